@@ -1,4 +1,6 @@
-"""Independent readers of captures, for comparison. Scapy reads the packets, and this module reads the other blocks."""
+"""Read packet captures independently of the harness, for comparison: packets with scapy, and other blocks with this
+module.
+"""
 
 import json
 import struct
@@ -20,7 +22,7 @@ class CapturedFrame(NamedTuple):
 
     @property
     def payload(self) -> bytes:
-        """The payload of UDP."""
+        """The data inside the UDP datagram."""
         return self.data[PAYLOAD_AT:]
 
 
@@ -36,7 +38,7 @@ def frames(path: Path) -> list[CapturedFrame]:
 
 
 def comment(path: Path) -> dict[str, Any]:
-    """Return the comment of the section header."""
+    """Return the comment in the section header of a capture file."""
     found: dict[str, Any] = json.loads(_options(path, SECTION, 16)[COMMENT])
     return found
 
@@ -48,7 +50,7 @@ def statistics(path: Path) -> dict[str, int]:
 
 
 def _options(path: Path, kind: int, fixed: int) -> dict[int, bytes]:
-    """Return the options of the only block of this kind. They follow `fixed` bytes."""
+    """Return the options of the only block of this kind. They follow `fixed` bytes of other data."""
     (body,) = (body[fixed:] for found, body in _blocks(path.read_bytes()) if found == kind)
     options = {}
     while len(body) >= 4:

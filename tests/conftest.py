@@ -1,4 +1,4 @@
-"""Settings of all tests, and the markers `lab`, `docker` and `uml`.
+"""Settings for all tests, and the pytest markers `lab`, `docker` and `uml`.
 
 A test with one of these markers needs private network namespaces, a Docker engine or User Mode Linux. It is skipped
 with a reason on a machine without it.

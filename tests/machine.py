@@ -1,4 +1,4 @@
-"""Requirements of tests that need more than Python. A test is skipped if this machine lacks a requirement.
+"""Check the requirements of tests that need more than Python. A test is skipped if a requirement is missing.
 
 The environment variable `UCP_REQUIRE` lists requirements that must not be missing, separated by commas: "lab", "netem",
 "nftables", "uml", "cc", "browser", "tshark", "docker", "tlc", "jq" and "ros". If one is missing, the test fails.
@@ -26,7 +26,7 @@ from netem.lab import Lab, LabUnavailable
 
 @functools.cache
 def unavailable(engine: str | None) -> LabUnavailable | None:
-    """Return the reason why this machine cannot open a lab with this engine. `engine` None stands for any engine."""
+    """Return the reason why this machine cannot open a virtual network with this engine, or None."""
 
     async def attempt() -> None:
         lab = await Lab.open([1, 2], engine=engine, log=Path(folder, "lab.log"))  # type: ignore[arg-type]
@@ -41,7 +41,7 @@ def unavailable(engine: str | None) -> LabUnavailable | None:
 
 
 def require(engine: str | None) -> None:
-    """Skip the test without a lab with this engine, or fail it if UCP_REQUIRE names the lab."""
+    """Skip the test if there is no virtual network with this engine, or fail it if UCP_REQUIRE names it."""
     if (error := unavailable(engine)) is None:
         return
     elsewhere = "; `make test-netem` runs it in User Mode Linux" if engine == "netem" else ""

@@ -37,7 +37,7 @@ def play(page: Path, directory: Path, columns: int = 120) -> int:
 
 
 def _blocks(page: Path) -> Iterator[tuple[str, str, str]]:
-    """Yield language, title and content of each block. The title may be empty."""
+    """Yield the language, title and content of each code block. The title may be empty."""
     yield from re.findall(
         r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```', page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
     )

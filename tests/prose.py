@@ -49,14 +49,14 @@ EXCEPTIONS = {
 
 
 class Occurrence(NamedTuple):
-    """A pattern in a text, with the words around it."""
+    """A pattern in a text, with the surrounding words."""
 
     pattern: str
     excerpt: str
 
 
 def files() -> list[str]:
-    """Return the paths of all texts that count, relative to the root of the repository."""
+    """Return the paths of all texts in which patterns are counted, relative to the root of the repository."""
     found = [REPOSITORY / name for name in PAGES]
     for folder in FOLDERS:
         found += (path for path in (REPOSITORY / folder).rglob("*") if path.suffix in SUFFIXES)
@@ -86,7 +86,7 @@ def occurrences(path: Path) -> Iterator[Occurrence]:
 
 
 def _docstrings(source: str) -> Iterator[str]:
-    """Yield the docstrings of a module, those below attributes included."""
+    """Yield the docstrings of a module, including those below attributes."""
     for node in ast.walk(ast.parse(source)):
         body = getattr(node, "body", None)
         for item in body if isinstance(body, list) else []:

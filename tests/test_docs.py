@@ -1,4 +1,4 @@
-"""The documentation: the site builds without warnings and loads nothing from other hosts, and all examples work."""
+"""Test the documentation: the site builds without warnings, loads nothing from other hosts, and all examples work."""
 
 import importlib
 import os
@@ -134,7 +134,7 @@ def test_commands_page_has_the_exit_statuses_of_each_command(site: Path) -> None
 
 
 def all_commands() -> Iterator[tuple[str, Any]]:
-    """Yield each command with its name, those inside of groups too."""
+    """Yield each command with its name, including commands in groups."""
     for name in COMMANDS:
         command = load_command(name)
         if hasattr(command, "commands"):

@@ -1,4 +1,4 @@
-"""The ratchet for plain English: pattern counts only go down, and subjects of new commits are short."""
+"""Test for plain English: pattern counts may only decrease, and subjects of new commits are short."""
 
 import subprocess
 from pathlib import Path

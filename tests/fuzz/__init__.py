@@ -1,4 +1,4 @@
-"""Fuzz tests of all readers of external input. With `atheris`, coverage guides the mutations; without, they are random.
+"""Fuzz tests of all code that reads external input. With the package `atheris`, coverage guides the random changes.
 
 finding.py     the conditions that every reader must meet
 targets/       one module for each reader, which gives it the bytes of an input

@@ -84,7 +84,7 @@ def _guided(name: str, seconds: int) -> bool:
 
 
 def _where_it_hangs(running: "subprocess.Popen[bytes]") -> None:
-    """Make a hanging process write its stack into its log, and its input into the failures. Then kill it."""
+    """Make a hanging process write its stack to its log, and its input to the failures. Then kill it."""
     for number in (signal.SIGUSR1, signal.SIGABRT):
         running.send_signal(number)
         time.sleep(1)

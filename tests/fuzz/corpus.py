@@ -1,4 +1,4 @@
-"""The stored inputs, in a folder for each target: former failures as `regression-NAME`, and inputs that cover most."""
+"""Find the stored inputs of each target: former failures (`regression-NAME`), and inputs with the most coverage."""
 
 from pathlib import Path
 
@@ -9,6 +9,6 @@ MOST_BYTES = 500_000
 
 
 def files_of(name: str) -> list[Path]:
-    """Return the stored inputs of a target. Empty if it has none yet."""
+    """Return the stored inputs of a target, or an empty list."""
     folder = FOLDER / name
     return sorted(path for path in folder.iterdir()) if folder.is_dir() else []

@@ -1,4 +1,4 @@
-"""The conditions that every reader must meet for any input: limits of time and memory, and sound error messages."""
+"""Define the conditions for every reader of external input: limits of time and memory, and short error messages."""
 
 import resource
 import signal
@@ -13,12 +13,12 @@ LONGEST_SENTENCE = 2000
 
 
 class FailedError(AssertionError):
-    """A reader violated a condition."""
+    """An error: a reader violated a condition."""
 
 
 @contextmanager
 def bounded() -> Iterator[None]:
-    """Raise FailedError if the block takes longer than MOST_S, or more memory than MOST_GROWTH_BYTES."""
+    """Raise FailedError if the code inside takes longer than MOST_S, or more memory than MOST_GROWTH_BYTES."""
 
     def too_long(signal_number: int, frame: FrameType | None) -> None:
         raise FailedError(f"took more than {MOST_S} s")

@@ -1,4 +1,4 @@
-"""`python -m tests.fuzz.keep [TARGET ...]`: select the inputs in tests/corpus again.
+"""Select the inputs in tests/corpus again: `python -m tests.fuzz.keep [TARGET ...]`.
 
 The candidates are the seeds, the inputs that `python -m tests.fuzz` left in .fuzz, and the stored inputs. The
 selection covers the most pairs of successive lines of the project. Smaller inputs are preferred. All regressions stay.
@@ -51,7 +51,7 @@ def _keep(name: str, flown: Path) -> list[bytes]:
 
 
 def _best(ways: dict[bytes, frozenset[Way]]) -> Iterator[bytes]:
-    """Yield the selected inputs: always the one that covers the most new pairs of lines, within the limits."""
+    """Yield the inputs to keep: repeatedly the one that covers the most new pairs of lines, within the limits."""
     covered: set[Way] = set()
     left = MOST_BYTES
     for _ in range(MOST_FILES):

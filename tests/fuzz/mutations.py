@@ -1,4 +1,4 @@
-"""Random damage of files, as the field, a careless user or an attacker causes it. A seed determines it."""
+"""Damage files at random, as on real flights, by careless users or by attackers. A seed determines the damage."""
 
 import json
 import random
@@ -56,14 +56,14 @@ def repeat_a_part(content: bytes, chance: random.Random) -> bytes:
 
 
 def set_bytes(content: bytes, chance: random.Random) -> bytes:
-    """Overwrite some bytes with extreme numbers, which may be the lengths of a binary format."""
+    """Return the file with some bytes replaced by extreme numbers, which may be lengths in a binary format."""
     place = chance.randrange(len(content) + 1)
     value = chance.choice((b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\0\x40", b"\1\0\0\0" * 2))
     return content[:place] + value + content[place + len(value) :]
 
 
 def move_lines(content: bytes, chance: random.Random) -> bytes:
-    """Repeat, exchange, remove or join lines."""
+    """Return the file with some lines repeated, exchanged, removed or joined."""
     lines = content.splitlines(keepends=True)
     if not lines:
         return content
@@ -87,7 +87,7 @@ def of_windows(content: bytes, chance: random.Random) -> bytes:
 
 
 def change_a_value(content: bytes, chance: random.Random) -> bytes:
-    """A value of the JSON in one line, or of all of it, is another."""
+    """Return the file with a different value at one place of a JSON document."""
     text = content.decode("utf-8", "surrogateescape")
     lines = [text] if text.startswith("{\n") else text.splitlines(keepends=True)
     number = chance.randrange(len(lines)) if lines else 0
@@ -104,7 +104,7 @@ def change_a_value(content: bytes, chance: random.Random) -> bytes:
 
 
 def _put(document: Any, chance: random.Random, value: Any) -> bool:
-    """Put `value` somewhere, or take a key away."""
+    """Set a random key of the document to `value`, or remove it. Return true on success."""
     while True:
         if isinstance(document, dict) and document:
             key = chance.choice(list(document))

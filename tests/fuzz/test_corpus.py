@@ -1,4 +1,4 @@
-"""Run each target with its stored inputs and a few mutated ones. `make fuzz` tries millions of mutated inputs."""
+"""Run each fuzz target with its stored inputs and a few random ones. `make fuzz` tries millions."""
 
 from itertools import islice
 

@@ -1,4 +1,4 @@
-"""Capture files for tests: pcapng and pcap files with given packets, and captures of agents in a simulated network."""
+"""Write packet capture files for tests: with given packets, or from agents in a simulated network."""
 
 import json
 import struct
@@ -40,7 +40,7 @@ def wall_ns(at_s: float) -> int:
 
 
 class PcapNg:
-    """A pcapng file under construction."""
+    """A pcapng file that is being written."""
 
     def __init__(self, vehicle: int | None = None, order: str = "<", resolution: int = 9) -> None:
         self.order = order
@@ -77,7 +77,7 @@ def pcap(packets: Iterable[tuple[int, bytes]], link_type: int = 1) -> bytes:
 
 
 class CaptureScript:
-    """Captures of scripted messages: sender, mission second, and the delay of each receiver."""
+    """Packet captures of scripted messages, with their sender, mission second, and the delay to each receiver."""
 
     def __init__(self, *vehicles: int) -> None:
         self.files = {vehicle: PcapNg(vehicle) for vehicle in vehicles}
@@ -86,7 +86,8 @@ class CaptureScript:
     def send(
         self, at_s: float, sender: int, message: Message, reaches: Mapping[int, float | Sequence[float]] | None = None
     ) -> bytes:
-        """Send a message. `reaches` maps a receiver to its delay in mission seconds, or to the delays of its copies.
+        """Send a message. `reaches` contains the delay of each receiver in mission seconds, or the delays of several
+        copies.
 
         By default the message reaches all other vehicles after 10 ms.
         """
@@ -103,7 +104,7 @@ class CaptureScript:
         datagram: bytes,
         reaches: Mapping[int, float | Sequence[float]] | None = None,
     ) -> None:
-        """Send any bytes as a datagram. `reaches` is that of `send`."""
+        """Send any bytes as a datagram. `reaches` has the same meaning as for `send`."""
         self.record(sender, at_s, OUTBOUND, datagram)
         all_others = {vehicle: 0.01 for vehicle in self.files if vehicle != sender}
         for receiver, delays in (all_others if reaches is None else reaches).items():
@@ -125,7 +126,7 @@ class CaptureScript:
 
 
 class Captures:
-    """Captures of all vehicles in a simulated network, from now on. `sent` and `heard` are the expected deliveries."""
+    """Packet captures of all vehicles in a simulated network. `sent` and `heard` are the expected deliveries."""
 
     def __init__(self, air: Air) -> None:
         self.air = air
@@ -158,7 +159,7 @@ class Captures:
         self.files[vehicle].packet(wall_ns(self.air.now), direction, data)
 
     def lost(self) -> set[tuple[bytes, int]]:
-        """Return a pair for each lost datagram: the datagram, and the vehicle that did not receive it."""
+        """Return a pair of datagram and vehicle for each vehicle that missed a datagram."""
         return {
             (datagram, listener)
             for datagram in self.sent
@@ -167,7 +168,7 @@ class Captures:
         }
 
     def write(self, run: Path, *without: int) -> Path:
-        """Write complete captures into a run directory, except for the vehicles in `without`."""
+        """Write complete packet captures into a run directory, except for the vehicles in `without`."""
         for file in self.files.values():
             file.statistics(wall_ns(self.air.now))
         return write_files(run, self.files, without)

@@ -1,4 +1,4 @@
-"""Run `ucp-harness` as a user does, and list the processes that it started."""
+"""Run `ucp-harness` like a user, and list the processes that it started."""
 
 import json
 import os
@@ -23,7 +23,7 @@ def harness(
     cwd: Path | None = None,
     input: str = "",
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end."""
+    """Run the command to its end, and return its output."""
     words = [str(argument) for argument in arguments]
     if forks.same_interpreter(env):
         return forks.call(words, env, cwd or Path.cwd(), input, deadline_s)
@@ -47,7 +47,7 @@ def write_scenario(directory: Path, **keys: Any) -> Path:
 
 
 class Running:
-    """An active run, which a test can observe and disturb."""
+    """An active run that a test can observe and disturb."""
 
     def __init__(
         self, scenario: Path, out: Path, *options: object, command: Sequence[str] = COMMAND, **settings: Any
@@ -82,7 +82,7 @@ class Running:
         os.kill(pid, number)
 
     def end(self) -> tuple[int, str, str]:
-        """Wait for the end. Return exit status, standard output and standard error."""
+        """Wait until the run ends. Return its exit status, standard output and standard error."""
         out, err = self.process.communicate(timeout=DEADLINE_S)
         return self.process.returncode, out, err
 
@@ -92,7 +92,7 @@ class Running:
 
 
 def processes(directory: Path) -> dict[int, str]:
-    """Return PID -> command line of every process whose arguments or working directory are in a run directory."""
+    """Return the command line of every process that uses a run directory, by process ID."""
     found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit() or int(entry.name) == os.getpid():

@@ -1,4 +1,4 @@
-"""Fixtures of tests that show a page in a browser."""
+"""Provide a browser for tests that show a page."""
 
 from collections.abc import Iterator
 

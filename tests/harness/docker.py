@@ -1,4 +1,4 @@
-"""Access to the Docker engine for tests: the containers of a run, and a connection that a test can break."""
+"""Use Docker in tests: list the containers of a run, and interrupt the connection to Docker."""
 
 import os
 import socket
@@ -13,7 +13,7 @@ from harness.play.containers.docker_engine import DEFAULT_HOST, Engine
 
 
 def containers(run: Path) -> list[str]:
-    """Return the names of all containers of the run in this directory, also of stopped ones."""
+    """Return the names of all containers of the run in this directory, including stopped ones."""
     engine = Engine.connect()
     found = engine.api.containers(all=True, filters={"label": f"{ownership.RUN}={ownership.run_name(run)}"})
     engine.close()
@@ -36,7 +36,7 @@ def foreign_container(name: str) -> Iterator[Engine]:
 
 
 class BreakableConnection:
-    """A socket that forwards to the engine, until a test calls `silent` or `cut`."""
+    """A socket that forwards everything to Docker, until a test calls `silent` or `cut`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

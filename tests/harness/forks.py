@@ -1,4 +1,4 @@
-"""Fast calls of `ucp-harness`: forks of a server process that has imported all commands.
+"""Call `ucp-harness` fast, by forking a server process that has already imported all commands.
 
 Each call is a process with its own arguments, working directory, environment and standard streams. A fork saves the
 import of the modules, 0.4 s of processor time. `python -m tests.harness.forks FD` is the server process. It ends when
@@ -28,7 +28,7 @@ READ_AT_START = ("PYTHON", "LANG", "LC_")
 
 
 def same_interpreter(environ: Mapping[str, str]) -> bool:
-    """Return whether an interpreter that starts with this environment behaves as this one."""
+    """Return true if a new interpreter with this environment would behave like the present one."""
     names = {name for name in (*environ, *os.environ) if name.startswith(READ_AT_START)}
     return all(environ.get(name) == os.environ.get(name) for name in names)
 
@@ -102,7 +102,7 @@ def _server(packages: Path | None) -> socket.socket:
 
 
 class _FastExit:
-    """The last exit handler of a fork. It skips the release of memory, which would take longer than most commands."""
+    """The last exit function of a forked process. It skips the release of memory, which would take long."""
 
     status = 1  # the status after an exception
 

@@ -1,4 +1,4 @@
-"""Missions for tests of the checker: real agents in a simulated network, exported as a run exports them."""
+"""Play missions for tests of the checker: real agents in a simulated network, with the usual export files."""
 
 import json
 from pathlib import Path
@@ -55,7 +55,7 @@ LOSSY = [{"at_s": 0.0, "what": "start", "detail": "loss 15 %", "fully_connected"
 
 
 def edit(path: Path, change: Any) -> None:
-    """Load the JSON in `path`, let `change` edit it in place, write it back."""
+    """Load the JSON file at `path`, let `change` edit it in place, and write it back."""
     document = json.loads(path.read_text())
     change(document)
     path.write_text(json.dumps(document))

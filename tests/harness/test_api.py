@@ -1,4 +1,4 @@
-"""The public names: `harness.api`, `ucp`, `netem` and `sitl` list them, and import each at its first use."""
+"""Test that the public packages list their names, and import each one when it is first used."""
 
 import ast
 import asyncio

@@ -1,4 +1,4 @@
-"""The built package: its builds are reproducible, and it works outside a clone and without extras.
+"""Test the built Python package: it is always the same, and works outside a clone and without optional packages.
 
 The tests do not download packages. They unpack the built wheel beside links to the packages that it requires, and run
 the commands with these packages and the standard library only. There is no extra, and no clone.
@@ -31,7 +31,7 @@ DEADLINE_S = 60.0
 
 
 def required(name: str, found: dict[str, Distribution]) -> dict[str, Distribution]:
-    """Add a distribution and its requirements without extras to `found`, and return `found`."""
+    """Add a package and its required packages to `found`, and return `found`."""
     if name not in found:
         found[name] = distribution(name)
         for line in found[name].requires or ():
@@ -42,7 +42,7 @@ def required(name: str, found: dict[str, Distribution]) -> dict[str, Distributio
 
 
 def build(source: Path, target: str, directory: Path, *, umask: int) -> Path:
-    """Build the "wheel" or the "sdist" from a source tree. Return the file, the only one in `directory`."""
+    """Build the "wheel" or the "sdist" from a source tree. Return the resulting file."""
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "--target", target, "--directory", str(directory)],
         cwd=source,
@@ -66,7 +66,7 @@ def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def packages(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a directory with the unpacked wheel, and links to the packages that it requires without extras."""
+    """Return a directory with the unpacked wheel, and links to the packages that it requires."""
     directory = tmp_path_factory.mktemp("packages")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(directory)  # noqa: S202  (our own wheel)

@@ -1,4 +1,4 @@
-"""The rooms of docs/explanation/architecture.md: imports run one way, pass through doors, and form no circle.
+"""Test the rooms (packages) of the harness: imports run one way, use public modules only, and form no circle.
 
 A room is one folder of `harness/`, or one of the packages `ucp`, `ucp.contract`, `netem` and `sitl`. A module with a
 leading underscore belongs to its room alone. A module without one is a door: another room imports it, a user does, or
@@ -45,7 +45,7 @@ def modules() -> dict[str, Path]:
 
 @cache
 def imports(module: str) -> frozenset[str]:
-    """Return the modules that a module imports, anywhere in it, for types as well."""
+    """Return the modules that a module imports anywhere, including those for types."""
     return frozenset(name for name in _imported(modules()[module]) if name != module)
 
 
@@ -142,12 +142,12 @@ def test_every_listed_door_exists_and_needs_its_entry() -> None:
 
 
 def test_modules_import_in_no_circle() -> None:
-    """Raises CycleError with the circle."""
+    """A CycleError of the library names the circle."""
     [*TopologicalSorter({module: imports(module) for module in modules()}).static_order()]
 
 
 def test_rooms_import_in_no_circle() -> None:
-    """Raises CycleError with the circle. The room `ucp.contract` is a room of its own."""
+    """A CycleError of the library names the circle. The package `ucp.contract` counts as a room of its own."""
     graph: dict[str, set[str]] = {}
     for module in modules():
         graph.setdefault(room_of(module), set()).update({room_of(name) for name in imports(module)} - {room_of(module)})

@@ -1,4 +1,4 @@
-"""Each JSON Schema has a digest in schemas.sha256, so that a schema changes only on purpose."""
+"""Test that each JSON schema has a digest in schemas.sha256, so that schemas change only on purpose."""
 
 import hashlib
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The table of wrong agents: every quirk is found, and repeated trials give the same results."""
+"""Test the table of wrong agents: every deliberate error is found, and repeated trials give the same results."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ ROWS = rows_of(PAGE.read_text(encoding="utf-8"))
 
 @cache
 def right(seed: int) -> Trial:
-    """Play the same mission with the right agent. The cache helps, because quirks share their first seeds."""
+    """Play the mission with the correct agent. The result is cached, because several tests need it."""
     return play(None, seed)
 
 

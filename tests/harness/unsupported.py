@@ -1,4 +1,4 @@
-"""Agents that do not support a feature. They report it at their start, or at a command during the run."""
+"""Agents that do not support a feature, and report this at their start or at a command."""
 
 import shlex
 import sys

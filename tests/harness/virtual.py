@@ -1,4 +1,4 @@
-"""Short-hand for scenarios in virtual time."""
+"""Create scenarios in virtual time with few words."""
 
 from typing import Any
 

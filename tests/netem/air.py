@@ -1,4 +1,4 @@
-"""The programs that tests run inside vehicles. They start by path, with this checkout as PYTHONPATH and no packages.
+"""The programs that tests run inside vehicles. They are started by their path, and need no packages.
 
     air.py listen            record each frame that arrives on eth0, by AF_PACKET
     air.py frames DESTINATION_MAC,... ETHERTYPE...   send one frame of each

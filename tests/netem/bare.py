@@ -1,4 +1,4 @@
-"""The smallest orchestrator: opens a lab, fills it with programs that want to live on, and waits.
+"""Open a virtual network, start programs in it that ignore signals, and wait.
 
 bare.py FOLDER [ENGINE]       says on standard output how far it has come
 """

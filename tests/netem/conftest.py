@@ -1,4 +1,4 @@
-"""Common parts of the tests of the lab: each engine in turn, and test programs in vehicles."""
+"""Common parts of the tests of virtual networks: each engine in turn, and test programs in vehicles."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ PACKETS = int(os.environ.get("UCP_TEST_PACKETS", "4000"))
 
 @pytest.fixture(params=["netem", "nftables"])
 def engine(request: pytest.FixtureRequest) -> str:
-    """Each engine in turn."""
+    """Return each engine in turn."""
     require(request.param)
     return str(request.param)
 
 
 @pytest.fixture
 def netem() -> str:
-    """The engine that knows all conditions."""
+    """Return the engine that supports all conditions."""
     require("netem")
     return "netem"
 
@@ -82,7 +82,7 @@ class Air:
         return program
 
     async def run(self, vehicle: int, *arguments: object) -> None:
-        """Run a sender to its end."""
+        """Run a sender until it ends."""
         program = await self.start(vehicle, *arguments)
         assert await asyncio.wait_for(program.process.wait(), 4 * DEADLINE_S) == 0, program.output.read_text()
 
@@ -91,12 +91,12 @@ class Air:
 
 
 def play(story: Coroutine[Any, Any, None]) -> None:
-    """Run a test's story; one that comes to a standstill fails instead of holding up the rest."""
+    """Run the coroutine of a test. If it stops making progress, the test fails."""
     asyncio.run(asyncio.wait_for(story, 6 * DEADLINE_S))
 
 
 async def until(condition: Any, what: str) -> None:
-    """Wait for a condition, with a deadline."""
+    """Wait until a condition is true, or fail after a time limit."""
     deadline = time.monotonic() + DEADLINE_S
     while not condition():
         assert time.monotonic() < deadline, f"waited in vain until {what}"
@@ -104,7 +104,7 @@ async def until(condition: Any, what: str) -> None:
 
 
 def assert_binomial(found: int, count: int, probability: float) -> None:
-    """`found` of `count` fits the probability; a right program fails one check in 100,000."""
+    """Check that a count fits the probability. A correct program fails once in 100,000 checks."""
     deviation = 4.42 * math.sqrt(count * probability * (1 - probability))
     expected = count * probability
     assert abs(found - expected) <= deviation, f"{found} of {count}; expected {expected:.0f} ± {deviation:.0f}"

@@ -1,4 +1,4 @@
-"""One scenario has the same meaning in a kernel and in the medium: the same broadcasts pass both, and are compared.
+"""Test that a scenario has the same meaning with real packets and in virtual time.
 
 The medium gets the real sending time of each packet, so effects of rates and limits can be compared packet by packet.
 Other conditions are random in both, and are compared by intervals of two samples. A correct program fails one check in
@@ -38,7 +38,7 @@ SEEDS = range(1, 6)
 
 @dataclass
 class Heard:
-    """Numbered packets that a receiver received."""
+    """The numbered packets that a receiver received."""
 
     sent_at: list[float]
     """Sending time of each packet in seconds."""
@@ -61,7 +61,7 @@ class Heard:
 
 @dataclass
 class Both:
-    """The packets of a receiver through the kernel, and through the medium with several seeds."""
+    """The packets of a receiver with real packets, and in virtual time with several seeds."""
 
     kernel: Heard
     medium: list[Heard]
@@ -69,14 +69,14 @@ class Both:
     """Assumed lateness of this machine: the largest measured one, but more than zero."""
 
     def agree_on_copies(self) -> None:
-        """The numbers of lost, single and duplicate packets agree."""
+        """Check that the numbers of lost, single and duplicate packets agree."""
         for number in range(3):
             kernel, medium = ([len(copies) == number for copies in one.delays] for one in self.sides)
             assert_same_share(f"{number} copies", kernel, medium)
         assert max(map(len, self.kernel.delays)) <= 2
 
     def agree_on_delays(self) -> None:
-        """The distributions agree, except for the lateness of this machine."""
+        """Check that the distributions of delays agree, apart from delays of this machine."""
         kernel, medium = (one.all_delays for one in self.sides)
         for at in statistics.quantiles(medium, n=20):
             by_then = [delay <= at for delay in medium]
@@ -85,13 +85,11 @@ class Both:
 
     @property
     def late_in_queue_s(self) -> float:
-        """Twice the lateness, because a late packet delays all packets behind it in a queue, and each of them is late
-        itself.
-        """
+        """Return twice the delay of the machine, because a late packet also delays the packets behind it in a queue."""
         return 2 * self.late_s
 
     def agree_on_arrivals(self) -> None:
-        """Packets that pass both arrive at the same time, except for the lateness of this machine."""
+        """Check that packets which arrive in both cases arrive at the same time, apart from delays of this machine."""
         pairs = zip(self.kernel.delays, self.medium[0].delays, strict=True)
         later = statistics.quantiles(one[0] - other[0] for one, other in pairs if one and other)
         assert all(-EARLY_S < late_s < self.late_in_queue_s for late_s in later), later
@@ -102,7 +100,7 @@ class Both:
 
     @property
     def pooled(self) -> Heard:
-        """All that the medium did."""
+        """Return all packets in virtual time."""
         sent_at = [at for one in self.medium for at in one.sent_at]
         return Heard(sent_at, [copies for one in self.medium for copies in one.delays])
 
@@ -110,7 +108,7 @@ class Both:
 async def broadcast(
     air: Air, conditions: NetworkConditions, sender: int, receivers: Iterable[int], at_once: int = PACKETS
 ) -> dict[int, Both]:
-    """Send packets as fast as `sender` can, under the current conditions, and return the packets at each receiver.
+    """Send packets as fast as `sender` can, and return the packets at each receiver.
 
     `at_once`: number of packets before each pause. Without pauses, a kernel may drop packets for many receivers.
     """
@@ -141,7 +139,7 @@ async def broadcast(
 def through_medium(
     vehicles: Sequence[int], seed: int, conditions: NetworkConditions, sender: int, sent_at: list[float]
 ) -> list[Heard]:
-    """Return the packets of each vehicle. Vehicles and `sender` are given by number."""
+    """Return the simulated packets of each vehicle. Vehicles and `sender` are given by number."""
     medium = Medium(vehicles, seed)
     medium.apply(conditions)
     flown = [Heard(sent_at, [[] for _ in sent_at]) for _ in vehicles]
@@ -152,7 +150,7 @@ def through_medium(
 
 
 def assert_no_more(what: str, one: Sequence[bool], other: Sequence[bool]) -> None:
-    """The share that is true of `one` is not larger than that of `other`, but by chance."""
+    """Check that the share of true values in `one` is not larger than in `other`, except by chance."""
     share = (sum(one) + sum(other)) / (len(one) + len(other))
     width = 4.42 * math.sqrt(share * (1 - share) * (1 / len(one) + 1 / len(other)))
     more = sum(one) / len(one) - sum(other) / len(other)
@@ -165,7 +163,7 @@ def assert_same_share(what: str, one: Sequence[bool], other: Sequence[bool]) -> 
 
 
 def test_independent_draws_agree(netem: str, tmp_path: Path) -> None:
-    """Loss and duplicates together, corruption, overtaking, and delays of every shape."""
+    """Conditions are loss and duplicates together, corruption, reordering, and delays of every distribution."""
     links = {
         WITNESS: CONSTANT,
         3: LinkConditions(loss=0.4, duplicate=0.6),
@@ -251,7 +249,7 @@ def test_rates_and_limits_agree(netem: str, tmp_path: Path) -> None:
 
 
 def assert_jitter_keeps_order(both: Both, spread_s: float) -> None:
-    """Under a rate, and does not add up."""
+    """Check that random delays do not change the order or add up if the data rate is limited."""
     heard = [one.arrivals for one in (both.kernel, *both.medium)]
     assert all(map(in_order, heard))
     ends = [arrivals[-1] for arrivals in heard]
@@ -259,7 +257,9 @@ def assert_jitter_keeps_order(both: Both, spread_s: float) -> None:
 
 
 def assert_overtakers_take_no_time(both: Both, each_s: float) -> None:
-    """Under a rate: as many come at once, and the others in order, one after another."""
+    """Check that reordered packets are not delayed if the data rate is limited, and that the others keep their
+    order.
+    """
     assert_same_share("overtakes", *([delay < CONSTANT_S / 2 for delay in one.all_delays] for one in both.sides))
     for one in (both.kernel, *both.medium):
         copies = zip(one.sent_at, one.arrivals, strict=True)

@@ -1,4 +1,4 @@
-"""The capture of a lab: all frames, no others, each in the file of the right vehicle."""
+"""Test packet captures of a virtual network: each file contains all frames of its vehicle and no others."""
 
 import asyncio
 import signal
@@ -25,7 +25,7 @@ Story = Callable[[Air, LiveCapture], Awaitable[None]]
 
 
 def capture(vehicles: Sequence[int], folder: Path, story: Story, engine: str | None = None) -> None:
-    """Lead a lab through the story while it is captured."""
+    """Run a test in a virtual network while its packets are captured."""
 
     async def run() -> None:
         async with await Lab.open(vehicles, engine=engine, log=folder / "lab.log") as lab:  # type: ignore[arg-type]
@@ -37,7 +37,7 @@ def capture(vehicles: Sequence[int], folder: Path, story: Story, engine: str | N
 
 
 def numbers(folder: Path, vehicle: int, *, outbound: bool) -> list[int]:
-    """Those that `netem._probe` gave the datagrams."""
+    """Return the numbers that `netem._probe` gave to the datagrams."""
     found = frames(folder / f"{vehicle}.pcapng")
     return [struct.unpack_from("!I", frame.payload)[0] for frame in found if frame.outbound == outbound]
 

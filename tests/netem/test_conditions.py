@@ -1,4 +1,4 @@
-"""Conditions as values: their meaning, and the refusal of invalid ones."""
+"""Test network conditions as objects: their meaning, and the refusal of invalid ones."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def test_engine_refuses_unsupported_conditions_before_any_change(conditions: Net
 
 
 class _Forgetful(Engine):
-    """Keeps all conditions except `refused`. If it is `stuck`, it keeps only the first ones."""
+    """An engine that forgets the conditions in `refused`. If it is `stuck`, it keeps only the first ones."""
 
     name = "forgetful"
     has_queues = True

@@ -1,4 +1,4 @@
-"""The lab as its users see it: programs, connections, ends of all kinds."""
+"""Test the virtual network from the view of its users: programs, connections, and all kinds of ends."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_vehicle_has_its_address_a_broadcast_address_and_a_default_route(tmp_p
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may enter a network that somebody else made")
 def test_cable_can_end_in_an_existing_network(tmp_path: Path) -> None:
-    """Programs in that network are reachable under its conditions. After the lab, the network is as before."""
+    """Programs in that network can be reached under its conditions. Afterwards it is as before."""
     neighbour = subprocess.Popen(["unshare", "--net", "sleep", "60"])
     network = Path(f"/proc/{neighbour.pid}/ns/net")
 
@@ -114,7 +114,7 @@ def test_an_idle_lab_is_silent(tmp_path: Path) -> None:
 
 
 def test_kernel_counts_datagrams_that_programs_read(tmp_path: Path) -> None:
-    """Vehicle 2 reads three datagrams of its own, and leaves its broadcast in the socket. Vehicle 1 has no socket."""
+    """Vehicle 2 reads three of its datagrams, and leaves its broadcast in the socket. Vehicle 1 has no socket."""
     program = (
         "import socket, sys; s = socket.socket(type=socket.SOCK_DGRAM); s.bind(('', 9)); "
         "s.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1); "
@@ -131,7 +131,7 @@ def test_kernel_counts_datagrams_that_programs_read(tmp_path: Path) -> None:
 
 
 def test_the_first_process_loads_little() -> None:
-    """Imports take most of the start time of a lab."""
+    """Imports take most of the start time of a virtual network."""
     words = subprocess.check_output(
         [sys.executable, "-P", "-c", "import sys, netem.init; print(*sys.modules)"], text=True
     )
@@ -270,7 +270,7 @@ def test_a_lab_of_impossible_vehicles_is_refused(tmp_path: Path, vehicles: list[
         asyncio.run(Lab.open(vehicles, log=tmp_path / "lab.log"))
 
 
-def test_when_the_first_process_dies_every_call_and_every_wait_ends(tmp_path: Path) -> None:
+def test_death_of_the_first_process_ends_every_call_and_wait(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         agent = await start(lab, tmp_path, 1, "/bin/sleep", "1000")
         waiting = asyncio.create_task(agent.wait())

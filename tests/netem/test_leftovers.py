@@ -1,4 +1,4 @@
-"""A lab whose orchestrator is killed, at any moment, leaves nothing behind."""
+"""Test that nothing remains of a virtual network whose owner is killed at any moment."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NAMESPACES = ("net", "user", "mnt", "pid")
 
 
 def processes_of(mark: Path) -> set[int]:
-    """Return the processes with the mark in their environment. Ended and foreign processes have none."""
+    """Return the running processes of this user with the mark in their environment."""
     found = set()
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -39,7 +39,7 @@ def processes_of(mark: Path) -> set[int]:
 
 
 def namespaces() -> set[str]:
-    """Return each namespace that a process is in. An ended process is in none, even before its parent collects it."""
+    """Return each namespace that contains a running process."""
     found = set()
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -49,7 +49,7 @@ def namespaces() -> set[str]:
 
 
 def has_ended(folder: Path) -> bool:
-    """Return whether the process is a zombie. The state follows the name (proc(5))."""
+    """Return true if the process is a zombie. The state follows the name in the file (proc(5))."""
     return (folder / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
@@ -59,7 +59,7 @@ def interfaces() -> set[str]:
 
 @contextmanager
 def orchestrator_in(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Start `bare.py` in the folder, and kill it if the test fails. The folder's name marks it and all its children."""
+    """Start `bare.py` in the folder, and kill it if the test fails. The folder's name marks all its processes."""
     env = {**os.environ, "UCP_TEST_MARK": str(folder)}
     with subprocess.Popen([sys.executable, str(BARE), str(folder)], stdout=subprocess.PIPE, env=env) as orchestrator:
         try:
@@ -90,7 +90,7 @@ def test_a_killed_orchestrator_leaves_nothing(tmp_path: Path, after_s: float) ->
 
 
 def namespaces_of(pids: set[int]) -> set[str]:
-    """The namespaces that these processes are in and we are not."""
+    """Return the namespaces that contain these processes but not the present one."""
     own = {str(Path("/proc/self/ns", kind).readlink()) for kind in NAMESPACES}
     found = set()
     for pid in pids:

@@ -1,4 +1,4 @@
-"""All that netem can do to a link, by packets: delays and their distributions, bursts, duplicates, and the rest.
+"""Test all effects of netem on a link: delays and their distributions, bursts of losses, duplicates, and others.
 
 The kernel draws these lots, so figures are compared with wide intervals; a right program fails about one in 100,000.
 """
@@ -34,7 +34,7 @@ LATE_S = 0.015  # lateness of the test machine that the reference may not show
 
 
 async def heard(air: Air, sender: int, receivers: dict[int, Any], count: int, size: int = 12) -> dict[int, Any]:
-    """Broadcast, and return what each receiver says of it."""
+    """Broadcast packets, and return the report of each receiver."""
     listeners = {vehicle: await air.start_ready(vehicle, "receive", PORT) for vehicle in receivers}
     await air.broadcast(sender, count, size=size)
     await until_quiet(air)
@@ -83,7 +83,7 @@ def test_delays_have_the_requested_mean_deviation_and_shape(netem: str, tmp_path
 
 
 def median(delay: Delay) -> float:
-    """Return the median of a delay in seconds. For Pareto, it is below the mean."""
+    """Return the median of a delay in seconds. For the Pareto distribution, it is below the mean."""
     shift = {"pareto": -0.32, "paretonormal": -0.2}.get(delay.distribution, 0.0)
     return delay.mean_s + shift * delay.jitter_s
 

@@ -1,4 +1,4 @@
-"""Machines that cannot, users who may not, and what doctor says about them."""
+"""Test machines that cannot run a virtual network, users without permission, and the messages about them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 def run_as_nobody(argv: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command as an ordinary user: this one, or the user `nobody` for root."""
+    """Run a command as an ordinary user: the present one, or the user `nobody` if this is root."""
     nobody = {"user": "nobody", "group": "nogroup", "extra_groups": []} if os.geteuid() == 0 else {}
     return subprocess.run(argv, capture_output=True, text=True, check=False, **nobody, **options)
 
 
 def require_nobody_can() -> None:
-    """Skip if only root can read its Python or this checkout."""
+    """Skip the test if only root can read the Python installation or this checkout."""
     probe = [sys.executable, "-c", "import netem.lab"]
     try:
         done = run_as_nobody(probe, env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(REPOSITORY)}, cwd="/")
@@ -40,7 +40,7 @@ def require_nobody_can() -> None:
 
 
 def run_script(script: str, *, prefix: list[str] | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a Python script as an ordinary user, in a folder of that user's own."""
+    """Run a Python script as an ordinary user, in a folder of that user."""
     require_nobody_can()
     folder = run_as_nobody(["mktemp", "-d"], cwd="/").stdout.strip()
     try:

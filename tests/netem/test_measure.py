@@ -1,4 +1,4 @@
-"""Requested and measured values: the statistics, the questions, and the detection of wrong networks."""
+"""Test measurements of the network: the statistics, the comparisons, and the detection of wrong networks."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def one_question(asked: float) -> Study:
 
 
 def losing(*shares: float) -> tuple[list[tuple[Study, int]], EngineMeasurement]:
-    """Return question and answer of an observer that loses these shares, one stream after the other."""
+    """Return a measurement whose network loses these shares, and its results."""
     asked: list[tuple[Study, int]] = []
     kept = iter(shares)
 

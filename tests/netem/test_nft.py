@@ -1,4 +1,4 @@
-"""Long changes are split for ordinary users, and a partly applied change can be undone."""
+"""Test that long changes are divided for ordinary users, and that a partly applied change can be undone."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ VEHICLES = range(1, 31)
 
 
 class Narrow(NftablesEngine):
-    """Its nft takes few commands at once, and fails after `lasts` transactions."""
+    """An nftables engine that accepts few commands at once, and fails after `lasts` transactions."""
 
     def __init__(self) -> None:
         self._vehicles = tuple(VEHICLES)

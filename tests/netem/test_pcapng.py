@@ -1,4 +1,4 @@
-"""Capture files, as scapy reads them: whole, cut off, and when the disk is full."""
+"""Test packet capture files by reading them with scapy: complete, truncated, and on a full disk."""
 
 import resource
 import subprocess

@@ -1,4 +1,4 @@
-"""The radio model: losses by distance, and their effect on conditions and groups."""
+"""Test the radio model: losses by distance, and their effect on conditions and groups."""
 
 from __future__ import annotations
 

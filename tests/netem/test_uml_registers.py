@@ -1,4 +1,4 @@
-"""Floating point and vector registers in User Mode Linux, on this processor and as on one that it does not know."""
+"""Test floating point and vector registers in User Mode Linux, on this processor and on an unknown one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WAYS = ["as here"] if _uml_registers.needed(Path(KERNEL) if KERNEL else None) el
 
 @pytest.fixture(params=WAYS)
 def guest(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """User Mode Linux as this processor has it, and with the library that keeps registers where it is not wanted."""
+    """Run User Mode Linux normally, and also with the register library where it is not needed."""
     if request.param == "preloaded":
         monkeypatch.setenv(_uml_registers.FORCE, "1")
     require_uml()
@@ -31,7 +31,7 @@ def guest(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.fixture(scope="module")
 def check(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The program that checks its registers. It prints lost ones, and then ends with status 1."""
+    """Compile the program that checks its registers. It prints lost registers, and then ends with status 1."""
     program = tmp_path_factory.mktemp("registers") / "check"
     argv = ["cc", "-O1", "-fno-builtin", "-pthread", "-o", str(program), str(PROGRAMS / "check.c")]
     if not _uml_registers.has_compiler():

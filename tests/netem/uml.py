@@ -1,4 +1,4 @@
-"""Runs the tests of real netem inside User Mode Linux, a kernel that has it: `python -m tests.netem.uml`.
+"""Run the tests of netem inside User Mode Linux: `python -m tests.netem.uml`.
 
 The same tests run in the same virtual environment, see `netem.uml`. Arguments go to pytest. The exit status is
 pytest's, or 3 if User Mode Linux is not here, does not boot, hangs or panics.
@@ -41,7 +41,7 @@ _TESTS = ("-q", "-k", "not nftables", *_OF_NETEM)
 
 
 def main(arguments: list[str]) -> int:
-    """Boot, run, and return pytest's exit status."""
+    """Boot User Mode Linux, run the tests, and return pytest's exit status."""
     pytest = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", *(arguments or _TESTS)]
     environment = {
         "UCP_TEST_PACKETS": "1500",

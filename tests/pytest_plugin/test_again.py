@@ -1,4 +1,4 @@
-"""A failing test says what plays its run once more, outside of pytest; and a run can be explored as a scenario can."""
+"""Test that a failing test prints the command that repeats its run outside pytest."""
 
 import re
 import shlex

@@ -1,4 +1,4 @@
-"""The key `expect` of a scenario."""
+"""Test the key `expect` of a scenario."""
 
 from typing import Any, get_args
 
@@ -42,7 +42,7 @@ def test_figures_are_compared_with_what_they_should_be(wanted: Any, figure: floa
     assert list(expect.out_of_range({"blocks": figure})) == ([sentence] if sentence else [])
 
 
-def test_a_scenario_says_what_it_expects_in_json_as_in_yaml() -> None:
+def test_expectations_are_the_same_in_json_and_yaml() -> None:
     one = scenario(expect={"characteristics": {1: "holds"}, "figures": {"blocks": 3}, "seeds": [0, 2]})
     assert type(one).model_validate_json(one.model_dump_json()) == one
 

@@ -1,4 +1,4 @@
-"""Scenarios that are tests by themselves, and YAML files of other tools."""
+"""Test scenarios that are tests by themselves, and YAML files of other programs."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The fixture `scenario`: it plays a scenario and provides the findings."""
+"""Test the fixture `scenario`, which plays a scenario and provides its verdicts."""
 
 import pytest
 

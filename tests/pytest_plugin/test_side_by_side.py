@@ -1,4 +1,4 @@
-"""Tests with runs beside each other, interrupted, and beside tests that have nothing to do with us."""
+"""Test runs in parallel tests, interrupted tests, and tests beside unrelated tests."""
 
 import json
 import os

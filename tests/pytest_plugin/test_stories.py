@@ -1,4 +1,4 @@
-"""Stories: text that is played and compared, and written anew if asked."""
+"""Test stories: they are played and compared with their text, or rewritten on request."""
 
 import json
 import shlex
@@ -36,7 +36,7 @@ def write(pytester: pytest.Pytester, text: str, file: str = "missed.story") -> P
 
 
 def written(pytester: pytest.Pytester, text: str = TOLD) -> Path:
-    """A story with what agents do."""
+    """Write a story with the reactions of agents."""
     path = write(pytester, text)
     run(pytester, path, "--ucp-rewrite").assert_outcomes(passed=1)
     return path

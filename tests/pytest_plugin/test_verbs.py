@@ -1,4 +1,4 @@
-"""Further actions of the fixture `swarm`: wait for a handler, delay messages, change links, inject datagrams."""
+"""Test further actions of the fixture `swarm`: wait for a handler, hold messages, change links, inject datagrams."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ pytest_plugins = "pytester"
 
 
 def record(pytester: pytest.Pytester) -> dict[str, Any]:
-    """Return the record of the only kept run."""
+    """Return the record of the only stored run."""
     (kept,) = run_directories(pytester)
     told: dict[str, Any] = json.loads((kept / "run.json").read_text())
     return told

@@ -1,4 +1,4 @@
-"""Options that say where tests are played: in User Mode Linux, or in containers of this machine's own files."""
+"""Test the options for the place of a run: User Mode Linux, or containers."""
 
 import json
 import os

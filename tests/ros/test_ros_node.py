@@ -1,4 +1,4 @@
-"""The agent that is a ROS 2 node, as its page shows it; `make test-ros` brings ROS along."""
+"""Test the agent that is a ROS 2 node, as its page describes it. `make test-ros` provides ROS."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.lab, pytest.mark.ros]
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory in which all that the page says has been done."""
+    """Return a directory in which all steps of the page were done."""
     if not (REPOSITORY / ".ros" / "installed").exists():
         do_without("ros", "there is no ROS 2 in .ros: make test-ros installs it")
     directory = tmp_path_factory.mktemp("a clone")
@@ -27,7 +27,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-def test_it_does_as_specified_among_others_with_loss_and_a_partition(played: Path) -> None:
+def test_ros_agent_follows_the_algorithms_with_loss_and_a_partition(played: Path) -> None:
     record = RunArchive(played / "mixed").record
     assert {key: judgement.verdict for key, judgement in record.judgements.items()} == {
         **dict.fromkeys("123456", "holds"),

@@ -1,4 +1,4 @@
-"""An autopilot of an embedded vehicle in the test's process, with one client and a clock that the test advances."""
+"""Run an autopilot of an embedded vehicle in the test's process, with one client and a clock that the test advances."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ACCEPTED, FAILED, UNSUPPORTED = (
 
 
 class Cockpit:
-    """A vehicle with one client. `heard` has all messages of the vehicle except its telemetry."""
+    """A vehicle with one client. `heard` contains all messages of the vehicle except telemetry."""
 
     def __init__(self, vehicle_type: VehicleType = "copter") -> None:
         self.vehicle = Autopilot(3, HOME, 0, vehicle_type)
@@ -44,7 +44,7 @@ class Cockpit:
         return news
 
     def command(self, command: int, *params: float) -> int:
-        """Send a COMMAND_LONG, and return its MAV_RESULT."""
+        """Send a COMMAND_LONG, and return its result code (MAV_RESULT)."""
         padded = [*params, *[0.0] * (7 - len(params))]
         answers = self.tell(mavlink.MAVLink_command_long_message(3, 1, command, 0, *padded))
         (ack,) = [answer for answer in answers if answer.get_type() == "COMMAND_ACK"]
@@ -73,7 +73,7 @@ class Cockpit:
         self.fly(40.0)
 
     def load(self, plan: Plan) -> Mission:
-        """Upload a plan item by item, as requested."""
+        """Upload a plan item by item, as the vehicle requests it."""
         vehicle_type = self.vehicle.vehicle_type
         mission = Mission(route(plan, vehicle_type, HOME.heading_deg), HOME, 3, vehicle_type)
         answers = self.tell(mavlink.MAVLink_mission_count_message(3, 1, len(mission.items)))

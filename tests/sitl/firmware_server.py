@@ -1,4 +1,4 @@
-"""A firmware server on loopback with ArduPilot's paths. It serves files correctly, or fails as the test requests."""
+"""A local server for firmware with ArduPilot's paths. It works correctly, or fails as the test requests."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def git_version(version: str = "4.6.3", commit: str = COMMIT) -> bytes:
 
 @dataclass(frozen=True)
 class Resource:
-    """The content at one path, and the manner of sending it."""
+    """The content at one path, and how the server sends it."""
 
     content: bytes
     status: int = 200
@@ -52,7 +52,7 @@ class Resource:
 
 @dataclass
 class FirmwareServer:
-    """A server of `files` by path, which a test may change.
+    """A server for `files` by path. A test may change them.
 
     It records requests (path, Range header) and answers (path, status).
     """
@@ -85,7 +85,7 @@ def copter_files() -> dict[str, Resource]:
 
 @contextlib.contextmanager
 def serving() -> Iterator[FirmwareServer]:
-    """A server of one stable copter."""
+    """Start a server that offers one stable copter firmware."""
     state = FirmwareServer(copter_files())
 
     class Handler(BaseHTTPRequestHandler):

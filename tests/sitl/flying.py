@@ -1,4 +1,4 @@
-"""Shared helpers of these tests: an embedded vehicle in a process of its own, and a simple client."""
+"""Helpers for tests of vehicles: an embedded vehicle in its own process, and a simple client."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def connect(port: int) -> socket.socket:
-    """Connect as soon as a program listens."""
+    """Connect to a port as soon as a program listens there."""
 
     def attempt() -> socket.socket | None:
         try:
@@ -78,7 +78,7 @@ def embedded(sysid: int = 3, speedup: float = 100.0, vehicle_type: VehicleType =
 
 
 class Client:
-    """A client that asks one thing at a time."""
+    """A client that sends one request at a time."""
 
     def __init__(self, port: int) -> None:
         self.sock = connect(port)
@@ -88,7 +88,7 @@ class Client:
         self.bytes_received = 0
 
     def wait_for(self, kind: str, **fields: Any) -> Any:
-        """The next message of this kind whose fields have these values."""
+        """Return the next message of this kind whose fields have these values."""
         deadline = time.monotonic() + DEADLINE_S
         while True:
             while self._waiting:
@@ -102,7 +102,7 @@ class Client:
             self._waiting += self.mav.parse_buffer(data) or ()
 
     def command(self, command: int, *params: float, target: int = 3) -> int:
-        """Send a COMMAND_LONG; return the MAV_RESULT."""
+        """Send a COMMAND_LONG, and return the result code (MAV_RESULT)."""
         padded = [*params, *[0.0] * (7 - len(params))]
         message = mavlink.MAVLink_command_long_message(target, 1, command, 0, *padded)
         self.sock.sendall(message.pack(self.mav))

@@ -1,4 +1,4 @@
-"""An embedded vehicle in the test's event loop, whose messages the test can change."""
+"""An embedded vehicle in the test's event loop. The test can change its messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TURN_S = 0.005
 
 
 class Puppet:
-    """An embedded vehicle whose frames `tamper` may change. Simulated time runs at SPEEDUP."""
+    """An embedded vehicle whose frames the function `tamper` may change. Simulated time runs at SPEEDUP."""
 
     def __init__(self, vehicle_type: VehicleType, sock: socket.socket) -> None:
         self.vehicle = Autopilot(3, HOME, 0, vehicle_type)
@@ -45,7 +45,7 @@ class Puppet:
 
 
 def frames(data: bytes) -> list[bytes]:
-    """The MAVLink 2 frames of a stream."""
+    """Return the MAVLink 2 frames in a byte stream."""
     found = []
     while data:
         length = 12 + data[1]

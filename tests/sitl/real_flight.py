@@ -1,9 +1,9 @@
-"""Flies a short plan with a real ArduPilot, at speedup 8, and ends it: for test_real_flight.py.
+"""Fly a short plan with a real ArduPilot at speedup 8, for test_real_flight.py.
 
     python -m tests.sitl.real_flight DIRECTORY copter|plane|rover mission|guided
 
-prints at which second of the vehicle's clock it was told to fly. Run it in a network namespace of its own: ArduPilot
-listens on every address and may send multicast.
+This command prints the second on the vehicle's clock at which the flight began. Run it in its own network namespace,
+because ArduPilot listens on every address and may send multicasts.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PLANS: dict[VehicleType, Plan] = {
 
 
 def fly(directory: Path, vehicle_type: VehicleType, by: By) -> float:
-    """Return the start of the plan on the vehicle's clock. `directory` has the telemetry log then."""
+    """Fly the plan, write the telemetry log to `directory`, and return the start of the plan on the vehicle's clock."""
     launch = ArduPilot.find(None, os.environ, vehicle_type).launch(3, HOME, SPEEDUP, directory)
 
     async def flight() -> float:
@@ -59,7 +59,7 @@ def fly(directory: Path, vehicle_type: VehicleType, by: By) -> float:
 
 
 def track_of(tlog: Path, began_s: float) -> list[tuple[float, tuple[float, float, float]]]:
-    """Return seconds since the start, and metres from home."""
+    """Return the seconds since the start, and the metres from home, of each recorded position."""
     log, points = mavutil.mavlink_connection(str(tlog)), []
     while (message := log.recv_match(type="GLOBAL_POSITION_INT")) is not None:
         if (second := message.time_boot_ms / 1e3 - began_s) >= 0:

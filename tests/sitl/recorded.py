@@ -1,4 +1,4 @@
-"""Recorded telemetry of ArduPilot 4.7.0-dev, cut to what tests need: `tests/sitl/recordings/*.tlog.gz`.
+"""Read recorded telemetry of ArduPilot 4.7.0-dev, shortened for the tests: `tests/sitl/recordings/*.tlog.gz`.
 
     python -m tests.sitl.recorded TELEMETRY.tlog OUT.tlog.gz
 
@@ -30,18 +30,18 @@ EVENTS = {"STATUSTEXT", "MISSION_ITEM_REACHED", "HOME_POSITION"}
 
 
 def frames(name: Name) -> Iterator[bytes]:
-    """Yield the frames of a recording, as the vehicle sent them."""
+    """Yield the frames of a recording in the order in which the vehicle sent them."""
     for frame, _ in messages(name):
         yield frame
 
 
 def messages(name: Name) -> Iterator[tuple[bytes, Any]]:
-    """Yield each frame with its message."""
+    """Yield each frame with its decoded message."""
     yield from _messages(gzip.decompress((RECORDINGS / f"{name}.tlog.gz").read_bytes()))
 
 
 def flight(name: Name) -> list[tuple[float, float, float, float]]:
-    """Return seconds since arming, and metres north, east and up from the starting place."""
+    """Return seconds since arming, and metres north, east and up from the start."""
     points: list[tuple[float, float, float, float]] = []
     home, armed_s, now_s = Home(0.0, 0.0), None, 0.0
     for _, message in messages(name):

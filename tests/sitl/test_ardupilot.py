@@ -1,4 +1,4 @@
-"""Finding and starting ArduPilot, with small stand-ins for the binary."""
+"""Test finding and starting ArduPilot, with small programs in place of its binary."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Modes and flights of the embedded vehicle, in one process and without a clock."""
+"""Test modes and flights of the embedded vehicle, in one process and without a clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Installing ArduPilot's binaries from a server on loopback that works correctly, or fails in various ways."""
+"""Test the installation of ArduPilot's binaries from a local server that works correctly, or fails in various ways."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def server() -> Iterator[FirmwareServer]:
 
 
 class Onlooker:
-    """A watcher that records its calls, and can end a download like Ctrl-C or a full disk."""
+    """An observer that records its calls, and can end a download like Ctrl-C or a full disk."""
 
     def __init__(self, end: BaseException | None = None) -> None:
         self.waited = threading.Event()
@@ -73,7 +73,7 @@ ARM_BINARY = b"\x7fELF\x01\x01\x01" + bytes(9) + b"\x02\x00\x28\x00" + BINARY[20
 
 
 def serve_arm(server: FirmwareServer, binary: bytes) -> None:
-    """The files of 32-bit ARM, with this binary."""
+    """Let the server offer the files for 32-bit ARM with this binary."""
     arm = RELEASE.replace("SITL_x86_64_linux_gnu", "SITL_arm_linux_gnueabihf")
     server.files[f"{arm}git-version.txt"] = server.files[f"{RELEASE}git-version.txt"]
     server.files[f"{arm}arducopter"] = Resource(binary)
@@ -547,7 +547,7 @@ def test_32_bit_arm_gets_its_own_binary(
 def test_aarch64_without_32_bit_support_is_refused(
     server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As the machine of the test does not."""
+    """The machine of the test does not support it either."""
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     serve_arm(server, ARM_BINARY)
     with pytest.raises(VehicleError, match="this aarch64 does not run programs of 32 bits: build ArduPilot SITL"):

@@ -1,4 +1,4 @@
-"""Plans flown by the real pilot: embedded vehicles over TCP, and puppets that misbehave."""
+"""Test plans that the real pilot flies: embedded vehicles over TCP, and vehicles with wrong messages."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def flown(vehicle_type: VehicleType, by: By, tlog: Path) -> Pilot:
 
 
 def places(tlog: Path) -> Iterator[tuple[float, tuple[float, float, float]]]:
-    """(seconds since boot, metres from home) of a telemetry log."""
+    """Yield (seconds since boot, metres from home) for each position in a telemetry log."""
     log = mavutil.mavlink_connection(str(tlog))
     while (message := log.recv_match(type="GLOBAL_POSITION_INT")) is not None:
         if message.lat:
@@ -60,7 +60,7 @@ def places(tlog: Path) -> Iterator[tuple[float, tuple[float, float, float]]]:
 
 @pytest.mark.parametrize("vehicle_type", TYPES)
 def test_mission_in_auto_mode_follows_the_computed_track(vehicle_type: VehicleType, tmp_path: Path) -> None:
-    """Within a metre at every second, once the starts are laid on one another."""
+    """The flight is within a metre of the computed path at every second."""
     tlog = tmp_path / "3.tlog"
     pilot = flown(vehicle_type, "mission", tlog)
     assert pilot.state.armed is (vehicle_type == "rover")
@@ -109,7 +109,7 @@ async def until(condition: Callable[[], bool]) -> None:
 def puppet_flown(
     tmp_path: Path, strings: Callable[[Puppet], None], vehicle_type: VehicleType = "copter", by: By = "mission"
 ) -> Pilot:
-    """Fly the plan on a puppet whose `strings` are pulled beforehand."""
+    """Fly the plan on a vehicle whose messages the function `strings` changes."""
 
     async def fly() -> Pilot:
         async with on_strings(tmp_path, vehicle_type) as (pilot, puppet):
@@ -122,7 +122,7 @@ def puppet_flown(
 
 
 def failure(tmp_path: Path, strings: Callable[[Puppet], None], after_m: float = 25.0, by: By = "mission") -> str:
-    """Why the flight of a copter fails whose `strings` are pulled when it is `after_m` high."""
+    """Return the reason why a flight of a copter fails if its messages are changed from a height of `after_m` on."""
 
     async def fly() -> str:
         async with on_strings(tmp_path) as (pilot, puppet):
@@ -138,7 +138,7 @@ def failure(tmp_path: Path, strings: Callable[[Puppet], None], after_m: float = 
 
 
 def without(monkeypatch: pytest.MonkeyPatch, *ids: int) -> Callable[[Puppet], None]:
-    """From now on these messages, or all, do not come, and the pilot is impatient."""
+    """Return a function that suppresses these messages, or all messages. The pilot's time limits become short."""
 
     def strings(puppet: Puppet) -> None:
         monkeypatch.setattr(sitl.pilot, "SILENCE_S", 0.3)
@@ -205,7 +205,7 @@ def test_undone_mode_is_requested_again(tmp_path: Path) -> None:
 
 
 def test_forgotten_mission_is_uploaded_again(tmp_path: Path) -> None:
-    """Act like ArduCopter 3.5 during its boot."""
+    """The vehicle behaves like ArduCopter 3.5 during its boot."""
     forgotten: list[int] = []
 
     def strings(puppet: Puppet) -> None:
@@ -301,7 +301,7 @@ def test_ready_vehicle_only_needs_arming(by: By, vehicle_type: VehicleType, tmp_
 
 
 def test_vehicle_that_revokes_its_readiness_is_not_ready(tmp_path: Path) -> None:
-    """ArduPilot 4.7 says for 2.4 s that a rover is ready, and then for 17 s that it is not."""
+    """ArduPilot 4.7 reports for 2.4 s that a rover is ready, and then for 17 s that it is not."""
 
     async def fly() -> None:
         async with on_strings(tmp_path, "rover") as (pilot, puppet):
@@ -321,7 +321,7 @@ def test_vehicle_that_revokes_its_readiness_is_not_ready(tmp_path: Path) -> None
 
 
 def test_pilot_stops_after_handing_over(tmp_path: Path) -> None:
-    """Else a pilot asks again for the mode that it set."""
+    """Otherwise, the pilot would request its own mode again."""
 
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):

@@ -1,4 +1,4 @@
-"""The introduction of a vehicle: its version and its parameters, with lost messages."""
+"""Test the requests for a vehicle's version and parameters, with lost messages."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ WISHES = ("go_to", "loiter", "land", "ascent")
 def test_motion_is_continuous_and_above_ground(
     vehicle_type: VehicleType, yaw: float, wishes: list[tuple[str, Point, float]]
 ) -> None:
-    """Whatever is wished for, wherever it is broken off: what begins, begins where the vehicle is."""
+    """Each movement begins at the position at which the previous one was interrupted."""
     model = MODELS[vehicle_type]
     segments = model.take_off(Motion(yaw_rad=yaw), 20)
     now, motion = 0.0, end_of(segments)

@@ -1,4 +1,4 @@
-"""The limits of the port, in one process in which only the client empties the buffer."""
+"""Test the limits of the TCP port, in one process in which only the client empties the buffer."""
 
 from __future__ import annotations
 

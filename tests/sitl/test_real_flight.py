@@ -24,7 +24,7 @@ PLANE_APART_M, PLANE_BESIDE_M = 80.0, 40.0  # planes: at the same second, and fr
 @pytest.mark.parametrize("by", WAYS)
 @pytest.mark.parametrize("vehicle_type", VEHICLE_TYPES)
 def test_real_vehicle_follows_the_computed_track(vehicle_type: VehicleType, by: By, tmp_path: Path) -> None:
-    """Fly in a separate network namespace, because ArduPilot listens on every address and may send multicast."""
+    """Fly in a separate network namespace, because ArduPilot listens on every address and may send multicasts."""
     program, directory = BINARIES[vehicle_type], os.environ.get("ARDUPILOT_SITL")
     if directory is None:
         pytest.skip(f"no ArduPilot: set ARDUPILOT_SITL to the directory that holds an {program}")

@@ -1,4 +1,4 @@
-"""Setups of vehicles: parameter and location files, frames and their defaults, debuggers and logs."""
+"""Test settings of vehicles: parameter and location files, frames and their defaults, debuggers and logs."""
 
 from __future__ import annotations
 

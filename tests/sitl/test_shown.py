@@ -1,4 +1,4 @@
-"""A computed track as a ground station receives it."""
+"""Test a computed flight path as a ground station receives it."""
 
 from typing import Any
 

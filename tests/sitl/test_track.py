@@ -1,4 +1,4 @@
-"""The computed track, compared with flights of the embedded vehicle and recorded flights of a real ArduCopter."""
+"""Compare the computed flight path with flights of the embedded vehicle and of a real ArduCopter."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ DRIVE = Plan((GoTo(100, 0, speed_ms=3), Loiter(45), GoTo(0, 200), GoTo(0, 0)))
     ],
 )
 def test_track_equals_the_flight_of_the_embedded_vehicle(vehicle_type: VehicleType, plan: Plan) -> None:
-    """Places go over the wire in 1e-7 degrees, about a centimetre; a plane makes some more of it in its turns."""
+    """Places are transmitted in units of 1e-7 degrees, about a centimetre. Turns of a plane increase the error."""
     cockpit = Cockpit(vehicle_type)
     began_s = cockpit.begin(plan)
     computed = track(vehicle_type, plan, heading_deg=HOME.heading_deg, begin_s=began_s)
@@ -79,7 +79,7 @@ def recorded(by: str) -> list[tuple[float, float, float, float]]:
 
 
 def climbed_s(points: list[tuple[float, float, float, float]], altitude_m: float) -> float:
-    """When a climb first passed an altitude."""
+    """Return the time at which a climb first passed an altitude."""
     for (before_s, *_, low_m), (after_s, *_, high_m) in itertools.pairwise(points):
         if low_m < altitude_m <= high_m:
             return before_s + (altitude_m - low_m) / (high_m - low_m) * (after_s - before_s)
@@ -87,7 +87,7 @@ def climbed_s(points: list[tuple[float, float, float, float]], altitude_m: float
 
 
 def arrivals_s(points: list[tuple[float, float, float, float]]) -> list[float]:
-    """When the corners of the square, and the ground, were first within 5 m, in this order."""
+    """Return the times at which the vehicle first came within 5 m of each corner of the square, and of the ground."""
     corners = [(100, 0, 20), (100, 100, 20), (0, 100, 20), (0, 0, 20), (0, 0, 0)]
     remaining, arrivals = iter(points), []
     for corner in corners:
@@ -101,7 +101,7 @@ def as_points(computed: Track) -> list[tuple[float, float, float, float]]:
 
 @pytest.mark.parametrize("by", ["mission", "guided"])
 def test_recorded_square_of_a_copter_equals_the_track(by: str) -> None:
-    """Within 2 m of the line everywhere; each side, and the landing, takes as long but for 4 s.
+    """The flight is within 2 m of the line. Each side and the landing take as long as computed, within 4 s.
 
     Times count from the middle of the take-off. This copter is of 2018, and leaves each place sooner than 4.7 does.
     """
@@ -122,7 +122,7 @@ WAYS: list[By] = ["mission", "guided"]
 @pytest.mark.parametrize("by", WAYS)
 @pytest.mark.parametrize("vehicle_type", OUT_AND_BACK)
 def test_recorded_vehicle_is_within_5_s_of_the_track(vehicle_type: Literal["copter", "rover"], by: By) -> None:
-    """Seconds count from arming. Whatever it is computed to be at some second, it is within 5 s of that, to 3 m."""
+    """Seconds count from arming. Each computed position is reached within 5 s and 3 m."""
     flown = flight(f"{vehicle_type}-{by}")  # type: ignore[arg-type]
     computed = track(vehicle_type, Plan(OUT_AND_BACK[vehicle_type]), heading_deg=355.4, by=by)
     for second, *place in flown:
@@ -132,7 +132,7 @@ def test_recorded_vehicle_is_within_5_s_of_the_track(vehicle_type: Literal["copt
 
 @pytest.mark.parametrize("by", WAYS)
 def test_recorded_plane_is_near_the_track(by: By) -> None:
-    """Within 80 m at the same second after arming, and within 30 m of the computed path over the ground."""
+    """The plane is within 80 m of the computed position at the same time, and within 30 m of the computed line."""
     plan = Plan((TakeOff(50), GoTo(600, 350, speed_ms=20), Loiter(120), GoTo(0, 0), Land()))
     computed = track("plane", plan, heading_deg=353.0, by=by)
     path = [computed.at(quarter / 4)[:2] for quarter in range(1200)]

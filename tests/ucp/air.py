@@ -1,4 +1,4 @@
-"""A few agents in virtual time, with a chosen delay or loss for each delivery."""
+"""Run a few agents in virtual time, with a chosen delay or loss for each delivery."""
 
 import heapq
 import itertools
@@ -125,7 +125,7 @@ def uniform_latency(rng: Random, low_s: float = 0.002, high_s: float = 0.05, los
 
 
 def assert_characteristics_2_to_4(agent: Agent, completed_by: dict[int, set[bytes]]) -> None:
-    """Assert characteristics 2, 3 and 4 of an agent from its state."""
+    """Check characteristics 2, 3 and 4 of an agent from its state."""
     chain = [block.block_hash for block in agent.state.chain]
     aside = [block.block_hash for block in (*agent.state.blocks_to_be_committed, *agent.state.reconcile_stack)]
     if agent.state.idle:

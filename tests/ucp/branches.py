@@ -1,4 +1,4 @@
-"""The tests that take each branch of the 20 event handlers. `python -m tests.ucp.branches` writes them to BRANCHES.md.
+"""List the tests that take each branch of the 20 event handlers. `python -m tests.ucp.branches` writes BRANCHES.md.
 
 A test declares its branches, for example `@takes("vote_timer_expiration", "approved", "chain changed")`. It fails if no
 agent takes them while it runs (`conftest.py`). `test_branches.py` fails if a branch has no such test.
@@ -160,7 +160,7 @@ WHEN: dict[str, dict[str, str]] = {
 
 
 def takes(handler: str, *branches: str) -> pytest.MarkDecorator:
-    """Declare that a test takes these branches of `handler`.
+    """Return a pytest marker which declares that a test takes these branches of `handler`.
 
     It can be repeated, and used as a mark of a `pytest.param`.
     """
@@ -168,14 +168,14 @@ def takes(handler: str, *branches: str) -> pytest.MarkDecorator:
 
 
 def declared(marks: Iterable[pytest.Mark | pytest.MarkDecorator]) -> set[Branch]:
-    """Return the branches that a test with these marks declares."""
+    """Return the branches that a test with these markers declares."""
     taken = (mark.kwargs for mark in marks if mark.name == "branch")
     return {(branches["handler"], branch) for branches in taken for branch in branches["branches"]}
 
 
 @contextmanager
 def recorded() -> Iterator[set[Branch]]:
-    """Collect the branches that agents take inside the context."""
+    """Yield the set of branches that agents take inside the context."""
     taken: set[Branch] = set()
 
     def recording(handler: EventHandler[Any]) -> Callable[..., str]:
@@ -196,7 +196,7 @@ def recorded() -> Iterator[set[Branch]]:
 
 
 def taken_by() -> dict[Branch, list[str]]:
-    """Return the tests in this folder that take each branch. Tests that may be skipped or to fail do not count."""
+    """Return the tests in this folder that take each branch. Tests that may be skipped do not count."""
     tests: dict[Branch, list[str]] = {}
     for path in sorted(Path(__file__).parent.glob("test_*.py")):
         for name, test in _tests_in(import_module(f"{__package__}.{path.stem}")):

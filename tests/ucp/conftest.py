@@ -1,4 +1,4 @@
-"""Fail a test that does not take the branches that it declares."""
+"""Fail each test that does not take the branches that it declares."""
 
 from collections.abc import Generator
 

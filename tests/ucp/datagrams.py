@@ -1,4 +1,4 @@
-"""Random messages with real events in their blocks, and damaged datagrams."""
+"""Create random messages with real events in their blocks, and damaged datagrams."""
 
 from hypothesis import strategies as st
 

@@ -1,4 +1,4 @@
-"""Run a loop until a condition holds."""
+"""Run an event loop until a condition is true."""
 
 import time
 from collections.abc import Callable
@@ -10,7 +10,7 @@ LOOK_EVERY_S = 0.005
 
 
 def run_until(loop: Loop, condition: Callable[[], bool], *, after_s: float = 0.0) -> None:
-    """Run the loop until the condition holds. It is first checked after `after_s` seconds."""
+    """Run the loop until the condition is true. It is first checked after `after_s` seconds."""
     deadline = time.monotonic() + DEADLINE_S
     met = False
 

@@ -1,4 +1,4 @@
-"""Give an agent the missions and requests of the vectors `refusals`, and compare its answers."""
+"""Give an agent the missions and requests of the test vectors `refusals`, and compare its answers."""
 
 import base64
 import contextlib
@@ -27,7 +27,7 @@ def expected(vector: dict[str, Any], features: Sequence[str]) -> str:
 
 
 def wrong_missions(command: list[str], features: Sequence[str]) -> list[tuple[str, Any]]:
-    """Return the missions that the agent answers in another way in virtual time, with its answers."""
+    """Return the missions that the agent answers incorrectly in virtual time, with its answers."""
     differences = []
     with Player(command) as player:
         for vector in VECTORS["missions"]:
@@ -39,7 +39,7 @@ def wrong_missions(command: list[str], features: Sequence[str]) -> list[tuple[st
 
 
 def wrong_exits(command: list[str], features: Sequence[str], place: Path) -> list[tuple[str, int]]:
-    """Return the missions that end the agent with another exit status, as a program."""
+    """Return the missions for which the agent program has the wrong exit status."""
     status = {"lacks": UNSUPPORTED, "wrong": WRONG_MISSION}
     differences = []
     path = place / "7.mission.json"
@@ -57,7 +57,7 @@ def wrong_exits(command: list[str], features: Sequence[str], place: Path) -> lis
 
 
 def wrong_answers(command: list[str], place: Path) -> list[tuple[str, Any]]:
-    """Return the requests that the agent answers in another way on its control socket, with its answers."""
+    """Return the requests that the agent answers incorrectly on its control socket, with its answers."""
     differences = []
     with _served(command, place) as client, client.makefile("rwb") as stream:
         for vector in VECTORS["requests"]:

@@ -1,4 +1,4 @@
-"""Properties that hold after each step, for any behaviour of radio, clock and neighbours."""
+"""Test properties of an agent after each step, for any behaviour of radio, clock and neighbours."""
 
 import base64
 import pickle

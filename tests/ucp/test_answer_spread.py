@@ -1,4 +1,4 @@
-"""The wait of answers before they are sent, by the setting `answer_spread_s`."""
+"""Test the delay of answers by the setting `answer_spread_s`."""
 
 import pytest
 
@@ -15,7 +15,7 @@ SPREAD_S = 2.0
 
 
 def asked_agent(spread_s: float = SPREAD_S) -> Agent:
-    """Return an agent that has received two questions at mission second 1."""
+    """Return an agent that has received two queries at mission second 1."""
     agent = Agent(7, (1, 2, 7), b"inception", Settings(answer_spread_s=spread_s))
     top = agent.state.chain.top_chain_hash
     block = Block(1, 1, b"data")

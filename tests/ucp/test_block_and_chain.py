@@ -1,4 +1,4 @@
-"""Hashes follow the equations of the thesis, and a chain finds its blocks by hash."""
+"""Test that hashes follow the equations of the thesis, and that a chain finds its blocks by hash."""
 
 import hashlib
 

@@ -1,4 +1,4 @@
-"""Each branch of each event handler has a test, and the page of branches is up to date."""
+"""Test that each branch of each event handler has a test, and that the page of branches is up to date."""
 
 from tests.ucp.air import Air
 from tests.ucp.branches import PAGE, WHEN, branches_of, page, recorded, taken_by

@@ -1,4 +1,4 @@
-"""The agent in C (`ucp/contract/examples/ucp_agent.c`): the duties of any agent, and errors that only C allows."""
+"""Test the agent in C (`ucp/contract/examples/ucp_agent.c`): the duties of any agent, and errors typical of C."""
 
 import json
 import os
@@ -62,7 +62,7 @@ def agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The agent in C with sanitizers. It ends at the first undefined behaviour or memory leak."""
+    """Compile the agent in C with sanitizers. It ends at the first undefined behaviour or memory leak."""
     folder = tmp_path_factory.mktemp("checked")
     probe = ["cc", "-fsanitize=address,undefined", "-x", "c", "-o", folder / "probe", "-"]
     if shutil.which("cc") and subprocess.run(probe, input=b"int main(void){return 0;}", check=False).returncode != 0:
@@ -73,7 +73,7 @@ def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def secured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The secured agent in C with sanitizers. It ends at the first undefined behaviour or memory leak."""
+    """Compile the secured agent in C with sanitizers. It ends at the first undefined behaviour or memory leak."""
     folder = tmp_path_factory.mktemp("secured")
     probe = ["cc", "-fsanitize=address,undefined", "-x", "c", "-o", folder / "probe", "-", "-lcrypto"]
     code = b"#include <openssl/evp.h>\nint main(void){return EVP_chacha20_poly1305() == 0;}"
@@ -133,7 +133,7 @@ def test_agent_answers_ambiguous_requests_as_in_the_vectors(checked: Path, tmp_p
 
 
 def test_c_agent_passes_generated_vectors(agent: Path) -> None:
-    """Return the generated paths. Each is a list of states with their inputs, from the mission to the end."""
+    """Each generated path is a list of states with their inputs, from the mission to the end."""
     steps = list(explore(VARIANTS["default"]))[::8]
     lines = to_lines([VectorSet(VARIANTS["default"], steps, {step.key: step for step in steps})])
     by_number = {step["step"]: step for step in map(json.loads, lines) if "step" in step}
@@ -204,7 +204,7 @@ def test_c_agent_refuses_a_mission_in_one_sentence(
 
 
 def test_hostile_lines_do_not_harm_the_c_agent(checked: Path) -> None:
-    """The agent answers damaged lines of transcripts, and leaks no memory."""
+    """The agent answers damaged input lines, and leaks no memory."""
     random = Random(1)
     told = []
     for transcript in sorted(INDEX.parent.glob("*.jsonl")):
@@ -271,7 +271,7 @@ SECURED_RUN: dict[str, Any] = {
 
 
 def test_secured_c_agent_sends_the_same_bytes_as_our_agent(secured: Path) -> None:
-    """The mission is sealed and has a reboot, a revocation and replayed datagrams."""
+    """The mission is encrypted, and contains a reboot, an exclusion and repeated datagrams."""
     ours = scenario(agents=4, security={"seal": True}, **SECURED_RUN)
     mixed = ours.model_copy(update={"agent_command": {1: [str(secured)], 3: [str(secured)]}})
     played, among_ours = simulate(mixed, 1, tracing=True), simulate(ours, 1, tracing=True, deliver_all=True)

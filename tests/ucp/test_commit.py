@@ -1,4 +1,4 @@
-"""Tests of Algorithms 1 to 6, handler by handler."""
+"""Test Algorithms 1 to 6, handler by handler."""
 
 from random import Random
 

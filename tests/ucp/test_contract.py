@@ -1,4 +1,6 @@
-"""The schemas and vectors of the agent contract agree with the code, and its page explains all names of the formats."""
+"""Test that the schemas and test vectors of the agent contract agree with the code, and that its page explains all
+names.
+"""
 
 import copy
 import json
@@ -100,7 +102,7 @@ def test_mission_file_on_the_page_is_valid() -> None:
 
 @pytest.fixture(scope="module")
 def left(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Document]]]:
-    """The inputs of an agent, its outputs, and its files."""
+    """Return the inputs of an agent, its outputs, and its files."""
     directory = tmp_path_factory.mktemp("agent")
     told = mission()
     agent = AgentUnderTest(directory, told)

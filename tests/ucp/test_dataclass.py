@@ -1,4 +1,4 @@
-"""The agent's own dataclasses compared with those of the standard library."""
+"""Compare the agent's own dataclasses with those of the standard library."""
 
 import copy
 import dataclasses

@@ -1,4 +1,4 @@
-"""Tests of loggable events and Algorithm 21."""
+"""Test loggable events and Algorithm 21."""
 
 from random import Random
 

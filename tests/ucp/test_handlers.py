@@ -1,4 +1,4 @@
-"""Handlers follow their declarations, and the diagram shows these declarations."""
+"""Test that handlers follow their declarations, and that the diagram shows these declarations."""
 
 import ast
 from collections.abc import Iterator
@@ -52,7 +52,7 @@ def traces(**keys: Any) -> Iterator[Trace]:
 
 
 def done(trace: Trace, handlers: dict[str, EventHandler[Any]]) -> Iterator[tuple[str, str]]:
-    """Yield (handler, sent message, started timer or triggered event) of a trace. Fail at the first undeclared one."""
+    """Yield (handler, sent message, started timer or triggered event) for a trace. Fail at the first undeclared one."""
     for life in trace.incarnations():
         ran: set[str] = set()
         for number, run in life:
@@ -149,7 +149,7 @@ def test_driver_interface_offers_no_operation_on_the_state() -> None:
 
 
 def test_no_module_of_ucp_imports_in_a_circle() -> None:
-    """Imports for type checking count too. CycleError names the circle."""
+    """Imports for type checking count too. The CycleError names the circle."""
     folder = Path(ucp.__path__[0])
     modules = {path.stem: imported(path) for path in folder.glob("*.py")}
     order = list(TopologicalSorter(modules).static_order())

@@ -1,4 +1,4 @@
-"""The event loop of an agent's process, and the control socket that uses it."""
+"""Test the event loop of an agent's process, and the control socket that uses it."""
 
 import json
 import os
@@ -75,7 +75,7 @@ class Client:
         self.heard = b""
 
     def hear(self) -> bool:
-        """Return whether the server has closed the connection."""
+        """Return true if the server has closed the connection."""
         try:
             data = self.socket.recv(1 << 20)
         except BlockingIOError:

@@ -1,4 +1,4 @@
-"""The wire format: an encoded message decodes and fits one datagram, and other bytes are rejected."""
+"""Test the encoding of messages: an encoded message can be decoded, and other bytes are rejected."""
 
 import pytest
 from hypothesis import given

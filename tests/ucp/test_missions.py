@@ -1,4 +1,4 @@
-"""Missions of the thesis (Section 4.3) in virtual time: five agents, 20 minutes."""
+"""Test missions of the thesis (Section 4.3) in virtual time: five agents, 20 minutes."""
 
 from random import Random
 
@@ -48,7 +48,7 @@ def test_final_reconcile_makes_one_chain_after_15_percent_loss(seed: int) -> Non
 
 
 def mutual_share(loss: float, seeds: range = range(5)) -> float:
-    """Return the share of all blocks that are in the mutual chain, as the mean over a few missions."""
+    """Return the share of all blocks that all chains have in common, as the mean over a few missions."""
     shares = []
     for seed in seeds:
         air = mission(loss, seed)

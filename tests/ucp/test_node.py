@@ -1,4 +1,4 @@
-"""One agent as a process on loopback: its files, its control socket, and its reaction to errors."""
+"""Test one agent as a process: its files, its control socket, and its reaction to errors."""
 
 import asyncio
 import base64
@@ -100,7 +100,7 @@ class AgentUnderTest:
             time.sleep(0.005)
 
     def send(self, datagram: bytes) -> None:
-        """Send a datagram from another address than the agent's, which ignores its own echo."""
+        """Send a datagram from an address other than the agent's, which ignores its own datagrams."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.bind(("127.0.0.2", 0))
             sock.sendto(datagram, ("127.0.0.1", self.document["network"]["port"]))

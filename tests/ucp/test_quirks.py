@@ -1,4 +1,4 @@
-"""Wrong agents make the requested mistakes and are otherwise correct."""
+"""Test that agents with a deliberate error make this error and are otherwise correct."""
 
 from functools import cache
 from random import Random
@@ -33,7 +33,7 @@ def value(quirk: str) -> float | bool:
 
 @cache
 def traces(seed: int, quirk: str | None) -> dict[int, Trace]:
-    """Return the traces of a swarm with loss, duplicated messages, diverged chains and deques of many blocks."""
+    """Return the traces of a swarm with loss, duplicated messages, diverged chains and long deques."""
     difficult = scenario(
         duration_s=450,
         network={"loss": 0.25, "duplicate": 0.2},

@@ -1,4 +1,4 @@
-"""Tests of Algorithms 7 to 20, handler by handler, with divergences and ties that the thesis could not force."""
+"""Test Algorithms 7 to 20, handler by handler, with divergences and ties that the thesis could not force."""
 
 from itertools import accumulate, pairwise
 from random import Random
@@ -32,7 +32,7 @@ def part(*groups: set[int]):
 
 
 def diverged(blocks_on_2: int = 1, **settings: object) -> Air:
-    """Return three agents. 2 and 3 share a chain, and 1 has a different chain of one block."""
+    """Return three agents. 2 and 3 have the same chain, and 1 has a different chain of one block."""
     air = Air([1, 2, 3], fate=part({1}, {2, 3}), settings=Settings(**settings))
     air.fill_block(1)
     for _ in range(blocks_on_2):
@@ -147,7 +147,7 @@ def test_a_vote_against_a_diverged_chain_starts_the_reconcile() -> None:
 
 @takes("reconcile_phase_3", "from the stack")
 def test_block_on_the_stack_is_committed_without_a_request() -> None:
-    """2 and 3 have 1's first block on top of their blocks. Phase 3 finds it on 1's stack."""
+    """Agents 2 and 3 have agent 1's first block on top of theirs. Phase 3 finds it on agent 1's stack."""
     air = diverged()
     own = next(iter(air.agents[1].state.chain))
     for agent in (air.agents[2], air.agents[3]):
@@ -160,7 +160,7 @@ def test_block_on_the_stack_is_committed_without_a_request() -> None:
 
 @takes("receive_request_next_in_sequence", "diverged")
 def test_queried_agent_without_the_chain_starts_a_reconcile() -> None:
-    """Agent 3 missed a block. It detects this from the phase 2 query of agent 1 (Algorithm 13)."""
+    """Agent 3 missed a block. It notices this when it receives agent 1's phase 2 query (Algorithm 13)."""
     air = Air([1, 2, 3], fate=part({1, 2}, {3}))
     air.fill_block(1)
     air.settle()
@@ -236,7 +236,7 @@ def test_tie_in_phase_1_continues_with_phase_2_or_pops(phase1_tie: str, expected
 
 
 def in_phase_2(agents: int, **settings: object) -> Air:
-    """Return agents without a network. Agent 1 asked for the successor of the inception block at 5 s."""
+    """Return agents without a network. Agent 1 asked for the block after the inception block at 5 s."""
     air = Air(range(1, agents + 1), fate=lambda *_: [], settings=Settings(**settings))
     agent = air.agents[1]
     agent.begin_reconcile(0.0)
@@ -246,7 +246,7 @@ def in_phase_2(agents: int, **settings: object) -> Air:
 
 
 def phase_2(answers: list[tuple[bytes | None, int]], **settings: object) -> tuple[Air, str]:
-    """Give agent 1 one answer of phase 2 (block hash, timestamp) from each of the agents 2, 3, ..."""
+    """Give agent 1 an answer of phase 2 (block hash, timestamp) from each of the agents 2, 3, ..."""
     air = in_phase_2(len(answers) + 1, **settings)
     agent = air.agents[1]
     for sender, (block_hash, timestamp_us) in enumerate(answers, start=2):

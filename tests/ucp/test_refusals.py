@@ -1,4 +1,4 @@
-"""The agent of the harness treats ambiguous missions and requests as in the vectors."""
+"""Test that the agent of the harness treats ambiguous missions and requests as the test vectors require."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The scapy layers and the codec implement the same format: both read and reject the same bytes."""
+"""Test that the scapy layers and the codec implement the same format: both read and reject the same bytes."""
 
 import subprocess
 import sys
@@ -58,7 +58,7 @@ def crafted_events(event_data: bytes) -> list[Packet]:
 
 
 def crafted(message: Message) -> Packet:
-    """Return the layer of a message, made from its fields by name."""
+    """Return a message as a scapy layer, created from its fields by name."""
     fields: dict[str, Any] = {name: getattr(message, name) for name in message.WIRE}
     if "block" in fields:
         fields["block"] = crafted_block(fields["block"])

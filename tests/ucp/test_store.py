@@ -1,4 +1,4 @@
-"""The store of an agent on disk, and its continuation after a reboot."""
+"""Test the stored data of an agent, and its continuation after a reboot."""
 
 import errno
 import os
@@ -21,7 +21,7 @@ from ucp.trigger import BootTrigger
 
 
 class StoringAir(Air):
-    """A mission in virtual time in which agent 1 has a store."""
+    """A mission in virtual time in which agent 1 stores its data."""
 
     def __init__(self, path: Path, loss: float) -> None:
         super().__init__([1, 2, 3], uniform_latency(Random(1), loss=loss))
@@ -67,7 +67,7 @@ def test_store_always_equals_the_state_of_the_agent(tmp_path: Path) -> None:
 
 
 def test_booted_agent_has_its_blocks_and_commits_completed_ones() -> None:
-    """Brown-outs during votes and reconciles of a lossy mission lose and duplicate no block."""
+    """Power losses during votes and reconciles of a lossy mission lose and duplicate no block."""
     air = Air([1, 2, 3], uniform_latency(Random(2), loss=0.3))
     air.generate_events(seed=2, mean_s=5.0)
     rng = Random(3)

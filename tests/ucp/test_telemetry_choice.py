@@ -1,4 +1,4 @@
-"""The kinds of events to log are selected in a scenario, written to the mission file, and logged by the agent."""
+"""Test the selection of event kinds in a scenario, in the mission file, and in the agent."""
 
 import base64
 import json
@@ -66,7 +66,7 @@ def test_scenario_with_a_wrong_selection_is_rejected(tmp_path: Path, log: Any, s
 
 @pytest.fixture
 def vehicle_port() -> Iterator[int]:
-    """The port of a vehicle that sends its mode and a text to its first client."""
+    """Yield the port of a vehicle that sends its mode and a text to its first client."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def serve() -> None:

@@ -1,4 +1,4 @@
-"""Waypoints, failsafes and battery levels: the events in a vehicle's stream, and their text."""
+"""Test events in a vehicle's stream, such as waypoints, failsafes and battery levels, and their text."""
 
 import random
 import struct
@@ -97,7 +97,7 @@ def test_breached_fence_is_a_failsafe_although_it_is_not_critical() -> None:
     ("bit", "name"), [(mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG, "compass"), (mavlink.MAV_SYS_STATUS_SENSOR_GPS, "GPS")]
 )
 def test_sensor_lost_in_flight_is_a_failsafe_although_not_critical(bit: int, name: str) -> None:
-    """ArduPilot 4.7 reports a lost compass, and a plane a lost GPS, only with this bit."""
+    """ArduPilot 4.7 reports a lost compass, and a plane also a lost GPS, only with this bit."""
     lost = mavlink.MAVLink_sys_status_message(ALL | bit, ALL | bit, ALL, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)
     assert event_texts(source("failsafe"), heartbeat(ACTIVE), lost) == [f"[0.0 s] failsafe, active: {name}"]
 
@@ -114,7 +114,7 @@ def test_other_unhealthy_sensors_are_no_failsafe() -> None:
 
 
 def levels(percentages: Iterable[int]) -> list[int]:
-    """Return the percentages at which an event occurs."""
+    """Return the percentages of the battery at which an event occurs."""
     events = source("battery")
     return [left for left in percentages if events.receive(frames(status(left=left)), 0.0)]
 

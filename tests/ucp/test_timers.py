@@ -1,4 +1,4 @@
-"""The timer expires once, and can be paused and resumed (Section 3.2)."""
+"""Test the timer: it expires once, and can be paused and resumed (Section 3.2)."""
 
 from tests.ucp.air import Air
 from ucp.timers import Timer
@@ -22,7 +22,7 @@ def test_paused_timer_keeps_its_remaining_time() -> None:
 
 
 def test_expired_timers_are_handled_in_order_of_their_deadlines() -> None:
-    """A late node handles the expiry of a vote before the later expiry of a phase, each once."""
+    """A late agent handles the expiry of a vote before the later expiry of a phase, and each of them once."""
     air = Air([1, 2], fate=lambda *_: [])
     air.fill_block(1)
     agent = air.agents[1]

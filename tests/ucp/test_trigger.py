@@ -1,4 +1,4 @@
-"""Each kind of trigger is read from a trace and written as the same object."""
+"""Test that each kind of trigger is read from a trace and written as the same object."""
 
 from typing import Any
 

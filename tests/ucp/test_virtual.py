@@ -1,4 +1,4 @@
-"""The agent in virtual time: refused inputs change nothing."""
+"""Test the agent in virtual time: refused inputs change nothing."""
 
 import io
 import json

@@ -1,4 +1,6 @@
-"""The Wireshark dissector, run by tshark, shows each declared field and rejects the same datagrams as the codec."""
+"""Test the Wireshark dissector with tshark: it shows each declared field, and rejects the same datagrams as the
+codec.
+"""
 
 import json
 import os
@@ -67,7 +69,7 @@ def frame(datagram: bytes) -> bytes:
 
 
 def tshark(folder: Path, frames: Sequence[bytes], *options: str, captured: int | None = None) -> str:
-    """Return the output of tshark for frames with `captured` captured bytes (None: all). Skip without tshark."""
+    """Return the output of tshark for these frames, of which `captured` bytes were captured (None means all)."""
     program = require_tshark()
     capture = folder / "air.pcap"
     with RawPcapWriter(str(capture), linktype=1) as writer:
@@ -84,14 +86,14 @@ def tshark(folder: Path, frames: Sequence[bytes], *options: str, captured: int |
 
 
 def layers(folder: Path, datagrams: Sequence[bytes], captured: int | None = None) -> list[dict[str, Any]]:
-    """Return the dissector's tree of each datagram, with `captured` bytes of each frame."""
+    """Return the dissector's tree for each datagram, with `captured` bytes of each frame."""
     options = ("-T", "json", "-J", "ucpchain", "--no-duplicate-keys")
     packets = json.loads(tshark(folder, [frame(datagram) for datagram in datagrams], *options, captured=captured))
     return [packet["_source"]["layers"]["ucpchain"] for packet in packets]
 
 
 def experts(tree: Any) -> dict[str, str]:
-    """Yield name and message of all expert information in a tree."""
+    """Return the name and message of all expert information in a tree."""
     if isinstance(tree, list):
         return {name: message for part in tree for name, message in experts(part).items()}
     if not isinstance(tree, dict):
@@ -101,7 +103,7 @@ def experts(tree: Any) -> dict[str, str]:
 
 
 def shown(prefix: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Return values as tshark shows them. It does not show omitted fields."""
+    """Return values in the form in which tshark shows them. Omitted fields are not shown."""
     text: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, Block):

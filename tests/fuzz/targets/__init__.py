@@ -1,4 +1,4 @@
-"""The targets by name. Each is a module with the functions `run`, which reads an input, and `seeds`, for valid inputs.
+"""List the fuzz targets by name. Each is a module with a function `run` for an input, and `seeds` for valid inputs.
 
 datagram    a datagram on the port: codec, scapy's layers, events in a block
 agent       an agent in any state, with forged messages, timers, events and reboots

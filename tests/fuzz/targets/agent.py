@@ -1,8 +1,8 @@
-"""An agent driven by a program: an input is a run of operations, each a byte and what it takes.
+"""Fuzz target: an agent. The input is a sequence of operations, each of which is a byte with its arguments.
 
-Whatever a program does, the agent raises nothing, what is dropped changes nothing, what cannot matter to it
-(`ucp.interest`) changes nothing, its trace says all that it changes, the reference core does the same at every step,
-and it can be booted from what it holds.
+For any sequence of operations, these conditions hold. The agent raises no exception. Dropped datagrams, and messages
+that cannot have an effect (`ucp.interest`), change nothing. The trace contains every change. The reference
+implementation takes the same steps. The agent can restart from its stored data.
 """
 
 import pickle
@@ -52,7 +52,7 @@ _TIMES_US = (0, 1, 2_000_000, 2**32, 2**63, 2**64 - 1)
 
 
 class _Program:
-    """The bytes of an input, one after another; zeros follow its end."""
+    """The bytes of an input, one after another. Zeros follow its end."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._position = data, 0
@@ -71,7 +71,7 @@ class _Program:
 
 
 class _Driven:
-    """An agent, and what its trace has said by now."""
+    """An agent that executes the operations, and its trace so far."""
 
     def __init__(self, settings: Settings) -> None:
         self.now = 0.0
@@ -102,7 +102,7 @@ class _Driven:
             self._reboot()
 
     def _wait(self, seconds: float | None) -> None:
-        """So long, or until the next timer ends; no timer is late."""
+        """Wait for this number of seconds, or until the next timer expires."""
         ends = self.agent.next_timer()
         until = self.now + seconds if seconds is not None else self.now if ends is None else ends
         while ends is not None and ends <= until:
@@ -113,7 +113,9 @@ class _Driven:
         self.now = until
 
     def _hear(self, sender: int, message: Message) -> None:
-        """From one of the others mostly, who may be in no roster; what cannot matter changes nothing."""
+        """Give the agent a message, mostly of another agent of the mission. A message that cannot matter must change
+        nothing.
+        """
         sender = sender or 1 if sender < 6 else 2 + sender % 3
         matters = sender in ROSTER[1:] and MATTERS[type(message)](self.agent.state, sender, message)
         before = None if matters else _of(self.agent)
@@ -156,7 +158,7 @@ class _Driven:
                 return BlockResponse(block)
 
     def _chain_hash(self, choice: int) -> bytes:
-        """One of the agent's chain, the top first, or what would come of a block of another on it."""
+        """Return a chain hash: one of the agent's chain, or the hash after another block on it."""
         chain = self.agent.state.chain
         hashes = [chain_hash for _, chain_hash in chain.with_chain_hashes()][::-1]
         hashes += [chain.inception.chain_hash, self.agent.state.top_chain_hash_at_initiation or bytes(32)]
@@ -164,7 +166,7 @@ class _Driven:
         return hashes[choice % len(hashes)]
 
     def _block(self, choice: int) -> Block:
-        """One that the agent holds, or one of another."""
+        """Return a block that the agent holds, or a new block of another agent."""
         state = self.agent.state
         blocks = [*self.strangers, *state.blocks_to_be_committed, *state.reconcile_stack[::-1], *state.chain]
         return blocks[choice % len(blocks)]
@@ -183,7 +185,7 @@ class _Driven:
         )
 
     def look(self) -> None:
-        """What it sent can be read, and its trace says what it holds."""
+        """Check that the sent messages can be decoded, and that the trace describes the held blocks."""
         for datagram in self.agent.datagrams_to_send():
             require(len(datagram) <= MAX_DATAGRAM_BYTES, "it sends what no datagram holds")
             require(decode(datagram).encode() == datagram, "it sends what is read otherwise")
@@ -199,7 +201,7 @@ class _Driven:
         require(set(self.held.completed) == {done.hex() for done in self.agent.state.completed}, "completed otherwise")
 
     def judge(self) -> None:
-        """As the reference core does it."""
+        """Check that the agent's trace follows the reference implementation."""
         header, parts = checked(self.trace.header), OptionalParts.of(self.trace)
         for life in self.trace.incarnations():
             follower = Follower(header, parts, Blocks(()), lambda since, until: False)
@@ -215,7 +217,7 @@ class _Driven:
 
 
 def _of(agent: Agent) -> bytes:
-    """All that the agent holds, asks and will do."""
+    """Return all data that determine the agent's later behaviour."""
     state = {name: value for name, value in vars(agent.state).items() if name not in ("now", "running", "changes")}
     return pickle.dumps({**state, "chain": vars(agent.state.chain)})
 
@@ -232,7 +234,7 @@ def run(data: bytes) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """A commit, a lost vote, and a reconcile through all of its phases."""
+    """Yield sequences of operations: a commit, a lost vote, and a reconcile with all its phases."""
     block = bytes([12, 1, 255, 12, 1, 255, 12, 1, 255, 12, 1, 255])
     for settings in range(len(SETTINGS)):
         yes = bytes([1, 2, 0, 3, 1, 1, 3, 0, 3, 1])

@@ -1,4 +1,4 @@
-"""An answer of an agent on its control socket. The reader accepts it as a status, or refuses it in one sentence."""
+"""Fuzz target: an agent's answer on its control socket. It must be accepted as a status, or refused in one sentence."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""ROS bags of both versions: what a file begins with says what it is called."""
+"""Fuzz target: ROS bags of both versions. The first bytes of the input determine the file name."""
 
 from collections.abc import Iterator
 from itertools import islice

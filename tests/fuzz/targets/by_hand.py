@@ -1,4 +1,4 @@
-"""Requests to an active run. Each line gets an answer, and the recorded scenario plays the same events again.
+"""Fuzz target: requests to an active run. Each line gets an answer, and the recorded scenario repeats the events.
 
 The mission is in virtual time. It pauses between the requests, and then continues to its end.
 """

@@ -1,4 +1,4 @@
-"""A capture, pcapng or pcap: read, joined with another, shown; its frames are written and read the same."""
+"""Fuzz target: a packet capture (pcapng or pcap). It is read, joined with another, and printed."""
 
 import struct
 from collections.abc import Iterator
@@ -50,7 +50,7 @@ def _same_again(frames: list[Frame], path: Path) -> None:
 
 
 def _show(paths: list[Path]) -> None:
-    """Format the capture as `ucp-harness packets` does."""
+    """Print the capture like `ucp-harness packets`."""
     captures = read_captures(paths)
     for sentence in (*captures.errors, *captures.problems):
         sound(sentence)

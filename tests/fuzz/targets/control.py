@@ -1,4 +1,4 @@
-"""The control socket of a running agent. Each line of a client gets an answer, and the agent continues to run."""
+"""Fuzz target: the control socket of a running agent. Each line gets an answer, and the agent continues to run."""
 
 import json
 import os
@@ -56,7 +56,7 @@ def _own_signal_handlers() -> Iterator[None]:
 
 
 def _converse(directory: Path, lines: list[bytes]) -> None:
-    """From a thread beside the agent, which it ends."""
+    """Send the lines from a second thread, and then end the agent."""
     try:
         path = directory / "1.control"
         deadline = time.monotonic() + _ANSWER_S

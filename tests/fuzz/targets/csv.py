@@ -1,4 +1,4 @@
-"""Records of other implementations in CSV."""
+"""Fuzz target: records of other programs in a CSV file."""
 
 from collections.abc import Iterator
 from itertools import islice

@@ -1,4 +1,4 @@
-"""A datagram on the port. The encoder reproduces an accepted datagram byte for byte, and scapy reads the same."""
+"""Fuzz target: a received datagram. If it is accepted, the encoder reproduces it, and scapy reads the same content."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,7 +23,7 @@ def run(data: bytes) -> None:
 
 @contextmanager
 def _scapy_raises() -> Iterator[None]:
-    """Let scapy raise the errors of its layers, which it hides by default."""
+    """Let scapy raise the errors of its layers, which it normally hides."""
     conf.debug_dissector, before = True, conf.debug_dissector
     try:
         yield

@@ -1,4 +1,4 @@
-"""A chain export, mission file or manifest at the depot. It is consolidated and compared."""
+"""Fuzz target: a chain export, mission file or manifest. It is merged with others and compared."""
 
 import json
 from collections.abc import Iterator

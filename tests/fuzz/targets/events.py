@@ -1,4 +1,4 @@
-"""A log of events, written outside the agent (`ucp-events/1`)."""
+"""Fuzz target: a log of events that a separate recorder wrote (`ucp-events/1`)."""
 
 import json
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""A chain export: refused in a sentence, or written and read the same, and put together with others."""
+"""Fuzz target: a chain export. It is refused in one sentence, or reproduced by the writer and merged with others."""
 
 from collections.abc import Iterator
 from pathlib import Path

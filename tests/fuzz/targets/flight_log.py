@@ -1,4 +1,6 @@
-"""Flight logs of vehicles. The first byte chooses the suffix of the file, which matters for a damaged beginning."""
+"""Fuzz target: flight logs of vehicles. The first byte selects the file name suffix, which matters if the beginning is
+damaged.
+"""
 
 from collections.abc import Iterator
 from itertools import islice

@@ -1,4 +1,4 @@
-"""A swarm in virtual time of which one agent is a program of somebody's: its answers may be any, the run ends.
+"""Fuzz target: the answers of a foreign agent (a separate program) in a simulated swarm. The run must always end.
 
 The program is ours, in this process, but for some answers. An input is lines `{"n":5,"answer":{...}}`: its answer
 number 5, counted from 0 through all its lives, is this, whatever it is.
@@ -85,7 +85,7 @@ def run(data: bytes) -> None:
 
 
 def _play(replaced: dict[int, bytes]) -> list[bytes]:
-    """Play the scenario, and return the answers without replacements."""
+    """Play the scenario with some answers replaced. Return the original answers."""
     ours = type("Replaced", (_OwnAgentProgram,), {"answers": [], "replaced": replaced})
     with (
         patch.object(_virtual_program, "LineProgram", ours),
@@ -112,7 +112,7 @@ def _judge(result: checker.Result) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """Answers as they are, of each kind."""
+    """Yield correct answers of each kind."""
     kept, kinds = [], set[frozenset[bytes]]()
     for number, answer in enumerate(_play({})[:999]):
         kind = frozenset(re.findall(rb'"(?:handler|message|answer|store|schema)":"?\w*', answer))

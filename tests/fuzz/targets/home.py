@@ -1,4 +1,5 @@
-"""Files from the field, and all code that reads them: it raises no traceback, and reports each unused file.
+"""Fuzz target: files of a real flight, and all code that reads them. It raises no traceback and reports each unused
+file.
 
 A file is ingested alone and together with undamaged files. It is imported, replayed if it is a trace, and read from the
 archive of its run. Slow steps are done for a part of the inputs, which depends on the input alone.
@@ -30,7 +31,7 @@ _AGENTS = {1, 2, 3}
 
 
 def run_of_three(directory: Path) -> Path:
-    """A run whose files are small: traces and captures have only their beginnings."""
+    """Play a run with small files: traces and packet captures contain only their beginnings."""
     run = flown(directory, duration_s=DURATION_S, capture=True)
     for trace in (run / "agents").glob("*.trace.jsonl"):
         trace.write_bytes(b"".join(trace.read_bytes().splitlines(keepends=True)[:TRACE_LINES]))
@@ -56,12 +57,12 @@ def _place() -> TemporaryDirectory[str]:
 
 @cache
 def sound_run() -> Path:
-    """Return the run of this process. A target replaces one of its files, and restores the file at its end."""
+    """Return the run of this process. A target replaces one of its files and restores it afterwards."""
     return run_of_three(Path(_place().name) / "run")
 
 
 def came_home(name: str, data: bytes) -> None:
-    """Ingest and import a file with this name and content."""
+    """Read and import a file with this name and content."""
     lot = zlib.crc32(data)
     with TemporaryDirectory() as directory:
         path = Path(directory) / name
@@ -76,7 +77,7 @@ def came_home(name: str, data: bytes) -> None:
 
 
 def in_its_run(place: str, data: bytes) -> None:
-    """Read a run whose file at `place` has this content."""
+    """Read a run in which the file at `place` has this content."""
     run = sound_run()
     path = run / place
     whole = path.read_bytes() if path.exists() else None
@@ -91,7 +92,7 @@ def in_its_run(place: str, data: bytes) -> None:
 
 
 def _named(path: Path, result: IngestResult) -> None:
-    """Require a sentence for each unused file or line."""
+    """Check that there is a sentence for each unused file or line."""
     for sentence in result.sentences():
         sound(sentence)
     dropped = bool(result.left_out)
@@ -109,7 +110,7 @@ def _named(path: Path, result: IngestResult) -> None:
 
 
 def _among_others(path: Path) -> None:
-    """Require that undamaged files are used in spite of a damaged file."""
+    """Check that undamaged files are used in spite of a damaged file."""
     result = ingest_files([sound_run(), path])
     for sentence in result.sentences():
         sound(sentence)
@@ -118,7 +119,7 @@ def _among_others(path: Path) -> None:
 
 
 def _check(out: Path) -> None:
-    """Judge the imported records, or refuse them in one sentence."""
+    """Check that the imported records can be judged, or are refused in one sentence."""
     try:
         result = checker.check(checker.gather(RunArchive(out)))
     except HarnessError as error:  # captures alone are not judged
@@ -129,7 +130,7 @@ def _check(out: Path) -> None:
 
 
 def _import(path: Path, out: Path) -> bool:
-    """Import the file. Return whether a part of it was usable."""
+    """Import the file. Return true if a part of it could be used."""
     try:
         record = import_records([path], [CsvAdapter(), RosBag()], out)
     except HarnessError as error:
@@ -158,7 +159,7 @@ def _replay(path: Path) -> None:
 
 
 def _archive(run: Path) -> None:
-    """The archive's own readers, which all other commands stand on."""
+    """Read the run with the archive, on which all other commands depend."""
     archive = RunArchive(run)
     sentences = [*archive.problems, *archive.gaps]
     list(archive.injected(RogueInjection))

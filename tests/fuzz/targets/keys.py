@@ -1,4 +1,5 @@
-"""Files of keys: bundles, public keys, private ones, revocations. Refused in a sentence, or read, and written the same.
+"""Fuzz target: key files (bundles, public keys, private keys, lists of excluded vehicles). They are refused, or
+reproduced by the writer.
 
 An input is a file, put in the place of one of those in a directory of good keys; its schema says of which.
 """
@@ -20,7 +21,7 @@ _GOOD = TemporaryDirectory(prefix="ucp-keys-")
 
 
 def _home() -> Path:
-    """Keys of three vehicles, one of which is revoked, made once."""
+    """Return a directory with the keys of three vehicles, one of which is excluded."""
     home = Path(_GOOD.name) / "home"
     if not home.exists():
         made = Home.new(home, [1, 7, 28], seals=True, epoch_s=600.0)
@@ -40,7 +41,7 @@ def run(data: bytes) -> None:
 
 
 def _read(home: Path, path: Path) -> None:
-    """As all commands do that read it."""
+    """Read a key file in the same way as all commands."""
     kept = Home(home)
     for read in (lambda: inspect(path), lambda: kept.bundles(), lambda: kept.revoke([1]), lambda: load_depot_key(home)):
         try:
@@ -61,7 +62,7 @@ def _read(home: Path, path: Path) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """One of each kind, and a bundle of a later epoch."""
+    """Yield a key file of each kind, and one with a later epoch."""
     for name in NAMES:
         yield (_home() / name).read_bytes()
     document = json.loads((_home() / NAMES[0]).read_bytes())

@@ -1,4 +1,4 @@
-"""A matrix in YAML; or, if it is JSON, an earlier night's record, and results of which a command goes on."""
+"""Fuzz target: a matrix file in YAML. JSON inputs are earlier results, with which a command continues."""
 
 from collections.abc import Iterator
 from pathlib import Path

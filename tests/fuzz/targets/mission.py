@@ -1,4 +1,4 @@
-"""A mission file. It is refused in one sentence, or a writer reproduces it, and an agent can play the mission."""
+"""Fuzz target: a mission file. It is refused in one sentence, or reproduced by the writer, and an agent can play it."""
 
 import base64
 import dataclasses
@@ -44,7 +44,7 @@ def _written(mission: Mission) -> dict[str, Any]:
 
 
 def _fly(mission: Mission) -> None:
-    """Use the mission as `ucp.node` does at its start."""
+    """Create an agent from the mission, as `ucp.node` does at its start."""
     lots = Random(mission.seed)
     mission.events.vehicle_host.encode("idna")
     agent = Agent(

@@ -1,4 +1,4 @@
-"""network.jsonl, the record of network conditions and of faults."""
+"""Fuzz target: network.jsonl, the record of network conditions and faults."""
 
 from collections.abc import Iterator
 from pathlib import Path

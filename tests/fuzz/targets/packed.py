@@ -1,4 +1,4 @@
-"""A trace that gzip compressed."""
+"""Fuzz target: a trace that gzip has compressed."""
 
 import gzip
 from collections.abc import Iterator

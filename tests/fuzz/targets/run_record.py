@@ -1,4 +1,4 @@
-"""run.json, whole, cut off, or of anybody: what of it fits is written and read the same."""
+"""Fuzz target: run.json, complete, truncated or foreign. Its valid part is reproduced by the writer."""
 
 from collections.abc import Iterator
 from pathlib import Path

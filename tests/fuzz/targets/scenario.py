@@ -1,4 +1,5 @@
-"""A scenario in YAML: refused in a sentence, or written and read the same; a short one is played and judged.
+"""Fuzz target: a scenario in YAML. It is refused in one sentence, or reproduced by the writer. A short one is also
+played.
 
 So scripted fates, lateness, datagrams and events are not only read but done.
 """
@@ -78,7 +79,7 @@ def run(data: bytes) -> None:
 
 
 def _short(scenario: Scenario) -> bool:
-    """Return whether a run of the scenario is fast, and starts no program that the input names."""
+    """Return true if a run of the scenario is fast, and starts no program that the input names."""
     entries = len(scenario.events.script) + len(scenario.timeline) + len(scenario.datagrams) + len(scenario.fates)
     injects = any(entry.injection for entry in scenario.timeline)
     return (
@@ -94,7 +95,7 @@ def _short(scenario: Scenario) -> bool:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """Yield the scenarios of the library, and a short one with every list."""
+    """Yield the included scenarios, and a short one that uses every list."""
     for scenario in sorted(LIBRARY.glob("*.yaml")):
         if scenario.stat().st_size < LARGEST_SEED:
             yield scenario.read_bytes()

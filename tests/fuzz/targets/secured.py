@@ -1,9 +1,9 @@
-"""An agent with keys, driven by a program: an input is a run of operations, each a byte and what it takes.
+"""Fuzz target: an agent with keys. The input is a sequence of operations, each of which is a byte with its arguments.
 
-Others with keys say to it what they like, well sealed and signed, or sealed with what they do not have, damaged,
-again, of any epoch and any life; the authority revokes anybody. The agent raises nothing, keeps no more than there are
-vehicles and blocks, what is dropped before its signature is verified changes nothing, and it does as one that shares
-its cached cryptography with others in virtual time.
+Other agents send any message: correctly encrypted and signed, with keys that they do not have, damaged, repeated, of
+any epoch and any restart. The authority excludes any agent. These conditions hold. The agent raises no exception. Its
+memory is limited by the numbers of vehicles and blocks. A datagram that is dropped before its signature is verified
+changes nothing. The agent behaves like one that shares cached cryptography with others in virtual time.
 """
 
 from collections.abc import Iterator
@@ -55,7 +55,7 @@ BEFORE_ITS_SIGNATURE = {
 
 
 class _Program:
-    """The bytes of an input, one after another; zeros follow its end."""
+    """The bytes of an input, one after another. Zeros follow its end."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._position = data, 0
@@ -73,7 +73,7 @@ class _Program:
 
 
 class _Driven:
-    """The agent, and what others have said to it."""
+    """The agent, and the messages that other agents have sent to it."""
 
     def __init__(self, crypto: CryptoFunctions) -> None:
         self.now = 0.0
@@ -117,7 +117,7 @@ class _Driven:
             self._reboot()
 
     def _sealed(self, program: _Program, said: tuple[int, bytes] | bytes) -> bytes:
-        """Of one of the others, signed by it or by another, in any epoch and life."""
+        """Return an encrypted datagram of another agent, correctly signed or not, of any epoch and any restart."""
         who, lies = program.byte(), program.byte()
         sender, signer = 2 + who % 3, 2 + (who if lies % 8 else who + 1) % 3
         epoch = min(len(self._secrets) - 1, max(0, int(self.now // KEYS.public.epoch_s) + lies // 8 % 16 - 3))
@@ -135,7 +135,7 @@ class _Driven:
         return datagram
 
     def _body(self, program: _Program) -> tuple[int, bytes]:
-        """A message as it should be, which answers what it likes."""
+        """Return a correct message, which may answer any request."""
         code, choice = 1 + program.byte() % 9, program.byte()
         state = self.agent.state
         blocks = [*BLOCKS, *state.blocks_to_be_committed, *state.chain]
@@ -208,7 +208,9 @@ class _Driven:
         self.agent.boot(stored, self.now)
 
     def look(self) -> None:
-        """What it sends is opened by others, what it keeps is bounded, and its trace can be written."""
+        """Check that other agents can decrypt the sent messages, that memory is limited, and that the trace can be
+        written.
+        """
         agent, session = self.agent, self.agent.session
         for datagram in agent.datagrams_to_send():
             require(len(datagram) <= MAX_DATAGRAM_BYTES, "it sends what no datagram holds")
@@ -228,7 +230,7 @@ class _Driven:
 
 
 def _of(agent: SecuredAgent) -> dict[str, Any]:
-    """All that a datagram might change."""
+    """Return all data that a datagram might change."""
     state, session = agent.state, agent.session
     return {
         "received": agent.received.copy(),
@@ -264,7 +266,9 @@ def run(data: bytes) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """A block that is voted on; commits, signed and not; a reconcile; epochs, lives and revocations; a reboot."""
+    """Yield operations: a vote, commits with and without signatures, a reconcile, epochs, restarts, exclusions, and a
+    power loss.
+    """
     block = bytes([13, 1, 40, 13, 1, 40, 13, 1, 40])
     commit, unsigned = bytes([1, 2, 128, 0, 24 + 1]), bytes([1, 2, 0, 0, 24 + 1])
     vote = bytes([1, 1, 67, 0, 24 + 1])

@@ -1,4 +1,4 @@
-"""A secured run's export with signatures, or its public keys: judged without a traceback, whatever either has become.
+"""Fuzz target: the signed export of a secured run, or its public keys. Both are judged without a traceback.
 
 The first byte of an input says which file the rest is put in the place of.
 """

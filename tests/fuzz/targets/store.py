@@ -1,4 +1,4 @@
-"""What a brown-out left on the disk: raw, or, if it begins with a brace, lines to which the right checksums are put.
+"""Fuzz target: the stored data of an agent. An input that begins with a brace gets correct checksums.
 
 It is refused in a sentence or it is a state that an agent boots from, and that is written and read again the same.
 """
@@ -56,7 +56,7 @@ def _agent() -> Agent:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """A store with all places filled, as it stands and without its checksums."""
+    """Yield a store with blocks in all places, with and without its checksums."""
     with TemporaryDirectory() as directory:
         path = Path(directory) / "1.store"
         agent = _agent()

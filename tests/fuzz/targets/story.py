@@ -1,4 +1,4 @@
-"""A story file. It is refused in one sentence, or its text without answers is the same story again."""
+"""Fuzz target: a story file. It is refused in one sentence, or its text without reactions gives the same story."""
 
 from collections.abc import Iterator
 from pathlib import Path

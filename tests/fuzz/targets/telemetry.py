@@ -1,4 +1,4 @@
-"""MAVLink of a vehicle, in pieces. Each resulting event fits into a block, and has a description in words."""
+"""Fuzz target: the MAVLink stream of a vehicle. Each resulting event fits into a block and has a description."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,6 @@
-"""A trace of either version: what is read of it is written the same, and all that stands on traces bears it."""
+"""Fuzz target: a trace of either version. Its readable part is reproduced by the writer, and all users of traces accept
+it.
+"""
 
 import json
 from collections.abc import Iterator

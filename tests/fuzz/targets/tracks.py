@@ -1,4 +1,4 @@
-"""tracks.jsonl, the positions of the vehicles."""
+"""Fuzz target: tracks.jsonl, the positions of the vehicles."""
 
 import json
 from collections.abc import Iterator

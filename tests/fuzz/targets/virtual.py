@@ -1,6 +1,6 @@
-"""An agent in virtual time: whatever lines it is given, each is answered by one line of JSON, and again the same.
+"""Fuzz target: an agent in virtual time. Each input line gets one JSON line as answer, and the same one each time.
 
-The reference core does the same at every step, and what a brown-out leaves is booted from.
+The reference implementation takes the same steps, and the agent can restart from its stored data.
 """
 
 import base64
@@ -71,7 +71,7 @@ _MISSION = _mission()
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """A block that is committed, one of another, a reconcile, and every command."""
+    """Yield input lines: a commit, a block of another agent, a reconcile, and every command."""
     block = Block(2, 5, b"of two")
     chain_hash = next_chain_hash(InceptionBlock(b"fuzz").chain_hash, block.block_hash)
     commit = in_base64(encode(2, 0, CommitBlock(block, chain_hash)))

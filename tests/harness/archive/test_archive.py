@@ -1,4 +1,4 @@
-"""RunArchive: all commands report the same problems of a run, complete or damaged."""
+"""Test the archive of a run: all commands report the same problems of a complete or damaged run."""
 
 import re
 import shutil
@@ -29,7 +29,7 @@ FILES = [
 
 @pytest.fixture(scope="module")
 def intact_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of three agents in virtual time."""
+    """Play a run of three agents in virtual time."""
     asked = scenario(agents=3, duration_s=300, network={"loss": 0.3})
     return run(asked, 3, tmp_path_factory.mktemp("whole") / "run", Silent(), backend="sim").directory
 
@@ -93,7 +93,7 @@ def test_all_commands_report_the_same_problems_of_a_damaged_run(
 
 
 def reported(directory: Path) -> set[str] | None:
-    """Return the damaged or missing files that the report names. None if it rejects a record of another version."""
+    """Return the damaged or missing files that the report names, or None if it rejects the record."""
     try:
         remains = read_source(RunArchive(directory, skim=True))
     except RunDirectoryError as error:
@@ -178,7 +178,7 @@ def test_skimmed_archive_reports_the_same_problems(intact_run: Path, tmp_path: P
 
 
 def recording(reader: Callable[..., Any], read: list[object]) -> Callable[..., Any]:
-    """Return the reader in a wrapper that records each path it reads."""
+    """Return a wrapper around the reader that records each path it reads."""
 
     def recorded(what: Any, **options: Any) -> Any:
         what = what if isinstance(what, Path) else tuple(what)

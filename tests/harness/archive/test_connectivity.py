@@ -1,4 +1,4 @@
-"""Connectivity: links and components of vehicles follow from the recorded changes of the network."""
+"""Test which vehicles are connected, as it follows from the recorded changes of the network."""
 
 import json
 from pathlib import Path
@@ -111,7 +111,7 @@ def test_lost_vehicle_has_no_links_until_its_replacement(tmp_path: Path) -> None
 
 
 def test_flight_changes_agree_with_the_recorded_details(tmp_path: Path) -> None:
-    """Compare with the details in run.json, while five vehicles fly apart and together during a partition."""
+    """Compare with the details in run.json, while five vehicles fly apart and back during a partition."""
     scenario = Scenario.model_validate(
         {
             "name": "pulse",

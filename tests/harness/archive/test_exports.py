@@ -1,4 +1,4 @@
-"""Exports from the field: each unusable file gives one sentence, and the others are read."""
+"""Test chain exports of real flights: each unusable file gives one sentence, and the others are read."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""History and replication: votes, reconciles and messages of known runs, and the spread of blocks over time."""
+"""Test the history of known runs: votes, reconciles, messages, and the number of copies over time."""
 
 from pathlib import Path
 from typing import Any

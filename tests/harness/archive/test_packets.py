@@ -1,4 +1,4 @@
-"""Joined captures: receivers, losses, answers and forgeries of each datagram."""
+"""Test joined packet captures: receivers, losses, answers and forged datagrams."""
 
 from collections import Counter
 from pathlib import Path
@@ -91,7 +91,7 @@ def test_losses_are_exactly_those_of_the_medium(finished_flight: tuple[Air, Capt
 
 
 def test_each_response_matches_the_request_in_the_trace(finished_flight: tuple[Air, Captures], run_dir: Path) -> None:
-    """Compare with the agents' traces, which record the message that triggered each response."""
+    """Compare with the agents' traces, which name the message that triggered each answer."""
     air, _ = finished_flight
     found = join(read(run_dir))
     exchanges = Exchanges(found)
@@ -300,7 +300,7 @@ def test_incomplete_capture_proves_no_forgery(tmp_path: Path) -> None:
 
 
 def test_field_captures_count_time_from_the_first_packet(tmp_path: Path) -> None:
-    """Give a file the vehicle's ID as its name: its own datagrams are outbound. Other files are observation points."""
+    """Captures named after a vehicle contain its own datagrams as outbound. Other files are other observers."""
     query, answer = frame(1, encode(1, 0, QUERY)), frame(2, encode(2, 0, ChainContainResponse(CHAIN, True)))
     (tmp_path / "1.pcap").write_bytes(pcap([(1_000_000, query), (1_500_000, answer)]))
     (tmp_path / "2.pcap").write_bytes(pcap([(1_250_000, query), (1_250_000, answer)]))

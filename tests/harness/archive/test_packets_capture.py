@@ -1,4 +1,4 @@
-"""Capture files: both formats, both byte orders, truncated files and hostile files."""
+"""Test packet capture files: both formats, both byte orders, truncated files and hostile files."""
 
 import struct
 from pathlib import Path
@@ -134,7 +134,7 @@ def test_unwrap_accepts_ucp_on_another_port() -> None:
 
 
 def test_unwrap_detects_every_flipped_bit() -> None:
-    """Compare with the receiver's kernel, which drops such a frame."""
+    """Compare with the Linux kernel of a receiver, which drops a damaged frame."""
     ethernet = frame(7, QUERY)
     for bit in range(8 * 14, 8 * len(ethernet)):
         flipped = bytearray(ethernet)

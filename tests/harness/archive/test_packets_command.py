@@ -1,4 +1,4 @@
-"""The command `ucp-harness packets`, as a user calls it."""
+"""Test the command `ucp-harness packets`."""
 
 import json
 import re
@@ -22,7 +22,9 @@ BEFORE, AFTER = bytes(32), bytes(range(32))
 
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
-    """Write captures in which vehicle 1 proposes and commits a block, 3 loses the commit, and 1 loses the vote of 3."""
+    """Write captures in which vehicle 1 proposes and commits a block, 3 misses the commit, and 1 misses the vote of
+    3.
+    """
     scene = CaptureScript(1, 2, 3)
     scene.send(10, 1, BlockAddRequest(BLOCK.block_hash, BEFORE))
     scene.send(10.02, 2, BlockAddResponse(BLOCK.block_hash, True))

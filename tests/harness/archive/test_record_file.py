@@ -1,4 +1,4 @@
-"""run.json: valid parts are used, invalid parts are reported, and the checker needs all its keys."""
+"""Test run.json: valid parts are used, invalid parts are reported, and the checker needs all its keys."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""The run directory: it is new or empty, and traces of later incarnations are appended."""
+"""Test the run directory: it must be new or empty, and traces of restarted agents are appended."""
 
 from pathlib import Path
 

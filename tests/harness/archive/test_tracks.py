@@ -1,4 +1,4 @@
-"""Tracks: complete, damaged and hostile files."""
+"""Test the recorded positions of vehicles in complete, damaged and hostile files."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Unknown names in traces: they cause no violation and no wrong figure, but a wrong algorithm number is found."""
+"""Test undefined names in traces: they cause no violation, but a wrong Algorithm number is found."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -55,7 +55,7 @@ def unknown_name(name: str) -> str:
 
 
 def renamings() -> Iterator[tuple[str, Rename]]:
-    """Yield each name of the vocabulary with a function that replaces it in a handler run."""
+    """Yield each defined name with a function that replaces it in a handler run."""
     for name, handler in HANDLERS.items():
         yield f"handler {name}", handler_renamed(name)
         for branch in handler.branches:
@@ -213,7 +213,7 @@ def test_losses_are_unknown_if_completed_blocks_are_unknown(honest: Evidence) ->
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a run in which agent 1 uses unknown names for its voting timer, a branch, and a completed block."""
+    """Write a run in which agent 1 uses undefined names for its voting timer, a branch, and a completed block."""
     path = tmp_path_factory.mktemp("run") / "run"
     assert not run(scenario(**EVENTFUL), 3, path, Silent(), "sim").result.bad
     for agent, old, new in (

@@ -1,4 +1,4 @@
-"""Losses and restarts of vehicles have the same effect with processes and in virtual time."""
+"""Test that losses and restarts of vehicles have the same effect with real processes and in virtual time."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The journal of a shared channel against the traces and run.json."""
+"""Test the comparison of a shared channel's log with the traces and run.json."""
 
 import json
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def details(run: Path, edit: Callable[[Lines], Lines] | None = None) -> list[str]:
-    """Return the findings of the check of records, after an edit of the journal."""
+    """Return the findings of the check of records after an edit of the channel's log."""
     journal = run / "channel.jsonl"
     original = journal.read_text()
     if edit is not None:

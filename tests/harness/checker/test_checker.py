@@ -1,4 +1,6 @@
-"""Each characteristic holds for a good run, is violated by a manipulated one, and never holds without evidence."""
+"""Test each characteristic: it holds for a good run, is violated by a manipulated one, and never holds without
+evidence.
+"""
 
 import re
 from pathlib import Path
@@ -15,7 +17,7 @@ from ucp.messages import CommitBlock
 
 
 def verdicts(result: Result) -> str:
-    """Return one letter for each characteristic: h(olds), v(iolated), n(ot applicable)."""
+    """Return one letter for the verdict on each characteristic: h(olds), v(iolated), n(ot applicable)."""
     return "".join(result.characteristics[number].verdict[0] for number in "123456")
 
 
@@ -65,7 +67,7 @@ def test_different_chains_after_loss_make_5_and_6_not_applicable(tmp_path: Path)
 
 
 def missed_last_block(reconcile_before: bool = False) -> Air:
-    """Return a fully connected swarm that loses one commit, after which no agent votes. Agent 2 stays different."""
+    """Return a swarm that loses one commit and never votes afterwards. The chain of agent 2 stays different."""
     air = Air([1, 2, 3])
     air.fill_block(1)
     air.settle()
@@ -232,7 +234,7 @@ def test_handler_without_a_valid_trigger_violates_1(run_dir: Path, trigger: dict
 
 
 def hang(lines: list[dict]) -> None:
-    """Remove the ends of votes from a trace."""
+    """Remove the ends of all votes from a trace."""
     lines[:] = [line for line in lines if line.get("handler") != "vote_timer_expiration"]
 
 

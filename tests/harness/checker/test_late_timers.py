@@ -1,4 +1,4 @@
-"""Timers that are later than the measured lag are deviations; a slow machine accuses no agent."""
+"""Test late timers: delays that the machine does not explain are deviations, and a slow machine accuses no agent."""
 
 import json
 import os
@@ -35,7 +35,7 @@ sys.exit(node.main(sys.argv[1:]))
 
 @pytest.fixture(scope="module")
 def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run whose headers have a voting timer of 10 s, but whose agents vote for half a second longer."""
+    """Play a run whose headers state a voting timer of 10 s, while agents vote for half a second longer."""
     asked = scenario(agents=3, duration_s=150, events=OFTEN, settings={"vote_timeout_s": 10 + LATE_S})
     directory = run(asked, 1, tmp_path_factory.mktemp("late") / "run", Silent(), backend="sim").directory
 
@@ -51,7 +51,7 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judged(late: Path, tmp_path: Path, *, speedup: float = 1.0, lag: list[dict[str, Any]] | None = None) -> Judgement:
-    """Judge the steps as if mission time ran at this speed, and as if this lag were measured."""
+    """Judge the steps as if mission time ran at this speed, and as if these machine delays were measured."""
     directory = tmp_path / "run"
     if not directory.exists():
         shutil.copytree(late, directory)
@@ -63,7 +63,7 @@ def judged(late: Path, tmp_path: Path, *, speedup: float = 1.0, lag: list[dict[s
 
 
 def measured(machine_s: float = 0.0, *, busy_s: float = 0.0, agents: str = "123") -> list[dict[str, Any]]:
-    """Return lines of two mission seconds for the whole run, with the same figures in each."""
+    """Return lines with the same measured delays for the whole run, two mission seconds each."""
     figures = {"machine_s": machine_s, "busy_s": dict.fromkeys(agents, busy_s)}
     return [{"from_s": at, "until_s": at + 2, **figures} for at in range(0, 2000, 2)]
 
@@ -95,7 +95,7 @@ def test_timer_of_a_paused_agent_is_no_deviation(late: Path, tmp_path: Path) -> 
     assert judged(late, tmp_path, lag=measured()).verdict == "as specified"
 
 
-def test_reason_says_that_no_lag_is_recorded(late: Path, tmp_path: Path) -> None:
+def test_reason_reports_that_no_lag_is_recorded(late: Path, tmp_path: Path) -> None:
     found = judged(late, tmp_path)
     assert found.verdict == "as specified"
     assert "the lag of the machine is not recorded for timers, so they may be up to 1 s" in found.reason
@@ -117,7 +117,7 @@ def test_lag_outside_the_measured_time_is_unknown() -> None:
 
 @pytest.fixture
 def busy_machine() -> Iterator[None]:
-    """Twice as many processes as processors compute."""
+    """Keep all processors busy with twice as many processes."""
     burning = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
     yield
     for process in burning:

@@ -1,4 +1,4 @@
-"""The liveness check reports an idle swarm, a cycle without end, or an estimate of the remaining time."""
+"""Test the liveness check: it reports an idle swarm, an endless cycle, or an estimate of the remaining time."""
 
 import json
 import re
@@ -28,14 +28,14 @@ def liveness(simulated: Simulated) -> Judgement:
 
 
 def judged(evidence: Evidence, **record: Any) -> dict[str, Judgement]:
-    """Return the judgements on the evidence with a changed record."""
+    """Return the judgements after a change of the record."""
     assert evidence.record is not None
     changed = replace(evidence, record=evidence.record.model_copy(update=record))
     return check(changed).judgements
 
 
 def disable_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Disable the search for a cycle, so that a simulation runs to its limit as processes do."""
+    """Disable the search for endless cycles, so that a simulation runs to its time limit."""
     monkeypatch.setattr(Simulation, "_new_recurrence", lambda simulation: None)
 
 
@@ -187,7 +187,7 @@ def test_agent_paused_to_the_end_is_not_judged() -> None:
 
 
 def test_reconcile_beside_a_paused_agent_is_no_chance_to_agree() -> None:
-    """Agent 3 alone has a block, and is paused to the end, so it answers no query of the final reconcile."""
+    """Agent 3 alone has a block. It is paused to the end, so it answers no query of the final reconcile."""
     run = simulate(
         scenario(
             agents=3,
@@ -220,7 +220,7 @@ def test_uniform_time_is_known_if_all_chains_are_equal() -> None:
 @pytest.mark.lab
 @pytest.mark.any_user
 def test_cycle_of_processes_is_found_in_traces(tmp_path: Path) -> None:
-    """All agents disapprove of every block. Each vote of the one agent with a block therefore ends in a reconcile."""
+    """All agents reject every block. Each vote of the one agent with a block therefore ends in a reconcile."""
     refusing = write_scenario(
         tmp_path,
         agents=2,

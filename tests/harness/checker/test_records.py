@@ -1,4 +1,6 @@
-"""Edited, cut, doubled or mixed records never get a good verdict. Unaltered records never contradict each other."""
+"""Test that edited, cut or mixed records never get a good verdict, and that unchanged records never contradict each
+other.
+"""
 
 import base64
 import json
@@ -25,7 +27,7 @@ Document = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of three agents with loss, a kill with a restart, a reboot, and a final reconcile."""
+    """Play a run of three agents with loss, a kill with a restart, a reboot, and a final reconcile."""
     asked = scenario(
         agents=3,
         duration_s=240,
@@ -72,7 +74,7 @@ def export(directory: Path, agent: int) -> Path:
 
 
 def contradicted(result: Result) -> list[str]:
-    """Check that records contradict each other, and return the characteristics that this violates."""
+    """Check that records contradict each other. Return the characteristics that this violates."""
     assert result.beside["records"].verdict == "contradict"
     return [number for number, judgement in result.characteristics.items() if judgement.verdict == "violated"]
 
@@ -296,7 +298,7 @@ LISTS = st.sampled_from(["take one out", "double one", "swap two"])
 def test_no_block_can_be_moved_in_any_record(
     whole: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
-    """No block, line or change can be removed, doubled or swapped in exports or traces without a bad verdict."""
+    """No block, line or change can be removed, doubled or swapped without a bad verdict."""
     directory = tmp_path_factory.mktemp("edited") / "run"
     shutil.copytree(whole, directory)
     agent = data.draw(st.sampled_from([1, 2, 3]))
@@ -356,7 +358,7 @@ def test_interrupted_run_has_traces_of_unknown_length(directory: Path) -> None:
 def test_report_before_the_last_handler_run_may_differ_from_the_export(
     directory: Path, runs_later: int, agrees: bool
 ) -> None:
-    """An agent of a run in real time reports that it is not idle, and its export says that it is."""
+    """An agent in real time reports that it is not idle, although its later export states that it is."""
 
     def in_real_time(document: list[Document]) -> None:
         for header in document:

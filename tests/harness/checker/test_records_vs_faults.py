@@ -1,4 +1,4 @@
-"""Records that contradict the scenario, the faults, the network or the end of a run are found."""
+"""Test that records which contradict the scenario, the faults, the network or the end of a run are found."""
 
 import base64
 import json
@@ -23,7 +23,7 @@ Edit = Callable[[Path], None]
 
 @pytest.fixture(scope="module")
 def unaltered(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a run with a reboot, a partition, a kill, a restart, a pause and a final reconcile."""
+    """Play a run with a reboot, a partition, a kill, a restart, a pause and a final reconcile."""
     asked = scenario(
         agents=4,
         duration_s=400,
@@ -90,7 +90,7 @@ def without_change(what: str) -> Edit:
 
 
 def with_loss(loss: float) -> Edit:
-    """Change the loss consistently in the scenario, run.json and network.jsonl."""
+    """Change the loss rate consistently in the scenario, run.json and network.jsonl."""
 
     def change(entry: Document) -> None:
         entry["detail"] = entry["detail"].replace("loss 20 %", f"loss {loss * 100:g} %")
@@ -163,7 +163,7 @@ def test_altered_record_contradicts_others(directory: Path, altered: Edit, expec
 
 
 def test_message_over_partition_is_found(directory: Path) -> None:
-    """Give a message that agent 1 handled during the partition to a sender on the other side."""
+    """Change the sender of a message that agent 1 handled during the partition to an agent on the other side."""
 
     def swap(lines: list[Document]) -> None:
         theirs = {line["t"]: sent for line in lines for sent in line.get("sent", ()) if 105 < line["t"] < 150}

@@ -1,4 +1,6 @@
-"""The blocks that survive a loss of vehicles, and the loss that a swarm can bear, in runs with a known answer."""
+"""Test which blocks survive a loss of vehicles, and which further loss a swarm can bear, in runs with a known
+answer.
+"""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The lateness of vote timers, computed from synthetic traces."""
+"""Test the lateness of vote timers with artificial traces."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def _run(t: float, handler: str, branch: str, reconciling: bool = False) -> Hand
 
 
 def _votes(*late_s: float, reconciling: bool = False) -> Trace:
-    """Return the trace of an agent whose voting timers of 10 s ended this late."""
+    """Return the trace of an agent whose voting timers of 10 s expired late by these times."""
     header = Header(agent_id=1, roster=[1], settings={"vote_timeout_s": 10.0}, clock={})
     runs = [
         run

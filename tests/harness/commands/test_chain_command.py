@@ -1,4 +1,4 @@
-"""`ucp-harness chain`: chains as text, JSON, GeoJSON and KML."""
+"""Test `ucp-harness chain`, which prints chains as text, JSON, GeoJSON and KML."""
 
 import base64
 import json
@@ -36,7 +36,7 @@ FLOWN = {
 
 
 def fly_vehicles(agents: int = 3, seconds: int = 240) -> Air:
-    """Play agents that log telemetry. Their vehicles fly east side by side, and reach a waypoint each minute."""
+    """Play agents that log telemetry. Their vehicles fly east side by side and reach a waypoint each minute."""
     air = Air(range(1, agents + 1))
     sources = {agent_id: TelemetryEvents(10.0, random.Random(agent_id), EVENT_KINDS) for agent_id in air.agents}
     for second in range(seconds):
@@ -127,7 +127,7 @@ def test_exports_without_a_run_are_decoded_as_telemetry(flown: Air, tmp_path: Pa
 
 
 def test_events_of_no_vehicle_are_printed_as_bytes(tmp_path: Path) -> None:
-    """Random events stay bytes, even if their ID and length match telemetry."""
+    """Random events are printed as bytes, even if their ID and length are those of telemetry."""
     air = Air([1])
     for _ in range(40):
         air.agents[1].add_event(LoggableEvent(5_000_000, WAYPOINT, bytes(6)), air.now)
@@ -251,7 +251,7 @@ def test_chains_are_read_without_a_valid_record(run_dir: Path, record: str) -> N
 
 @pytest.mark.parametrize("option", ["--decode", "--json"])
 def test_closed_standard_output_ends_the_command_quietly(tmp_path: Path, option: str) -> None:
-    """The output is longer than the buffer of a pipe."""
+    """The output is longer than the buffer of a pipe, so the command notices that the reader is gone."""
     run = write_run(fly(agents=5, duration_s=12_000), tmp_path / "run", CONNECTED)
     with subprocess.Popen(
         [*COMMAND, "chain", str(run), option], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -313,7 +313,7 @@ def test_any_block_is_printed_and_mapped(flown: Air, blocks: list[tuple[int, int
 
 
 def fixes(book: Logbook) -> list[list[tuple[int, bytes]]]:
-    """Return the fixes of each track. Positions are bytes, because unknown angles are NaN, and NaN equals nothing."""
+    """Return the positions of each track as bytes, because unknown angles are NaN, which equals nothing."""
     return [[(timestamp_us, position.pack()) for timestamp_us, position in track.fixes] for track in tracks(book)]
 
 
@@ -327,7 +327,7 @@ def logbook_of(air: Air) -> Logbook:
 
 
 def check_geojson(collection: dict[str, Any]) -> None:
-    """Assert the rules of RFC 7946 for these features."""
+    """Check that these features follow the rules of RFC 7946."""
     assert collection["type"] == "FeatureCollection"
     for feature in collection["features"]:
         assert feature["type"] == "Feature"

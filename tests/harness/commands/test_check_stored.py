@@ -1,4 +1,4 @@
-"""`check` compares stored verdicts and versions with its own. A swarm that needs more time has status 4."""
+"""Test that `check` compares stored verdicts and versions with its own. A swarm that needs more time gives status 4."""
 
 import json
 import os
@@ -54,7 +54,7 @@ def test_check_reports_another_stored_verdict(
 
 
 def test_run_edited_after_its_end_is_status_1(tmp_path: Path) -> None:
-    """Without a clone the commit is unknown, so the version of the package and the reference identify the checker."""
+    """Outside a clone the commit is unknown, so package version and reference identify the checker."""
     installed = tmp_path / "installed"
     installed.mkdir()
     for package in ("harness", "netem", "sitl", "ucp"):

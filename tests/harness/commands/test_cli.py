@@ -1,4 +1,4 @@
-"""The command line without a lab: `check`, wrong requests, exit statuses."""
+"""Test the command line without a virtual network: `check`, wrong requests, and exit statuses."""
 
 import json
 import sys

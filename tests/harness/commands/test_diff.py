@@ -1,4 +1,4 @@
-"""`ucp-harness diff`: the first difference of two runs. Two runs with the same seed do not differ."""
+"""Test `ucp-harness diff`. Two runs with the same seed have no difference."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ SAME = AgentDifference(None, None)
 
 
 def fly(out: Path, seed: int = 1, **keys: Any) -> Path:
-    """Play a run in virtual time. By default, three agents fly for five minutes."""
+    """Play a run in virtual time. By default, three agents run for five minutes."""
     run(scenario(**{"agents": 3, "duration_s": 300, **keys}), seed, out, Silent(), "sim")
     return out
 
@@ -37,7 +37,7 @@ def a(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def b(a: Path) -> Path:
-    """A copy of the run `a` that a test may change."""
+    """Return a copy of the run `a`, which a test may change."""
     return Path(shutil.copytree(a, a.with_name("b")))
 
 
@@ -94,7 +94,7 @@ def test_json_holds_the_first_difference(a: Path, b: Path) -> None:
 
 
 def test_times_and_hashes_of_the_same_blocks_are_not_compared(a: Path, b: Path) -> None:
-    """Two runs of processes differ in this way."""
+    """Two runs with real processes always differ in this way."""
     for path in (b / "agents").glob("*.json*"):
         text = re.sub(
             r"\b[0-9a-f]{64}\b", lambda found: hashlib.sha256(found[0].encode()).hexdigest(), path.read_text()

@@ -1,4 +1,4 @@
-"""The command line: its help imports no command, and the shell completes names and options."""
+"""Test the help of the command line and shell completion. Neither imports the modules of commands."""
 
 import json
 import os
@@ -56,7 +56,7 @@ def test_summary_of_a_command_is_the_start_of_its_help(name: str) -> None:
 
 
 def panels(*command: str) -> dict[str, str]:
-    """Return the panels of a command's help at 80 columns: title, and text."""
+    """Return the panels of a command's help at 80 columns, as title and text."""
     shown = harness(*command, "--help", env={**os.environ, "COLUMNS": "80"}).stdout
     return dict(re.findall(r"╭─ ([^─]+) ─+╮\n(.*?)╰─", shown, re.DOTALL))
 

@@ -1,4 +1,4 @@
-"""Judging a run shows its progress. Ctrl-C ends it with a sentence and status 130."""
+"""Test the progress display while a run is judged. Ctrl-C ends it with a sentence and exit status 130."""
 
 import io
 from pathlib import Path
@@ -20,7 +20,7 @@ SWARM = scenario(agents=3, duration_s=100)
 
 
 class Judged(Silent):
-    """A display that keeps the steps of the judging. It can press Ctrl-C at one of them."""
+    """A display that records the steps of the checker. It can press Ctrl-C at one of them."""
 
     def __init__(self, interrupted_at: str | None = None) -> None:
         self.steps: list[str] = []

@@ -1,4 +1,4 @@
-"""The option `--kernel uml`: commands in User Mode Linux, called from outside."""
+"""Test the option `--kernel uml`, which runs commands in User Mode Linux."""
 
 import json
 import os
@@ -146,7 +146,7 @@ def _run(script: str) -> int:
 
 
 class _UmlProgram:
-    """A program that starts User Mode Linux. It must remove all files in `temporary` at its end."""
+    """A program that starts User Mode Linux. At its end, it must remove all files in `temporary`."""
 
     def __init__(self, folder: Path, *command: str) -> None:
         self.temporary = folder / "tmp"
@@ -167,7 +167,7 @@ class _UmlProgram:
         pytest.fail(f"it ended before it said {word}: {self.process.communicate()}")
 
     def remaining_processes(self) -> list[str]:
-        """Return the command lines of the processes of its User Mode Linux. They contain the name of its directory."""
+        """Return the command lines of its User Mode Linux processes. They contain the name of its directory."""
         found = []
         for entry in Path("/proc").iterdir():
             try:

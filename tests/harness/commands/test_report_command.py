@@ -1,4 +1,4 @@
-"""`ucp-harness report`: write the report of a run again, also of an incomplete or damaged run."""
+"""Test `ucp-harness report`, which writes the report of a run again, even if the run is incomplete or damaged."""
 
 import shutil
 import signal
@@ -60,7 +60,7 @@ def test_damaged_export_is_reported_and_the_rest_is_drawn(run_dir: Path) -> None
 
 
 def cut(path: Path) -> None:
-    """Remove the end of a file, as if its writer had been stopped within a line."""
+    """Cut off the end of a file, as if its writer had been stopped within a line."""
     path.write_bytes(path.read_bytes()[:-40])
 
 

@@ -1,4 +1,4 @@
-"""`ucp-harness runs`: list past runs, and open a report."""
+"""Test `ucp-harness runs`, which lists past runs and opens a report."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from tests.harness.mission import CONNECTED, fly, write_run
 
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
-    """Two runs: the newer one is damaged."""
+    """Write two runs. The newer one is damaged."""
     folder = tmp_path / "runs"
     folder.mkdir()
     air = fly(agents=3, duration_s=400)

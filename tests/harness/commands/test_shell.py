@@ -1,4 +1,4 @@
-"""`ucp-harness shell`: a shell in the network of a vehicle of an active run."""
+"""Test `ucp-harness shell`, which opens a shell in the network of a vehicle of an active run."""
 
 import subprocess
 import time
@@ -15,7 +15,7 @@ DEADLINE_S = 60.0
 
 @contextmanager
 def active_run(tmp_path: Path, kind: str) -> Iterator[Path]:
-    """Start a run, and yield its directory when all agents run. End the run after the block."""
+    """Start a run, and yield its directory when all agents run. Afterwards end the run."""
     out = tmp_path / "run"
     scenario = write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": kind})
     with subprocess.Popen(

@@ -1,4 +1,4 @@
-"""`ucp-harness tell`: cause events in an active run from another terminal."""
+"""Test `ucp-harness tell`, which causes events in an active run from another terminal."""
 
 import signal
 from pathlib import Path

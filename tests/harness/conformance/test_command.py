@@ -1,4 +1,4 @@
-"""The command `ucp-harness conformance`, and the results of a test in virtual time."""
+"""Test the command `ucp-harness conformance`, and the results of a test in virtual time."""
 
 import asyncio
 import os

@@ -1,4 +1,4 @@
-"""Agents that hang or end after many inputs, and failures that virtual time cannot repeat."""
+"""Test agents that hang or end after many inputs, and failures that cannot be repeated in virtual time."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Conformance over UDP: a right agent passes. A wrong agent fails, and the failure names the wrong Algorithm."""
+"""Test conformance over UDP: a correct agent passes. A wrong agent fails, and the failure names the Algorithm."""
 
 import asyncio
 import dataclasses
@@ -26,7 +26,7 @@ LIMIT_S = 60.0
 
 @pytest.fixture(scope="module")
 def idle() -> list[VectorSet]:
-    """The vectors of an idle agent with at most one block in its chain."""
+    """Return the generated tests of an idle agent with at most one block in its chain."""
     steps = list(explore(VARIANTS["default"]))
     wanted = {step.key: step for step in steps if step.before.activity == "idle" and len(step.path) <= 1}
     assert len(wanted) > 30
@@ -73,7 +73,7 @@ def test_vectors_that_need_a_missing_feature_are_not_applicable(tmp_path: Path, 
 
 
 async def _late(place: Path) -> tuple[Observation | None, bool, Observation | None]:
-    """Stop an agent while its vote ends, and give it two inputs.
+    """Suspend an agent while its vote ends, and give it two inputs.
 
     Return the first observation, whether the reference follows the agent, and the second observation.
     """

@@ -1,4 +1,4 @@
-"""The page with the results of many agents, and the file with their commands."""
+"""Test the page with the results of many agents, and the file with their commands."""
 
 from pathlib import Path
 

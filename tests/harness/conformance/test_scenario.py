@@ -1,4 +1,4 @@
-"""A path as a scenario: the agent runs the same handlers as in the test, and the checker finds a wrong agent."""
+"""Test conformance inputs as a scenario: the agent runs the same handlers, and the checker detects a wrong agent."""
 
 import sys
 
@@ -22,7 +22,7 @@ PATHS = [
 
 
 def played(path: tuple[str, ...], *command: str) -> tuple[list[tuple[str, str]], list[str]]:
-    """Play a path as a scenario. Return handlers and branches of the agent under test, and its deviations."""
+    """Play inputs as a scenario. Return the handlers and branches of the agent under test, and its deviations."""
     text = scenario_of("a path", (sys.executable, "-P", "-m", *command), VARIANTS["default"], path)
     simulated = simulate(Scenario.model_validate(yaml.safe_load(text)), 1, tracing=True)
     trace = simulated.evidence.traces[AGENT]

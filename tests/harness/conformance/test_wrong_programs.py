@@ -1,4 +1,4 @@
-"""Handwritten cases find programs with mistakes outside the 20 algorithms."""
+"""Test that handwritten test cases detect programs with errors outside the 20 algorithms."""
 
 import asyncio
 import sys

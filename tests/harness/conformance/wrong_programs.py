@@ -1,4 +1,5 @@
-"""Wrong agents as programs: `python -m tests.harness.conformance.wrong_programs MISTAKE MISSION_FILE`, or `--virtual`.
+"""Run agents with programming errors: `python -m tests.harness.conformance.wrong_programs MISTAKE MISSION_FILE`, or
+`--virtual`.
 
 Each is `python -m ucp.node` with one mistake outside the 20 algorithms. `ucp/quirks` has mistakes inside them.
 """
@@ -153,7 +154,7 @@ def writes_only_itself_as_roster() -> None:
 
 @mistake
 def keeps_trace_in_memory() -> None:
-    """A killed agent then has no trace."""
+    """Keep the trace in memory, so that a killed agent has no trace."""
     kept: list[str] = []
     _patch(TraceFile, "write", lambda old, self, text: kept.append(text))
 
@@ -240,7 +241,7 @@ def sends_as_another_agent() -> None:
 
 @mistake
 def answers_its_own_echo() -> None:
-    """It counts each broadcast of its own as dropped."""
+    """Count each of the agent's own broadcasts as dropped."""
 
     def receive(old: Callable[..., Any], self: Node) -> None:
         while True:
@@ -353,7 +354,7 @@ def reads_times_as_doubles() -> None:
 
 @mistake
 def answers_requests_only_one_by_one() -> None:
-    """A request that arrives together with another one is lost."""
+    """Lose a request that arrives together with another one."""
     from ucp.control import _Client
 
     def go_on(old: Callable[..., Any], self: Any) -> None:

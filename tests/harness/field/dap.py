@@ -1,4 +1,4 @@
-"""A client of the Debug Adapter Protocol, like an IDE. It attaches to debugpy and reads the state of the program."""
+"""A client for the Debug Adapter Protocol, which reads the state of a debugged program like an IDE."""
 
 import json
 import socket
@@ -10,7 +10,7 @@ DEADLINE_S = 60.0
 
 
 class Ide:
-    """A client that attaches to the debugger at `port`. Raises OSError if no debugger listens before the deadline."""
+    """A client that connects to the debugger at `port`. Raises OSError if no debugger answers in time."""
 
     def __init__(self, port: int) -> None:
         self._connection = _connect(port)
@@ -23,7 +23,7 @@ class Ide:
         self._connection.close()
 
     def attach(self, breakpoints: dict[Path, int]) -> None:
-        """Attach with one breakpoint per file, at the given line."""
+        """Connect to the program, and set one breakpoint per file at the given line."""
         self.ask("initialize", adapterID="test", pathFormat="path", linesStartAt1=True)
         attaching = self._send("attach", {"justMyCode": False})
         self.event("initialized")
@@ -36,7 +36,7 @@ class Ide:
         self._answer(attaching)
 
     def stopped_in(self) -> dict[str, Any]:
-        """Return the frame in which the program has stopped."""
+        """Return the stack frame in which the program has stopped."""
         thread = self.event("stopped")["threadId"]
         frame: dict[str, Any] = self.ask("stackTrace", threadId=thread)["stackFrames"][0]
         return {**frame, "thread": thread}

@@ -1,4 +1,4 @@
-"""Write flight logs for tests: DataFlash with own definitions of the messages, telemetry with pymavlink."""
+"""Write flight logs for tests: DataFlash files with own message definitions, and telemetry with pymavlink."""
 
 import struct
 from collections.abc import Iterable, Iterator
@@ -32,7 +32,7 @@ LAT_DEG, LON_DEG = 48.0, 2.0
 
 
 def dataflash(name: str, *values: Any) -> bytes:
-    """Return one message."""
+    """Return one DataFlash message."""
     number, types, _ = DEFINITIONS[name]
     raw = [
         round(value * _FACTOR[code]) if code in _FACTOR else value for code, value in zip(types, values, strict=True)
@@ -41,7 +41,7 @@ def dataflash(name: str, *values: Any) -> bytes:
 
 
 def definitions() -> bytes:
-    """Return the FMT messages of all types."""
+    """Return the DataFlash messages that define all message types (FMT)."""
     messages = []
     for name, (number, types, columns) in DEFINITIONS.items():
         length = 3 + struct.calcsize("<" + "".join(_STRUCT[code] for code in types))
@@ -75,7 +75,7 @@ def dataflash_file(messages: Iterable[bytes] | None = None) -> bytes:
 
 
 def stamped(at_us: int, frame: bytes) -> bytes:
-    """Return a frame in a telemetry log."""
+    """Return a MAVLink frame in the form of a telemetry log."""
     return struct.pack(">Q", at_us) + frame
 
 

@@ -1,4 +1,4 @@
-"""The records of a run as other recorders would write them: CSV files, and ROS bags made by `rosbags`."""
+"""Write the records of a run in the formats of other recorders: CSV files, and ROS bags made by `rosbags`."""
 
 import base64
 import csv
@@ -19,7 +19,7 @@ EPOCH_NS = 1_790_000_000_000_000_000
 
 
 class RecordedItem(NamedTuple):
-    """One item of an agent's recorder. `kind` is that of the CSV column."""
+    """One record of an agent. `kind` is the value of the CSV column of that name."""
 
     time_ns: int
     agent: int

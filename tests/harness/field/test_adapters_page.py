@@ -1,4 +1,4 @@
-"""The examples in docs/how-to/import-other-logs.md work as the page describes."""
+"""Test that the examples in docs/how-to/import-other-logs.md work as described."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The table of wrong agents in replay is complete, and its rows agree with the replays."""
+"""Test that the table of wrong agents in replays is complete and correct."""
 
 from docs.generate.wrong_agents.at_the_desk import PAGE, AtTheDesk, Named, row
 from docs.generate.wrong_agents.trials_page import rows_of

@@ -1,4 +1,4 @@
-"""`calibrate`: the fit of a radio to flights with known parameters, its intervals, and records that are incomplete."""
+"""Test `calibrate` with flights whose radio parameters are known, and with incomplete records."""
 
 import json
 import math
@@ -23,7 +23,7 @@ EPOCH_US = 1_790_000_000_000_000
 
 
 def attempts(seed: int, number: int = 1500, truth: DeliveryModel = TRUTH, lasting: int = 1) -> list[Attempt]:
-    """Draw attempts over six links. `lasting` messages of a link share their shadowing."""
+    """Draw random transmissions over six links. `lasting` messages of a link share their shadowing."""
     rng, drawn = Random(seed), []
     for block in range(number // lasting):
         deviation, link = rng.gauss(0, 1), rng.randrange(6)
@@ -127,7 +127,7 @@ def test_simulated_flight_is_fitted(flown: tuple[Path, Calibration, DeliveryMode
 
 
 def _taken_home(run: Path, directory: Path, vehicles: tuple[int, ...]) -> Path:
-    """Copy the traces as those of real agents, and write flight logs of `vehicles` in place of `tracks.jsonl`."""
+    """Copy the traces in the form of real records, and write flight logs of `vehicles` in place of `tracks.jsonl`."""
     directory.mkdir()
     for trace in (run / "agents").glob("*.trace.jsonl"):
         text = trace.read_text().replace('"epoch_us":0', f'"epoch_us":{EPOCH_US}')

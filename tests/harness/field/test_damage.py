@@ -1,4 +1,4 @@
-"""Damaged records of right agents lead to no accusation, no traceback, and true reasons."""
+"""Test that damaged records of correct agents lead to no false accusation and no traceback."""
 
 import re
 import shutil
@@ -103,7 +103,7 @@ def test_boot_from_disk_proves_an_earlier_incarnation(tmp_path: Path) -> None:
 def test_forged_block_during_a_recorded_incarnation_is_not_genuine(
     whole: tuple[Path, Undamaged], tmp_path: Path
 ) -> None:
-    """The trace of agent 1 has the time of the block, so no missing incarnation can have completed it."""
+    """The trace of agent 1 covers the time of the block, so no missing part of it can have completed the block."""
     evidence = field_evidence(gather(RunArchive(whole[0])), ingest_files([whole[0]]).largest())
     trace, export = evidence.traces[1], evidence.exports[2]
     held = next(block for block in export.chain if block.agent_id == 1)
@@ -113,7 +113,7 @@ def test_forged_block_during_a_recorded_incarnation_is_not_genuine(
 
 
 def _without(path: Path, *numbers: int) -> Path:
-    """Cut lines out of a trace, counted from 1, and move it away from its run."""
+    """Remove lines from a trace, counted from 1, and move it away from its run."""
     lines = path.read_bytes().splitlines(keepends=True)
     moved = path.parent.parent.parent / path.name
     moved.write_bytes(b"".join(line for number, line in enumerate(lines, 1) if number not in numbers))
@@ -155,7 +155,7 @@ def test_ingest_reads_swapped_and_repeated_lines_once_and_in_order(run: Path, tm
 
 
 def test_lost_timer_callback_is_named_before_its_effects(run: Path, tmp_path: Path) -> None:
-    """The voting timer of an agent stops without its handler. The next event finds the agent idle."""
+    """The voting timer of an agent stops without a handler run. The next event finds the agent idle."""
     trace = read_trace(trace_of(run, 1))
     assert trace is not None
     header = checked(trace.header)

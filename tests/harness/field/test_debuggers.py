@@ -1,4 +1,4 @@
-"""A breakpoint in a handler of ucp/ stops a replay with the agent's real state, in pdb and in an IDE."""
+"""Test that a breakpoint in a handler stops a replay with the agent's real state, in pdb and in an IDE."""
 
 import socket
 import subprocess

@@ -1,4 +1,4 @@
-"""The commands in docs/how-to/find-a-field-bug.md print the output on the page."""
+"""Test that the commands in docs/how-to/find-a-field-bug.md print the output on the page."""
 
 import shutil
 import tarfile

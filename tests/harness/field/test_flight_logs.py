@@ -1,4 +1,4 @@
-"""The reader of ArduPilot's flight logs: each kind of record, GPS time, jumps of the clock, and damaged files."""
+"""Test the reading of ArduPilot's flight logs: all records, GPS time, jumps of the clock, and damaged files."""
 
 import gzip
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Flight logs of vehicles, matched with the agents that flew on them, in each command that reads field records."""
+"""Test that flight logs are assigned to the agents that flew on the vehicles, in each command that uses them."""
 
 import json
 from pathlib import Path
@@ -118,7 +118,7 @@ def test_changes_of_gps_and_mode_are_in_time_order(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Exports of agents 7 and 8. Only the vehicle of agent 7 has a flight log; other files belong to other tools."""
+    """Create exports of agents 7 and 8, a flight log of agent 7's vehicle, and files of other programs."""
     directory = tmp_path_factory.mktemp("home")
     air = Air([7, 8])
     for agent_id in (7, 8):

@@ -1,4 +1,4 @@
-"""Import of foreign records: nothing is invented, and each omission is reported."""
+"""Test the import of records of other programs: nothing is invented, and each omission is reported."""
 
 import csv
 import json

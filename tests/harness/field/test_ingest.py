@@ -1,4 +1,4 @@
-"""Ingesting files: records are grouped by content, every usable part is used, and every other part is reported."""
+"""Test the reading of many files: records are grouped by content, and every usable part is used."""
 
 import gzip
 import json
@@ -27,7 +27,7 @@ def other_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def damaged_copy(intact_run: Path, tmp_path: Path) -> Path:
-    """Return a copy of the run that a test may damage."""
+    """Return a copy of the run, which a test may damage."""
     shutil.copytree(intact_run, tmp_path / "home")
     return tmp_path / "home"
 

@@ -1,4 +1,4 @@
-"""Reconstruction of flights from the records of runs in virtual time."""
+"""Test the reconstruction of flights from the records of runs in virtual time."""
 
 import base64
 import json
@@ -40,7 +40,7 @@ FIELD: dict[str, Any] = {
 
 
 def field_records(directory: Path, run: Path, *left_out: str) -> Path:
-    """Copy the records of a run that a real flight would have, without those of the harness."""
+    """Copy those records of a run that a real flight would have."""
     directory.mkdir()
     for path in (run / "agents").glob("*.json*"):
         if path.name not in left_out:

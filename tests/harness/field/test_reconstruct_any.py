@@ -1,4 +1,4 @@
-"""Any flight of correct agents with complete records is reproduced to the last block."""
+"""Test that any flight of correct agents with complete records is reproduced to the last block."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +17,7 @@ DURATION_S = 300
 
 @st.composite
 def flights(draw: st.DrawFn) -> dict[str, Any]:
-    """Draw a flight with loss, a partition, a kill or a pause, and clocks with offset and drift."""
+    """Draw a random flight with loss, a partition, a kill or a pause, and inaccurate clocks."""
     struck, at_s = draw(st.sampled_from(AGENTS)), draw(st.integers(60, 120))
     back_s = at_s + draw(st.integers(5, 100))
     death = draw(

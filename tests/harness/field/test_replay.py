@@ -1,4 +1,4 @@
-"""Replay of records: differences, exact backward steps, and unusable records."""
+"""Test the replay of records: differences, exact steps back, and unusable records."""
 
 import json
 import shutil
@@ -106,7 +106,7 @@ def test_json_output_agrees_with_the_text(wrong_run: Path) -> None:
 
 
 def test_source_line_of_each_handler_is_its_first_statement() -> None:
-    """Compare the first statement. A breakpoint at `def` would stop when the module is imported."""
+    """Compare the first statement of each handler. A breakpoint at `def` would stop when the module is imported."""
     for name in HANDLERS:
         path, _, line = source_of(name).rpartition(":")
         lines = (Path.cwd() / path).read_text().splitlines()

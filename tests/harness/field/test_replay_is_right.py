@@ -1,4 +1,4 @@
-"""Replay of correct agents never finds a difference: in virtual time, with processes, and in containers."""
+"""Test that a replay of correct agents never finds a difference: in virtual time, with processes, and in containers."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -40,7 +40,7 @@ FAULTS: list[list[dict[str, Any]]] = [
 
 
 def assert_no_difference(directory: Path) -> None:
-    """Replay each record in the directory of its run, and alone, where the fate of the agent is unknown."""
+    """Replay each record in the directory of its run, and alone, where the end of the agent is unknown."""
     traces = sorted((directory / "agents").glob("*.trace.jsonl"))
     assert traces
     for trace in traces:

@@ -1,4 +1,4 @@
-"""Interactive replay: the commands, from a pipe and from a terminal."""
+"""Test the commands of an interactive replay, from a pipe and from a terminal."""
 
 import json
 import os
@@ -22,7 +22,7 @@ def wrong_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def output_of(wrong_run: Path, *commands: str, options: tuple[str, ...] = ("--step",)) -> dict[str, list[str]]:
-    """Return the output after each command. All commands are different."""
+    """Return the output after each command. All commands must be different."""
     ended = harness("replay", wrong_run, "--agent", 2, *options, input="".join(f"{command}\n" for command in commands))
     assert sentences(ended.stderr) == []
     said: dict[str, list[str]] = {"": []}

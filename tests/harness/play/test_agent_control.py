@@ -1,4 +1,4 @@
-"""Messages of programs that ended with status 127: of an agent that lacks a feature, or of a shell."""
+"""Test the messages about programs that ended with status 127: an agent without a feature, or a shell."""
 
 from pathlib import Path
 

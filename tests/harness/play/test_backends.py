@@ -1,4 +1,4 @@
-"""The table of backends, and a backend of this file with a network that loses nothing."""
+"""Test the table of backends with a new backend whose network loses nothing."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -74,7 +74,7 @@ class PerfectSwarm(Swarm):
 
 
 class PerfectAir(Backend):
-    """A backend with the name of another one, because scenarios and records accept only known names."""
+    """A new backend under the name of an existing one, because scenarios accept only known names."""
 
     name = "docker"
 

@@ -1,4 +1,4 @@
-"""The counts of losses by receiver on a shared channel."""
+"""Test the counts of losses by receiver on a shared radio channel."""
 
 from collections import Counter
 from random import Random

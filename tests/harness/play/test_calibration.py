@@ -1,4 +1,4 @@
-"""`ucp-harness doctor --measure`: its table, JSON and exit status; `tests/netem/test_measure.py` has real packets."""
+"""Test `ucp-harness doctor --measure`: its table, its JSON output and its exit status."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STUDY = Study(NetworkConditions(), (Question(1, 4, "loss 0.15", "lost", 0.15, lo
 
 
 def losing(*shares: float) -> Observer:
-    """Return an observer that loses these shares: the first share in the first stream, and so on."""
+    """Return a measuring function that reports these loss rates, one after another."""
     streams = iter(shares)
 
     def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
@@ -40,7 +40,7 @@ def losing(*shares: float) -> Observer:
 
 
 def fake(monkeypatch: pytest.MonkeyPatch, observer: Observer, findings: list[Requirement] = WORKS) -> None:
-    """A machine with these findings, whose network is an observer, and of which one question is asked."""
+    """Replace the machine by one with these properties and this measuring function."""
     monkeypatch.setattr(doctor_module, "examine", lambda: findings)
     monkeypatch.setattr(capabilities, "studies", lambda engine: (STUDY,))
     monkeypatch.setattr(capabilities, "in_lab", lambda engine: observer)

@@ -1,4 +1,4 @@
-"""Captures of runs with processes and in virtual time contain the frames that were sent and received."""
+"""Test that packet captures of runs contain the frames that were sent and received."""
 
 import json
 import os
@@ -50,7 +50,7 @@ def record(out: Path) -> dict[str, Any]:
 
 
 def files(out: Path) -> dict[str, bytes]:
-    """Return the files that a capture must not change."""
+    """Return the files of a run that a packet capture must not change."""
     kept = ("agents/*", "before-final-reconcile/*", "network.jsonl")
     return {str(path.relative_to(out)): path.read_bytes() for pattern in kept for path in out.glob(pattern)}
 

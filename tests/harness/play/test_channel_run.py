@@ -1,4 +1,4 @@
-"""A channel that agents share as processes, in real time."""
+"""Test a radio channel that agent processes share in real time."""
 
 import json
 from pathlib import Path
@@ -64,7 +64,7 @@ def test_processes_share_a_channel_and_no_record_contradicts(tmp_path: Path) -> 
 
 
 def shares(channels: list[ChannelRecord], receivers: int) -> dict[str, float]:
-    """Return the share of copies that these channels lost, by reason."""
+    """Return the share of copies that these radio channels lost, by reason."""
     copies = receivers * sum(channel.frames for channel in channels)
     return {
         reason: sum(channel.total(reason) for channel in channels) / copies for reason in ("collision", "half_duplex")

@@ -1,4 +1,4 @@
-"""Processes that an agent leaves running at its end."""
+"""Test processes that an agent leaves running at its end."""
 
 import json
 import os

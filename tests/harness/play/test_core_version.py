@@ -1,4 +1,4 @@
-"""The version of the agent core: the recorded digests, and the effect of an edit."""
+"""Test the version of the agent core: the recorded digests, and the effect of an edit."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The cache of cryptographic results hides no error of an agent."""
+"""Test that the cache of cryptographic results does not hide an agent's errors."""
 
 from collections.abc import Callable
 from dataclasses import replace

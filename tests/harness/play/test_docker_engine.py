@@ -1,4 +1,4 @@
-"""The Docker backend without an engine, or with one that does not answer."""
+"""Test the Docker backend if Docker is missing or does not answer."""
 
 import asyncio
 import json
@@ -29,7 +29,7 @@ from tests.harness.secure.secrets import secrets as secrets_of
 
 
 def listening(path: Path) -> socket.socket:
-    """A server that takes connections, and never answers."""
+    """Return a server socket that accepts connections and never answers."""
     server = socket.socket(socket.AF_UNIX)
     server.bind(str(path))
     server.listen()

@@ -1,4 +1,4 @@
-"""The Docker backend for real: the verdicts of the process backend, its faults, and nothing left behind."""
+"""Test the Docker backend with real containers: same verdicts as with processes, faults, and no leftovers."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def on_docker(tmp_path: Path, *options: object, **keys: Any) -> subprocess.Compl
 
 
 def long_run(tmp_path: Path, **keys: Any) -> Running:
-    """A run that goes on until the test ends it."""
+    """Start a run that continues until the test ends it."""
     run = Running(write_scenario(tmp_path, duration_s=100_000, **NO_VEHICLES, **keys), tmp_path / "run", *ON_DOCKER)
     run.wait_for_mission(1, 2, 3)
     return run
@@ -81,7 +81,7 @@ def test_faults_of_agents_and_vehicles(tmp_path: Path) -> None:
 
 
 def test_captured_keys_work_in_containers_and_leave_no_secret(tmp_path: Path) -> None:
-    """Sealed, forged in two names, replayed, revoked: what agents dropped, and in whose name they heard what."""
+    """The attacker sends encrypted, forged and repeated datagrams. The test checks what agents drop and accept."""
     home = Home.new(tmp_path / "home", [1, 2, 3], seals=True, epoch_s=30.0)
     timeline = [
         {"at_s": 40, "forge": {"message": "Commit Block", "sender": 2}},
@@ -231,7 +231,7 @@ def test_output_of_a_program_is_in_its_log(tmp_path: Path) -> None:
 
 
 def test_container_cannot_change_its_network(tmp_path: Path) -> None:
-    """It has no capability, and a root that it cannot write to."""
+    """A container has no privileges, and its root directory cannot be written."""
     agent = tmp_path / "agent.sh"
     agent.write_text("#!/bin/sh\ngrep Cap /proc/self/status\ngrep NoNewPrivs /proc/self/status\ntouch /x\nexit 4\n")
     agent.chmod(0o755)

@@ -1,4 +1,4 @@
-"""Runs with a ground station that sees all vehicles and commands one of them."""
+"""Test runs with a ground station that sees all vehicles and commands one of them."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""Requests of a user to an active run."""
+"""Test the requests of a user to an active run."""
 
 import asyncio
 import json
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.any_user
 
 
 def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> Run:
-    """Play a run in virtual time that is paused at second 0. `do` sends requests, and time resumes after it."""
+    """Play a simulated run that is paused at mission second 0. `do` sends requests, and then time continues."""
     interventions = Interventions(asked, virtual_time=True, paused=True)
     over = threading.Event()
 
@@ -49,7 +49,7 @@ def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> R
 
 
 def files_of(run: Path) -> dict[str, bytes]:
-    """Return the files of the agents."""
+    """Return the contents of the agents' files."""
     return {str(path.relative_to(run)): path.read_bytes() for path in sorted((run / "agents").rglob("*.json*"))}
 
 

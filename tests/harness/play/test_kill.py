@@ -1,4 +1,4 @@
-"""If SIGKILL ends the harness at any moment, only the run directory remains of the run."""
+"""Test that only the run directory remains if the harness is killed at any moment."""
 
 import contextlib
 import json
@@ -26,7 +26,7 @@ MARK = "UCP_TEST_MARK"
 
 
 def marked(mark: str) -> dict[int, str]:
-    """Return PID -> network namespace of each process that inherited the mark of this run."""
+    """Return the network namespace of each process that inherited the mark of this run, by process ID."""
     wanted = f"{MARK}={mark}".encode()
     found = {}
     for entry in Path("/proc").iterdir():
@@ -38,7 +38,7 @@ def marked(mark: str) -> dict[int, str]:
 
 
 def network_namespaces() -> set[str]:
-    """Return all network namespaces in which a process runs, or that a process has open or mounted."""
+    """Return all network namespaces that are in use."""
     found = set()
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -52,7 +52,7 @@ def network_namespaces() -> set[str]:
 
 
 def rules() -> str:
-    """Return the firewall rules of this network. Empty if this user cannot read them."""
+    """Return the firewall rules of this network, or an empty text if this user cannot read them."""
     nft = shutil.which("nft", path="/usr/sbin:/sbin:/usr/bin")
     if nft is None or os.geteuid() != 0:
         return ""

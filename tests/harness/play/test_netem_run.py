@@ -1,4 +1,4 @@
-"""A whole run of agents over real netem. `make test-netem` plays it in User Mode Linux."""
+"""Test a whole run of agents over the kernel's netem. `make test-netem` plays it in User Mode Linux."""
 
 import json
 from pathlib import Path

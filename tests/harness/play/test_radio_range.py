@@ -1,4 +1,4 @@
-"""The network follows the flight: radio losses apply in addition to the conditions of the timeline."""
+"""Test that the network follows the flight: radio losses are added to the conditions in the timeline."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A run in virtual time stops when its swarm is in a cycle."""
+"""Test that a simulated run stops when its swarm repeats a cycle forever."""
 
 from typing import Any
 
@@ -98,7 +98,7 @@ def test_idle_swarm_is_in_no_cycle() -> None:
 
 
 def test_hanging_agent_is_reported_without_a_period() -> None:
-    """The quirk `crash_on_tie` lets a tie leave an agent in a reconcile that no timer ends."""
+    """An agent with the error `crash_on_tie` stays in a reconcile forever after a tie."""
     hanging = [
         run
         for seed in range(20)
@@ -117,7 +117,7 @@ def test_hanging_agent_is_reported_without_a_period() -> None:
 
 
 def test_two_checks_at_the_same_time_are_no_cycle() -> None:
-    """A hunt found this run: the search reported a period of 0 s, but the swarm was idle 15 s later."""
+    """A random search found this run: a cycle of 0 s was reported, although the swarm was idle 15 s later."""
     script = [(1, 1), (1, 3), (7, 2), (11, 3), (12, 1), (27, 2), (32, 3)]
     run = simulate(
         scenario(

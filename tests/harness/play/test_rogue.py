@@ -1,4 +1,4 @@
-"""The rogue node alone: its reactions to received datagrams."""
+"""Test the rogue node (a sender of forged messages) alone."""
 
 from random import Random
 from typing import Any
@@ -48,7 +48,7 @@ def receive(one: Rogue, datagram: bytes, now: float) -> list[RogueDatagram]:
 
 
 def wait(one: Rogue, until: float) -> list[tuple[float, RogueDatagram]]:
-    """Return the datagrams that it sends, with their times."""
+    """Return the datagrams that the rogue node sends until this time, with their times."""
     sent = []
     while (at := one.next_timer()) is not None and at <= until:
         one.handle_timer(at)

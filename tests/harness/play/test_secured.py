@@ -1,4 +1,4 @@
-"""A secured mission in virtual time gives the same verdicts as a plain one, and drops forged messages."""
+"""Test that a secured mission in virtual time has the same verdicts as a plain one, and drops forged messages."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
 
 
 def dropped(run: Simulated) -> set[str]:
-    """Return the reasons for which agents dropped datagrams."""
+    """Return the reasons why agents dropped datagrams."""
     return {reason for agent in run.played.agents.values() for reason in agent.get("dropped", {})}
 
 

@@ -1,4 +1,4 @@
-"""The library scenarios give the same chains with and without keys, and the program reports any difference."""
+"""Test that all included scenarios give the same chains with and without keys."""
 
 import sys
 from pathlib import Path

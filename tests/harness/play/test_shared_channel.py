@@ -1,4 +1,4 @@
-"""A channel that all vehicles share, in virtual time."""
+"""Test a radio channel that all vehicles share in virtual time."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The simulation is deterministic. Tracing and omitted deliveries do not change a run."""
+"""Test that the simulation always gives the same result. Traces and omitted deliveries do not change a run."""
 
 import hashlib
 import json
@@ -132,7 +132,7 @@ def test_omitted_deliveries_change_no_agent(
     final_reconcile: bool,
     seed: int,
 ) -> None:
-    """Delivering all N² messages gives the same exports, figures and effective handler runs, to the last byte."""
+    """A simulation that delivers every message gives exactly the same exports, figures and effective handler runs."""
     one = scenario(
         agents=agents,
         duration_s=300,
@@ -152,7 +152,7 @@ def test_omitted_deliveries_change_no_agent(
 
 @pytest.mark.parametrize("quirk", ["vote_while_reconciling", "count_phase1_of_others"])
 def test_wrong_agents_receive_all_messages(quirk: str) -> None:
-    """One agent answers during a reconcile. The other counts answers to queries of other agents."""
+    """One agent answers during a reconcile, and another counts answers to queries of other agents."""
     right = scenario(network={"loss": 0.2})
     wrong = scenario(network={"loss": 0.2}, quirks={quirk: True})
     default = results_of(simulate(wrong, 1))
@@ -163,7 +163,7 @@ def test_wrong_agents_receive_all_messages(quirk: str) -> None:
 
 
 def test_quirk_affects_only_the_named_agents() -> None:
-    """Agents without the quirk are correct. A quirk with the value false has no effect."""
+    """Agents without the deliberate error are correct. An error with the value false has no effect."""
     some = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [2, 3]}})
     assert some.quirks_of(2) == {"vote_while_reconciling": True} and some.quirks_of(1) == {}
     steps = simulate(some, 1, tracing=True).result.beside["steps"]
@@ -222,7 +222,7 @@ BURSTS = {
     ],
 )
 def test_seed_gives_the_same_run_on_every_machine(name: str, seed: int, expected: str) -> None:
-    """A changed digest means that old seeds no longer reproduce old runs. The commit must explain it."""
+    """A changed digest means that old seeds no longer give the same runs. The commit must explain it."""
     one = scenario(network=BURSTS, duration_s=600) if name == "bursts" else load_scenario(SCENARIOS / name)
     assert digest(simulate(one, seed, tracing=True)) == expected
 
@@ -250,7 +250,7 @@ def test_other_seed_gives_another_run() -> None:
 
 
 def test_added_loss_does_not_change_the_events() -> None:
-    """Events and losses have separate random streams."""
+    """Events and losses use separate random number streams."""
 
     def completed(**network: Any) -> list[list[str]]:
         exports = simulate(scenario(network=network), 5).evidence.exports.values()

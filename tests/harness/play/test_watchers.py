@@ -1,4 +1,4 @@
-"""The tasks beside a mission end with it, and the first error is reported."""
+"""Test tasks that run beside a mission: they end with it, and the first error is reported."""
 
 import asyncio
 import gc

@@ -1,4 +1,4 @@
-"""Copies of the agent core with one planted bug each, and the prover that runs with such a copy."""
+"""Create copies of the agent core with one planted error each, and run proofs with them."""
 
 import os
 import shutil
@@ -15,7 +15,7 @@ LIMIT_S = 300.0
 
 
 class Bug(NamedTuple):
-    """A bug: in a file of `ucp/`, `right` is replaced by `wrong`."""
+    """A planted error: in a file of `ucp/`, the text `right` is replaced by `wrong`."""
 
     file: str
     right: str
@@ -23,7 +23,7 @@ class Bug(NamedTuple):
 
 
 def edited(directory: Path, *bugs: Bug) -> Path:
-    """Copy the core to `directory/ucp`, with these bugs. Return `directory`."""
+    """Copy the agent core to `directory/ucp` with these errors. Return `directory`."""
     copy = directory / "ucp"
     shutil.copytree(Path(ucp.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))
     for bug in bugs:
@@ -35,12 +35,12 @@ def edited(directory: Path, *bugs: Bug) -> Path:
 
 
 def environment(core: Path) -> dict[str, str]:
-    """Return the environment of a process that imports the core in the directory `core`."""
+    """Return the environment variables of a process that imports the agent core in the directory `core`."""
     return {**os.environ, "PYTHONPATH": f"{core}{os.pathsep}{ROOT}", "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def with_core(core: Path, *arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run `ucp-harness` with the core in the directory `core`."""
+    """Run `ucp-harness` with the agent core in the directory `core`."""
     return subprocess.run(
         [sys.executable, "-P", "-m", "harness.cli", *map(str, arguments)],
         cwd=cwd,

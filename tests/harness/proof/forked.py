@@ -1,4 +1,4 @@
-"""A swarm that is explored from a fork on: some agents are idle with different chains of one block each."""
+"""Explore a swarm from a state in which some agents are idle with different chains."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from harness.proof.model._zones import NOTHING_RUNS
 
 
 def forked(bounds: Bounds, holders: Sequence[int]) -> Swarm:
-    """Return a swarm whose initial state is a fork.
+    """Return a swarm whose initial state has diverged chains of one block each.
 
     `holders` has the number of agents that hold each chain. The other agents hold no block.
 

@@ -1,4 +1,4 @@
-"""An attacker with the keys of a vehicle.
+"""Test proofs with an attacker who has the keys of a vehicle.
 
 All its possible messages are explored, and simulated runs confirm the results.
 """
@@ -62,9 +62,7 @@ def explored(agents: int = 3, blocks: int = 1, lies: int = 1) -> Graph:
 
 
 def lied_to(graph: Graph) -> Iterator[tuple[Agent, Material]]:
-    """Yield each agent in each state in which the attacker can send it one more message, with the material of this
-    message.
-    """
+    """Yield each agent in each state in which the attacker can send it one more message."""
     bounds, local = graph.swarm.bounds, graph.swarm.local
     captor = Attacker(replace(bounds, lies=bounds.lies + 1), local)
     pairs = {
@@ -80,7 +78,7 @@ def lied_to(graph: Graph) -> Iterator[tuple[Agent, Material]]:
 
 
 def random_message(lots: Random, agent: Agent, material: Material) -> Message:
-    """Return a random message of an attacker that knows these blocks and can make others."""
+    """Return a random message of an attacker who knows these blocks and can create others."""
     made = Block(CAPTURED, lots.randrange(2_000_000), lots.randbytes(20))
     blocks = [*material.blocks, made]
     hashes = [*material.named, made.block_hash, lots.randbytes(32)]
@@ -108,7 +106,7 @@ def random_message(lots: Random, agent: Agent, material: Material) -> Message:
 
 
 def outcome(agent: Agent, message: Message, others: frozenset[PendingQuestions]) -> Any:
-    """Return the agent's state after a message, and the answers that other agents wait for.
+    """Return the agent's state after a message, and those of its answers for which other agents wait.
 
     New blocks have neutral names. The agent is restored.
     """
@@ -168,7 +166,7 @@ def test_random_attacks_are_contained() -> None:
 
 
 def by_chance(lots: Random) -> Iterator[Any]:
-    """Play a random run: three agents complete one block and lose messages, the third is captured and sends one lie."""
+    """Play a random run: three agents complete one block, and a captured vehicle sends one forged message."""
     agents = [Agent(number, (1, 2, 3), b"proof", Settings(max_block_bytes=267)) for number in (1, 2, 3)]
     times = {lots.uniform(0, 30): what for what in ("completes", "captured", "lies")}
     while True:
@@ -194,7 +192,7 @@ def by_chance(lots: Random) -> Iterator[Any]:
 
 
 def lie(agents: list[Agent], now: float, lots: Random) -> None:
-    """Send a random message of the attacker to some of the agents."""
+    """Send a random forged message to some of the agents."""
     captor = Swarm(Bounds(3, 1, captured=CAPTURED)).captor
     assert captor is not None
     held = [frozenset((*agent.state.chain, *agent.state.reconcile_stack)) for agent in agents]
@@ -314,7 +312,7 @@ def test_lie_needs_a_captured_vehicle(tmp_path: Path) -> None:
 
 
 def test_random_attacks_in_any_network_are_contained() -> None:
-    """The agent has one block of its own and receives any number of lies.
+    """The agent has one block of its own and receives any number of forged messages.
 
     Messages of other agents come late, twice or never.
     """

@@ -1,4 +1,4 @@
-"""States that differ only in the identity of blocks are one state, if any block may be the older one."""
+"""Test that states which differ only in the identity of blocks count as one, if any block may be the oldest."""
 
 from collections.abc import Iterator, Sequence
 from itertools import permutations

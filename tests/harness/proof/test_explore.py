@@ -1,4 +1,4 @@
-"""The whole and the reduced state space are equal, and contain the states of random runs."""
+"""Test that the full and the reduced state space agree, and contain the states of random runs."""
 
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -32,7 +32,7 @@ def explored(*arguments: Any, **options: Any) -> Graph:
 
 
 def view_of(agent: Agent) -> View:
-    """Return the visible state of an agent: the places of its blocks, and its running timers."""
+    """Return the visible state of an agent: its blocks by place, and its running timers."""
     return (
         tuple(block.timestamp_us // MICROSECONDS for block in agent.state.chain),
         tuple(block.timestamp_us // MICROSECONDS for block in agent.state.blocks_to_be_committed),
@@ -43,12 +43,12 @@ def view_of(agent: Agent) -> View:
 
 
 def seen_of(agents: Sequence[Agent]) -> Seen:
-    """Return the visible states of agents in a sorted order, without their identity."""
+    """Return the visible states of agents in sorted order, without their identity."""
     return tuple(sorted(map(view_of, agents)))
 
 
 def by_place(graph: Graph) -> set[Seen]:
-    """Return the visible states of the living agents in each state, in the order of their places."""
+    """Return the visible states of the living agents in each state, in the order of their positions."""
     local = graph.swarm.local
     agent = Agent(1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
 
@@ -138,8 +138,7 @@ def by_chance(
     most_lost: float = inf,
     stagger: Stagger | None = None,
 ) -> Iterator[Seen]:
-    """Play a random run, and yield the visible states whenever no message is under way. Messages take no time, and
-    blocks come at any time.
+    """Play a random run, and yield the visible states whenever no message is on its way.
 
     If clocks differ, the timestamps of the agents are years apart. `most_lost` limits the number of lost messages.
     """

@@ -1,4 +1,4 @@
-"""Livelocks: their conditions, and their confirmation by the simulation."""
+"""Test endless cycles: their conditions, and their confirmation by the simulation."""
 
 from pathlib import Path
 
@@ -76,7 +76,7 @@ def test_cycle_is_found_in_an_incomplete_graph(tmp_path: Path, monkeypatch: pyte
 
 
 def test_only_one_block_of_the_livelock_has_a_fixed_time(tmp_path: Path) -> None:
-    """The first blocks of both agents must follow each other at once.
+    """The first blocks of both agents must be completed directly after each other.
 
     The other blocks may come until the vote is decided.
     """

@@ -1,4 +1,4 @@
-"""State spaces with a limited number of losses."""
+"""Test state spaces with a limited number of lost messages."""
 
 from pathlib import Path
 from random import Random

@@ -1,4 +1,4 @@
-"""`prove --against`: only findings that the original does not have count."""
+"""Test `prove --against`: only violations that the original agent does not have count."""
 
 import json
 import subprocess
@@ -39,7 +39,7 @@ def test_violation_that_the_original_lacks_is_a_new_finding(tmp_path: Path) -> N
 
 
 def test_original_with_the_same_bug_leaves_nothing_new_but_undecided(tmp_path: Path) -> None:
-    """The search stops at the shared violation, so later states can have a new one."""
+    """The search stops at the violation that both have, so later states may contain a new one."""
     (tmp_path / "original").mkdir()
     original = edited(tmp_path / "original", PROPOSES_NOTHING)
     core = edited(tmp_path, PROPOSES_NOTHING, HARMLESS)

@@ -1,4 +1,4 @@
-"""Packed states and successors unpack to the originals."""
+"""Test that compactly stored states and successors give the originals back."""
 
 import pytest
 

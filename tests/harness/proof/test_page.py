@@ -1,5 +1,4 @@
-"""Compare the quick rows of the tables in appendix/proof-bounds.md and appendix/livelock-measurements.md with the
-prover."""
+"""Compare the quick rows of the tables in proof-bounds.md and livelock-measurements.md with new proofs."""
 
 import re
 from collections.abc import Iterator
@@ -25,7 +24,7 @@ Row = dict[str, str]
 
 
 def rows() -> Iterator[Row]:
-    """Yield each row of a table of bounds, with the options in the comment above the table."""
+    """Yield each row of a table of bounds, with the command options in the comment above the table."""
     lines = iter(PAGE.read_text().splitlines())
     for line in lines:
         if options := re.fullmatch(r"<!-- prove(.*) -->", line):
@@ -67,7 +66,7 @@ def at_most(cell: str) -> int | None:
 
 
 def one_chain(proof: Proof) -> str:
-    """Return the text of the page: the number of further votes, and the numbers of states that need 0, 1, ... more."""
+    """Return the text for the page: how many further votes states need, and how many states need each number."""
     live = proof.liveness
     if live is None:
         return "not looked at"
@@ -99,7 +98,7 @@ def test_row_of_the_page_equals_the_proof(row: Row, tmp_path: Path) -> None:
 
 
 def captured_rows() -> list[Row]:
-    """Return the quick rows of the table of captured agents."""
+    """Return the quick rows of the table about captured agents."""
     page = PAGE.read_text()
     head, _, *lines = page.partition("<!-- captured -->\n")[2].partition("\n\n")[0].splitlines()
     found = [dict(zip(cells(head), cells(line), strict=True)) for line in lines]
@@ -124,7 +123,7 @@ def test_row_of_captured_agent_equals_the_proof(row: Row, tmp_path: Path) -> Non
 
 
 class Cell(NamedTuple):
-    """A cell of the table of cycles: its bounds and its text."""
+    """A cell of the table of endless cycles: its bounds and its text."""
 
     bounds: Bounds
     said: str

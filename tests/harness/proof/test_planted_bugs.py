@@ -1,4 +1,4 @@
-"""Bugs planted into a copy of the core: the prover finds each one, and the written scenario plays it."""
+"""Test that a proof detects each error planted into a copy of the agent, and writes a scenario that shows it."""
 
 import json
 from pathlib import Path
@@ -79,7 +79,7 @@ def test_planted_bug_is_found_and_its_scenario_plays_it(
 
 
 def test_agent_that_depends_on_a_counter_is_refused(tmp_path: Path) -> None:
-    """The number of reconciles grows for ever, so it is no part of a state."""
+    """The number of reconciles grows without limit, so it cannot be part of a state."""
     wrong = NOT_APPROVED.replace(
         "        core", "        if core.reconciles == 2:\n            core.take_from_deque()\n        core"
     )

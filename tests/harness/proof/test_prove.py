@@ -1,4 +1,4 @@
-"""The findings of `prove`, their confirmation by the simulation, and the output of the command."""
+"""Test the results of `prove`, their confirmation by the simulation, and the output of the command."""
 
 import json
 import multiprocessing
@@ -58,7 +58,7 @@ def test_wrong_agent_is_found_and_its_scenario_confirms_it(tmp_path: Path, quirk
 
 
 def test_scenario_forces_the_order_of_messages_that_cross(tmp_path: Path) -> None:
-    """Agent 3 hears a commit before a request of the same instant, and therefore refuses the block."""
+    """Agent 3 receives a commit before a request at the same time, and therefore rejects the block."""
     bounds = Bounds(3, 2, "lossy", quirks={"disapproved_and_unmoved": True}, reduced=False, losses=1)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.flaw is not None
@@ -88,7 +88,7 @@ def test_wrong_step_without_consequence_is_found(tmp_path: Path, quirk: str, han
 
 
 def test_timer_that_was_not_stopped_is_found_before_it_expires(tmp_path: Path) -> None:
-    """The record of a run shows the timer only after its expiry."""
+    """The record of a run shows the timer only when it expires."""
     bounds = Bounds(2, 2, "lossy", quirks={"phase3_timer_runs_on": True}, reduced=False, steps=True)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.flaw is not None
@@ -205,7 +205,7 @@ def test_interrupted_workers_stop(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_ctrl_c_during_the_start_of_workers_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Functions that run at a fork swallow all exceptions."""
+    """Functions that Python calls at a fork ignore all exceptions."""
     interruptions = [signal.SIGINT]
     os.register_at_fork(before=lambda: signal.raise_signal(interruptions.pop()) if interruptions else None)
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)

@@ -1,4 +1,4 @@
-"""An agent that all other agents refuse, explored from the fork on: the conditions of its livelock, and the cures."""
+"""Test an agent whose blocks all others reject: the conditions of its endless cycle, and the corrections."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ STAGGER = {"stagger": {"phase1_timeout_s": 0.5}}
 
 
 def after_the_fork(agents: int, holders: list[int], keys: dict[str, Any]) -> Liveness:
-    """Return the graph after the fork, without losses, with a block of any agent at any moment."""
+    """Return the result of exploring a swarm with diverged chains, without losses, with a block at any time."""
     bounds = Bounds(agents, len(holders) + 1, "lossless", **keys)
     graph = explore(forked(bounds, holders), most_bytes=8e9, most_s=300)
     assert graph.ended == "complete"

@@ -1,4 +1,4 @@
-"""Zones compared with all possible times on a grid."""
+"""Compare sets of remaining timer values (zones) with all possible times on a grid."""
 
 from itertools import product
 from random import Random
@@ -10,7 +10,7 @@ DURATIONS = (10, 5)
 
 
 def test_zones_contain_exactly_the_possible_times() -> None:
-    """Timers start and expire at random. Whole units are enough because all bounds are whole (explanation/proof.md)."""
+    """Timers start and expire at random. Whole units are enough, because all bounds are whole numbers."""
     for seed in range(30):
         lots, zones = Random(seed), Zones()
         zone, points = NOTHING_RUNS, {()}
@@ -45,7 +45,7 @@ def test_zone_finds_timers_that_expire_at_the_same_moment() -> None:
 
 
 def inside(zones: Zones, zone: int, timers: int) -> list[tuple[int, ...]]:
-    """Return the points of a zone with whole coordinates."""
+    """Return the points of a zone with integer coordinates."""
     matrix = zones.matrix(zone)
     found = []
     for point in product(range(max(DURATIONS) + 1), repeat=timers):

@@ -1,4 +1,6 @@
-"""A headless Chromium, driven over its remote debugging pipe with the standard library; it loads our own pages."""
+"""Control a headless Chromium through its debugging pipe, with the standard library only. It loads only our own
+pages.
+"""
 
 import contextlib
 import json
@@ -29,13 +31,13 @@ _FLAGS = [
 
 
 def chromium_or_skip() -> str:
-    """The browser's path. Without one the test is skipped, or fails where UCP_REQUIRE contains `browser`."""
+    """Return the path of the browser. Without one, the test is skipped, or fails if UCP_REQUIRE contains `browser`."""
     found = (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name)))
     return next(found, None) or do_without("browser", "no chromium on PATH (Debian package `chromium`)")
 
 
 class Browser:
-    """One page at a time. `complaints` collects what its console and its security policy have to say."""
+    """A browser that shows one page at a time. `complaints` contains the messages of its console."""
 
     def __init__(self, to_browser: int, from_browser: int) -> None:
         self._to, self._from = to_browser, from_browser
@@ -87,7 +89,7 @@ class Browser:
 
     @contextlib.contextmanager
     def on_paper(self) -> Iterator[None]:
-        """Laid out as for a printer."""
+        """Lay out the page as for a printer inside the context."""
         self._call("Emulation.setEmulatedMedia", media="print")
         yield
         self._call("Emulation.setEmulatedMedia", media="")
@@ -126,7 +128,7 @@ class Browser:
 
 @contextlib.contextmanager
 def open_browser(profile: Path) -> Iterator[Browser]:
-    """Start a Chromium with its own empty profile, and end it; it expects the pipe on descriptors 3 and 4."""
+    """Start a Chromium with a new, empty profile, and end it afterwards. It expects the pipe on descriptors 3 and 4."""
     chromium = chromium_or_skip()
     its_input, to_browser = os.pipe()
     from_browser, its_output = os.pipe()

@@ -1,4 +1,4 @@
-"""Flights for the map's tests: tracks and the network that they make, written as a run writes them."""
+"""Write flight paths and the network that follows from them, for tests of the map."""
 
 import json
 import math
@@ -21,7 +21,7 @@ def still(north_m: float, east_m: float) -> Way:
 
 
 def split_and_rejoin(vehicle: int) -> Way:
-    """A minute together, then 1 to 3 go west and the others east for two minutes, and back again."""
+    """Return the position of a vehicle in a flight: a minute together, two minutes in two groups, and back again."""
     side = -1 if vehicle <= 3 else 1
 
     def way(at_s: float) -> tuple[float, float]:
@@ -33,7 +33,7 @@ def split_and_rejoin(vehicle: int) -> Way:
 
 
 def write_flight(run_dir: Path, scenario: Scenario, ways: Mapping[int, Way], seconds: int) -> None:
-    """Record flights along `ways` once per second, and apply the scenario's network."""
+    """Record the positions of vehicles once per second, and apply the scenario's network."""
     reach = RadioRange(scenario)
     changes = timeline_of(scenario)
     lines: list[dict[str, Any]] = []

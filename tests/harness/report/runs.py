@@ -1,4 +1,4 @@
-"""Run directories for the report's tests: chains written as names of blocks, made with the real protocol core."""
+"""Write run directories for tests of the report. Chains are given as names of blocks."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ def block(name: str) -> Block:
 
 
 def documents(chains: Chains) -> dict[int, dict[str, Any]]:
-    """The export of each agent; `chains` are like {1: "1.1 2.1", 2: "1.1"}, oldest block first."""
+    """Return the export of each agent. `chains` is like {1: "1.1 2.1", 2: "1.1"}, with the oldest block first."""
     named = {agent_id: chain.split() if isinstance(chain, str) else list(chain) for agent_id, chain in chains.items()}
     everywhere = {name for chain in named.values() for name in chain}
     exported = {}
@@ -41,7 +41,7 @@ def exports(chains: Chains) -> dict[int, Export]:
 
 
 def write_run(run_dir: Path, chains: Chains, result: Mapping[str, Any] | None = None) -> Path:
-    """A run directory with these chains; `result` replaces what `result_of` says."""
+    """Write a run directory with these chains. `result` replaces the content that `result_of` returns."""
     write_exports(run_dir / "agents", chains)
     (run_dir / "run.json").write_text(json.dumps({**result_of(list(chains)), **(result or {})}))
     return run_dir
@@ -54,7 +54,7 @@ def write_exports(directory: Path, chains: Chains) -> None:
 
 
 def result_of(agent_ids: Sequence[int]) -> dict[str, Any]:
-    """The run.json of a run in which all went well."""
+    """Return the run.json of a run without any problem."""
     names = [
         "distributed",
         "idle ⇒ committed",

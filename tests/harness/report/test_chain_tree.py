@@ -1,4 +1,4 @@
-"""The tree of chains that agree, diverge, end early, or hold the same block after different histories."""
+"""Test the tree of chains that agree, diverge, or end early."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Nothing overlaps and every label fits, whatever the chains."""
+"""Test that no marks of the chain tree overlap, and that every label fits."""
 
 import itertools
 import time
@@ -58,7 +58,7 @@ def assert_readable(drawn: Layout) -> None:
 
 @st.composite
 def swarms(draw: st.DrawFn) -> dict[int, list[str]]:
-    """Chains that follow a common one for a while, and then go their own ways."""
+    """Draw random chains that share a common beginning."""
     agent_ids = draw(st.lists(st.sampled_from([1, 2, 3, 4, 5, 6, 7, 300, 301, 302, 65535]), min_size=1, unique=True))
     common = draw(st.permutations(BLOCKS))
     chains = {}

@@ -1,4 +1,4 @@
-"""The tree as SVG: well-formed, with a description, and with the name and holders of each block."""
+"""Test the chain tree as SVG: valid, with a description, and with the name and holders of each block."""
 
 import re
 from xml.etree import ElementTree

@@ -1,4 +1,4 @@
-"""Agents' colours differ, and labels on them are readable."""
+"""Test that agents' colours differ, and that labels on them are readable."""
 
 from harness.present.colours import contrast, inks
 

@@ -1,4 +1,4 @@
-"""The thesis's figures have their stories (tests/stories), and docs/how-to/write-a-story.md names each."""
+"""Test that each figure of the thesis has its story in tests/stories, and that the guide names each."""
 
 import re
 from pathlib import Path
@@ -29,7 +29,7 @@ IN_NO_FIGURE = {
 
 
 def told(story: Story, directory: Path, seed: int = 1) -> str:
-    """The story as it is played in virtual time."""
+    """Return the text of the story as it is played in virtual time."""
     run(story.in_virtual_time, seed, directory, Silent(), "sim", delivers_all=True)
     narrator = Narrator(RunArchive(directory).traces, story.scenario.roster)
     return story.with_answers([narrator.answer(section) for section in story.sections])
@@ -95,7 +95,7 @@ def test_wrong_agent_changes_the_story(tmp_path: Path, figure: str, quirk: str, 
 
 @pytest.mark.parametrize("path", sorted(STORIES.glob("*.story")), ids=lambda path: path.stem)
 def test_sentences_do_not_coincide_with_the_end_of_a_timer(path: Path) -> None:
-    """Which of the two is first would be chance among processes."""
+    """The order of two simultaneous inputs would depend on chance between real processes."""
     text = path.read_text()
     told_at = {*re.findall(r"^(\d+) s: ", text, re.MULTILINE)}
     instants = re.split(r"^    at (\d+) s\n", text, flags=re.MULTILINE)[1:]

@@ -1,4 +1,4 @@
-"""The report in a real browser: nothing to complain about, nothing cut off, and the keyboard is enough."""
+"""Test the report in a real browser: no error messages, no text cut off, and full use by keyboard."""
 
 from pathlib import Path
 from typing import Literal
@@ -41,7 +41,7 @@ def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1280])
-def test_it_fits_the_screen_and_the_console_is_silent(
+def test_page_fits_the_screen_and_logs_no_error(
     browser: Browser, page: Path, width: int, scheme: Literal["light", "dark"]
 ) -> None:
     browser.show(page, width=width, scheme=scheme)

@@ -1,4 +1,4 @@
-"""junit.xml of a run: its test cases, and valid XML for any run."""
+"""Test junit.xml of a run: its test cases, and valid XML for any run."""
 
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ def cases(result: dict[str, Any]) -> dict[str, Case]:
 
 
 def judged(number: str, **keys: Any) -> dict[str, Any]:
-    """The result of a run whose characteristic of this number is as these keys say; the others hold."""
+    """Return a result in which one characteristic has these values, and the others hold."""
     result = result_of([1, 2, 3])
     for one in result["characteristics"].values():
         one["verdict"] = "holds"

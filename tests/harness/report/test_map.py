@@ -1,4 +1,4 @@
-"""The map: tracks of the vehicles, parts of the network, and descriptions."""
+"""Test the map: flight paths, groups of connected vehicles, and descriptions."""
 
 import math
 import re
@@ -44,7 +44,7 @@ def section_of(run_dir: Path, ink: dict[int, Ink]) -> MapSection | None:
 
 
 def paths(section: MapSection) -> list[tuple[str, str, list[tuple[float, float]]]]:
-    """Class, tooltip and points of all ways on the map."""
+    """Return the class, tooltip and points of all paths on the map."""
     found = []
     for path in ElementTree.fromstring(str(section.tracks)).iter(f"{SVG}path"):  # noqa: S314 - ours
         if path.get("class", "").startswith("way "):
@@ -84,7 +84,7 @@ def test_the_moments_are_begin_changes_and_end_with_the_live_links(tmp_path: Pat
 
 
 def test_links_are_drawn_and_described_by_their_loss(tmp_path: Path) -> None:
-    """All are connected, and hardly hear each other."""
+    """All vehicles are connected, but most messages are lost."""
     section = drawn(tmp_path, network={"loss": 0.98, "radio": {"hard_range": {"range_m": 2000}}})
     assert said(section)[0] == "0 s all 5 connected, links lose 98 %"
     assert 'class="link whole q3"' in section.moments[0].picture
@@ -104,7 +104,7 @@ def test_each_type_of_vehicle_has_its_shape(tmp_path: Path) -> None:
 
 
 def test_a_known_track_gives_the_known_path(tmp_path: Path) -> None:
-    """A square of 200 m, flown north, east, south, west: on the map up, right, down, left."""
+    """A square of 200 m, flown north, east, south and west, is drawn up, right, down and left."""
 
     def square(at_s: float) -> tuple[float, float]:
         side, along = int(at_s // 50) % 4, at_s % 50 * 4

@@ -1,4 +1,4 @@
-"""Geometry of the map: north is up, one scale applies to both axes, and thinning makes no visible change."""
+"""Test the geometry of the map: north is up, both axes have one scale, and simplified lines look the same."""
 
 import math
 from itertools import pairwise
@@ -72,7 +72,7 @@ def test_no_point_is_farther_from_the_thinned_line_than_the_tolerance(line: list
 
 
 def _distance(point: Point, start: Point, end: Point) -> float:
-    """Return the distance, found by trying points along the line. It shares no formula with the tested code."""
+    """Return the distance, found by trying points along the line, independently of the tested code."""
     low, high = 0.0, 1.0
 
     def at(share: float) -> float:

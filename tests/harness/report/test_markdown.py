@@ -1,4 +1,4 @@
-"""report.md: short enough for a pull request, and nothing in it becomes markup that is not ours."""
+"""Test report.md: it is short enough for a pull request, and no text from a run becomes markup."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The strip of the recorded network over mission time."""
+"""Test the picture of the recorded network over mission time."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The page shows the contents of complete and damaged run directories, and escapes all of them."""
+"""Test the page of complete and damaged run directories: it shows and escapes all their contents."""
 
 import gc
 import json
@@ -25,7 +25,7 @@ CHAINS = {1: "1.1 2.1 3.1", 2: "1.1 2.1", 3: "1.1 2.1 3.1"}
 
 
 class Reader(HTMLParser):
-    """A page's elements and its text as a person sees it."""
+    """The elements of a page, and its text as a reader sees it."""
 
     def __init__(self, page: str) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The report has the command and the scenario that play the run again, to the byte in virtual time."""
+"""Test that the command and the scenario in the report repeat the run exactly in virtual time."""
 
 import html
 import re

@@ -1,4 +1,4 @@
-"""The timeline of the page: its contents, its size, and the escaping of texts."""
+"""Test the timeline of the page: its contents, its size, and the escaping of texts."""
 
 import base64
 import hashlib
@@ -51,7 +51,7 @@ def html_of(run_dir: Path) -> str:
 
 
 def run_with(tmp_path: Path, *lines: Mapping[str, Any], result: Mapping[str, Any] | None = None) -> Path:
-    """A run of agents 1 and 2 with these lines in the trace of agent 1."""
+    """Write a run of agents 1 and 2 with these lines in the trace of agent 1."""
     run_dir = write_run(tmp_path / "run", {1: "1.1", 2: "1.1"}, result)
     header = {"schema": "ucp-trace/1", "agent_id": 1, "roster": [1, 2], "settings": {}, "clock": {}}
     written = "".join(json.dumps(line) + "\n" for line in (header, *lines))
@@ -127,7 +127,7 @@ def test_page_of_twenty_minutes_with_all_messages_stays_small(troubled: Path) ->
     assert len(html_of(troubled).encode()) < 1_000_000
 
 
-def test_a_long_restless_run_is_thinned_and_says_so() -> None:
+def test_long_run_with_many_changes_is_thinned_and_reported() -> None:
     phases = [Phase("phase 1", 0.0, 1.0, 1)] * 3
     spans = [(agent, float(at_s)) for agent in range(1, 51) for at_s in range(200)]
     votes = [Vote(agent, "aa", at_s, at_s + 1, "approved") for agent, at_s in spans]

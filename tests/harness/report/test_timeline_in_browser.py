@@ -1,4 +1,4 @@
-"""The timeline in a real browser: its script runs, zooms by button, key and mouse, and draws messages."""
+"""Test the timeline in a real browser: zooming by button, key and mouse, and the drawing of messages."""
 
 from pathlib import Path
 from typing import Literal
@@ -33,7 +33,7 @@ def span(browser: Browser) -> tuple[float, float]:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1280])
-def test_it_fits_the_screen_and_the_console_is_silent(
+def test_page_fits_the_screen_and_logs_no_error(
     browser: Browser, page: Path, width: int, scheme: Literal["light", "dark"]
 ) -> None:
     browser.show(page, width=width, scheme=scheme)

@@ -1,4 +1,4 @@
-"""Runs whose answers wait before they are sent."""
+"""Test runs in which answers are delayed before they are sent."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ ROUGH: dict[str, Any] = {
 
 
 def waits(evidence: Evidence) -> list[float]:
-    """Return the mission seconds from the handler run that answers to the handler run that receives the answer."""
+    """Return the mission seconds between each sent answer and its handling by the receiver."""
     runs = [(agent_id, run) for agent_id, trace in evidence.traces.items() for run in trace.runs]
     answered = {(agent_id, sent.seq): run.t for agent_id, run in runs for sent in run.sent if sent.message in ANSWERS}
     triggers = [(run.t, run.trigger) for _, run in runs if isinstance(run.trigger, MessageTrigger)]

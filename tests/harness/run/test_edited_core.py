@@ -1,4 +1,4 @@
-"""The step judge finds an error in an edited core, and names the handler. It does not share code with the agents.
+"""Test that the checker detects an error in an edited agent and names the handler.
 
 Each test edits a copy of `ucp`, as an engineer edits a clone, and plays a scenario with the copy.
 """
@@ -26,7 +26,7 @@ SCENARIO = {
 
 
 class Edit(NamedTuple):
-    """An edit of a file of `ucp`, and the handler in which it is a mistake."""
+    """An edit of a file of `ucp`, and the handler that it breaks."""
 
     about: str
     handler: str

@@ -1,4 +1,4 @@
-"""Runs with real processes and namespaces, and the errors that a user can meet."""
+"""Test runs with real processes and namespaces, and the errors that a user can cause."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Agents play protocol variants, the step judge uses them, and records name them."""
+"""Test protocol variants: agents play them, the checker uses them, and records name them."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""The keys of `network.channel`: a preset, single figures, and errors of one sentence."""
+"""Test the keys of `network.channel`: a preset, single figures, and errors of one sentence."""
 
 import typing
 from dataclasses import fields

@@ -1,4 +1,4 @@
-"""Scripted fates decide about single messages. They cause events that the experiments of the thesis could not force."""
+"""Test scripted deliveries of single messages. They force events that the experiments of the thesis could not."""
 
 import json
 from pathlib import Path

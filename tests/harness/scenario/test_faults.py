@@ -1,4 +1,4 @@
-"""Faults of agents in a scenario: kill, crash, restart, pause, resume, reboot, switch off, and wrong clocks."""
+"""Test the faults of agents: kill, crash, restart, pause, resume, reboot, switch off, and wrong clocks."""
 
 from itertools import pairwise
 from random import Random
@@ -78,7 +78,7 @@ def test_restarted_agent_receives_no_message_sent_before_its_start() -> None:
 
 
 def test_restarted_agent_logs_no_event_of_its_first_incarnation() -> None:
-    """The events that its first incarnation had yet to log are lost."""
+    """The events that the agent had not yet logged when it was killed are lost."""
     simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 300.5, "restart": [2]}])
     source = RandomEvents(Random(agent_seed(4, 2, incarnation=2)), mean_s=10)
     expected = [t for t in (300.5 + source.next()[0] for _ in range(100)) if t <= 600]
@@ -143,7 +143,7 @@ def test_block_lost_in_a_brown_out_is_a_violation(monkeypatch: pytest.MonkeyPatc
 
 
 def test_reconcile_ended_by_a_brown_out_counts_as_no_chance_to_agree() -> None:
-    """The agent ends this reconcile after its boot, without answers of other agents."""
+    """The agent ends this reconcile when it restarts, without answers of other agents."""
     began = {"handler": "reconcile_begin", "algorithm": 7, "branch": "begun", "reconciling": True}
     ended = {"handler": "reconcile_finalize", "algorithm": 20, "branch": "done", "reconciling": False}
     runs = [run_of(10.0, **began), run_of(20.0, **ended)]
@@ -203,7 +203,7 @@ def test_agent_that_stays_paused_leaves_the_run_unsettled() -> None:
 
 @pytest.mark.parametrize(("offset_s", "drift"), [(-1000, 0.0), (1000, 0.0), (0, 0.01), (-50, -0.2)])
 def test_agents_agree_with_wrong_and_drifting_clocks(offset_s: float, drift: float) -> None:
-    """Timers and timestamps follow the drifting clock. A timestamp before the start of the run is 0."""
+    """Timers and timestamps follow the inaccurate clock. A timestamp before the start of the run becomes 0."""
     simulated = played([], clocks={2: {"offset_s": offset_s, "drift": drift}}, final_reconcile=True)
     assert verdicts(simulated) == {"holds"}
     own = [block for block in simulated.evidence.exports[1].chain if block.agent_id == 2]

@@ -1,4 +1,4 @@
-"""Flight plans of vehicles: refused plans, the program and system ID of each vehicle, and a run."""
+"""Test flight plans of vehicles: refused plans, the program and system ID of each vehicle, and a run."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""A new fault needs one class. Every room of the harness then knows the fault."""
+"""Test that a new fault needs only one class, and that all parts of the harness then support it."""
 
 import json
 import os

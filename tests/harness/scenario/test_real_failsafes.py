@@ -1,4 +1,4 @@
-"""Failsafes of a real ArduCopter that the timeline causes."""
+"""Test failsafes of a real ArduCopter that the timeline causes."""
 
 import json
 import os

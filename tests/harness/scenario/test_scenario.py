@@ -1,4 +1,4 @@
-"""Scenario files: an error names the key, the value and the allowed values."""
+"""Test scenario files: an error names the key, the value and the allowed values."""
 
 from pathlib import Path
 

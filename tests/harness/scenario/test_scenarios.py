@@ -1,4 +1,4 @@
-"""Every scenario of the library, played in virtual time, has the effect that its first lines describe."""
+"""Test that every included scenario has the effect that its first lines describe."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -42,7 +42,7 @@ def mutual_length(run: Simulated) -> int:
 
 
 def blocks_beyond_mutual(run: Simulated) -> int:
-    """Return the number of blocks by which the longest chain exceeds the mutual chain."""
+    """Return the number of blocks by which the longest chain exceeds the common part of all chains."""
     return max(map(len, chains(run).values())) - mutual_length(run)
 
 
@@ -268,7 +268,7 @@ def rogue(run: Simulated, seed: int) -> None:
 
 
 def field_test_2020(run: Simulated, seed: int) -> None:
-    """Section 4.3 and Figure 4.7 of the thesis, with both bugs, and the departures that the scenario lists."""
+    """Check Section 4.3 and Figure 4.7 of the thesis, with both of its errors and the listed differences."""
     whole = chains(run)[10]
     assert chains(run)[28] == whole
     for agent in (32, 122):
@@ -298,7 +298,7 @@ def field_test_2020(run: Simulated, seed: int) -> None:
 
 
 def captured(run: Simulated, seed: int) -> None:
-    """Agents accept messages that the attacker signs with the keys of vehicle 3, and only in the name of vehicle 3."""
+    """Check that agents accept the attacker's messages with the keys of vehicle 3 only in the name of vehicle 3."""
     violated = {number: one for number, one in run.result.characteristics.items() if one.verdict == "violated"}
     assert set(violated) == {"1", "4"}
     assert {finding.agent_id for finding in violated["4"].evidence} == {1, 2, 4, 5}
@@ -313,7 +313,7 @@ def captured(run: Simulated, seed: int) -> None:
 
 
 def secure(run: Simulated, seed: int) -> None:
-    """Agents accept no message of a rogue node without keys."""
+    """Check that agents accept no message of a rogue node without keys."""
     dropped = sum((Counter(agent["dropped"]) for agent in run.played.agents.values()), Counter[str]())
     assert dropped["replayed"]
     assert dropped["not secured"]
@@ -322,7 +322,7 @@ def secure(run: Simulated, seed: int) -> None:
 
 
 def revoked_in_partition(run: Simulated, seed: int) -> None:
-    """All running agents receive the revocation when they can, and forward it to agents that start later."""
+    """Check that all running agents learn of the excluded vehicle, and inform agents that start later."""
     heard_s = {}
     for agent_id, trace in run.evidence.traces.items():
         heard = [aside.t for _, aside in trace.asides if isinstance(aside, CommandEntry) and aside.command == "revoke"]

@@ -1,4 +1,4 @@
-"""Schedules: ramps, repeated changes, and nemeses. They are computed before the run."""
+"""Test schedules of network changes: ramps, repeated changes, and random changes, computed before the run."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ def states(one: Scenario) -> list[NetworkChange]:
 
 
 def heard(state: NetworkChange, roster: tuple[int, ...]) -> dict[int, set[int]]:
-    """Return the vehicles that each vehicle hears, itself included."""
+    """Return the vehicles that each vehicle can receive, including itself."""
     conditions = state.conditions
     return {
         receiver: {

@@ -1,4 +1,4 @@
-"""Changes of the network in a timeline: any key, for all links, receivers or single links, lasting or temporary."""
+"""Test network changes in a timeline: any key, for all links, receivers or single links, temporary or permanent."""
 
 import json
 from pathlib import Path

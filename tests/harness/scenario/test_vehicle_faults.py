@@ -1,4 +1,4 @@
-"""Faults of vehicles in a timeline: GPS, compasses, motors, batteries, and wind."""
+"""Test faults of vehicles in a timeline: GPS, compasses, motors, batteries, and wind."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Scenario keys that repeat a recorded flight: events, arrivals, late timers, datagrams, and expected chains."""
+"""Test scenario keys that repeat a recorded flight: events, arrivals, late timers, datagrams, and expected chains."""
 
 import base64
 from typing import Any

@@ -1,4 +1,4 @@
-"""All secrets of a mission, and whether any is in what a run left, in whatever form somebody may have put it."""
+"""Search the files of a run for any secret of the mission, in any encoding."""
 
 import base64
 import json
@@ -15,7 +15,7 @@ _CLEAR_START = MAGIC + bytes([VERSION])
 
 
 def secrets(home: Home, epochs: int, boots: Iterable[tuple[int, bytes]] = ()) -> dict[str, bytes]:
-    """What each is -> private keys, the group's secret of each epoch, and what senders derive from it in a life."""
+    """Return all secrets by name: private keys, the group secret of each epoch, and the keys derived from it."""
     documents = {name: json.loads((home.directory / name).read_text()) for name in ("authority.key", "depot.key")}
     found = {name: bytes.fromhex(document["private_key"]) for name, document in documents.items()}
     bundles, mission = home.bundles(), home.public().mission
@@ -34,7 +34,9 @@ def secrets(home: Home, epochs: int, boots: Iterable[tuple[int, bytes]] = ()) ->
 
 
 def forms(secret: bytes) -> Iterator[bytes]:
-    """Raw, hexadecimal, base64 wherever in it, a whole number, a list of numbers, and as Python shows bytes."""
+    """Yield encoded forms of a secret: raw, hexadecimal, base64, an integer, a list of numbers, and Python's
+    notation.
+    """
     yield secret
     yield secret.hex().encode()
     yield secret.hex().upper().encode()
@@ -50,20 +52,20 @@ def forms(secret: bytes) -> Iterator[bytes]:
 
 
 def told(known: dict[str, bytes], contents: Iterable[tuple[str, bytes]]) -> list[str]:
-    """Which secrets are where."""
+    """Return the names of the secrets found, with their places."""
     looked_for = [(name, form) for name, secret in known.items() for form in forms(secret)]
     return [f"{name} in {where}" for where, content in contents for name, form in looked_for if form in content]
 
 
 def left_in(directory: Path) -> Iterator[tuple[str, bytes]]:
-    """All files, by their names."""
+    """Yield the content of all files with their names."""
     for path in directory.rglob("*"):
         if path.is_file() and not path.is_symlink():
             yield str(path), path.read_bytes()
 
 
 def boots_in(content: bytes) -> set[tuple[int, bytes]]:
-    """Senders and their lives, by the headers of sealed datagrams in a capture."""
+    """Return the senders and their start times in the headers of encrypted datagrams of a packet capture."""
     found, start = set(), content.find(_CLEAR_START)
     while start >= 0:
         length = int.from_bytes(content[start + 12 : start + 14], "big")

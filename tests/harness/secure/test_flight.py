@@ -1,6 +1,6 @@
-"""A flight that was secured, sealed, captured and revoked, opened by every command that reads runs.
+"""Test a secured flight with encrypted events, packet captures and an exclusion, in every command that reads runs.
 
-Each says what is true of it, and none a secret, with and without keys.
+Each command prints correct results with and without keys, and never a secret.
 """
 
 import json
@@ -81,7 +81,7 @@ COMMANDS: list[tuple[Sequence[str], int, str]] = [
 @pytest.mark.parametrize(
     ("command", "status", "words"), COMMANDS, ids=lambda it: it[0] if isinstance(it, tuple) else ""
 )
-def test_a_command_says_what_is_true_and_no_secret(
+def test_command_prints_the_truth_and_no_secret(
     home: Home, flown: Path, tmp_path: Path, command: Sequence[str], status: int, words: str
 ) -> None:
     bundle = str(home.directory.parent / "bundles/1.bundle.json")
@@ -99,7 +99,7 @@ def test_a_command_says_what_is_true_and_no_secret(
     assert told(secrets(home, 12), left) == []
 
 
-def test_what_is_reconciled_at_home_keeps_the_makers_signatures(flown: Path, tmp_path: Path) -> None:
+def test_reconcile_at_the_depot_keeps_block_signatures(flown: Path, tmp_path: Path) -> None:
     done = harness("consolidate", flown, "--out", tmp_path / "record.jsonl", "--reconcile")
     assert done.returncode == 0, done.stderr
     judged = json.loads(harness("check", tmp_path / "record.reconciled", "--json", "--keys", flown).stdout)
@@ -109,7 +109,7 @@ def test_what_is_reconciled_at_home_keeps_the_makers_signatures(flown: Path, tmp
 
 
 def brought_home(flown: Path, directory: Path) -> Path:
-    """Exports and captures, and no trace."""
+    """Copy exports and packet captures without traces."""
     directory.mkdir()
     for path in (*flown.glob("agents/*.chain.json"), *flown.glob("capture/*")):
         shutil.copy(path, directory)

@@ -1,4 +1,4 @@
-"""Whose keys a run revokes: by the authority's key at home, or by the message that was made there before."""
+"""Test which vehicles a run excludes: by the authority's key, or by a message that was signed before."""
 
 import json
 from collections.abc import Callable
@@ -89,7 +89,7 @@ def other(home: Home, bundles: Path) -> Home:
 
 
 @pytest.mark.parametrize(("mistake", "keys", "sentence"), MISTAKES)
-def test_what_nobody_can_revoke_is_refused(
+def test_revocation_without_a_key_is_refused(
     home: Home, tmp_path: Path, mistake: Break, keys: dict[str, Any], sentence: str
 ) -> None:
     mistake(home, tmp_path / "bundles")
@@ -97,7 +97,7 @@ def test_what_nobody_can_revoke_is_refused(
         simulate(asked(tmp_path / "bundles", **keys), 1)
 
 
-def test_what_was_revoked_at_home_is_the_first_that_the_timeline_revokes(home: Home) -> None:
+def test_timeline_must_begin_with_the_prepared_revocation(home: Home) -> None:
     assert home.revoke([3]).number == 1
     assert not simulate(asked(home.directory), 1).result.bad
     later = [{"at_s": 60, "revoke": [2], "heard_by": [1]}, *REVOKED["timeline"][1:]]

@@ -1,4 +1,4 @@
-"""Event data that is sealed to the depot: agents carry it, the judge follows it, and the depot alone reads it."""
+"""Test encrypted event data: agents carry them, the checker follows them, and only the depot can read them."""
 
 import base64
 import dataclasses
@@ -26,7 +26,7 @@ LOGGED = b"nobody else reads this"
 
 
 class SealedSwarm:
-    """Three agents that sealed and committed a few blocks, and whose exports and keys are in a directory."""
+    """Three agents that committed a few encrypted blocks, with exports and keys in a directory."""
 
     def __init__(self, directory: Path) -> None:
         self.home = Home.new(directory / "keys", ROSTER, seals=True, epoch_s=600.0)
@@ -97,7 +97,7 @@ def test_judge_finds_an_agent_whose_trace_has_other_sealed_data(swarm: SealedSwa
     assert judgement.evidence[0].handler == "build_data_block"
 
 
-def test_chains_say_that_it_is_sealed_and_the_depots_key_opens_it(swarm: SealedSwarm) -> None:
+def test_chains_report_encrypted_events_and_the_depot_key_decrypts_them(swarm: SealedSwarm) -> None:
     closed = harness("chain", "--decode", swarm.directory)
     assert closed.returncode == 0
     assert "sealed to the depot" in closed.stdout
@@ -134,7 +134,7 @@ def test_another_depots_key_is_refused(swarm: SealedSwarm, tmp_path: Path) -> No
         assert "sealed to another depot" in done.stderr
 
 
-def test_a_block_that_is_not_what_it_says_is_not_opened(swarm: SealedSwarm, tmp_path: Path) -> None:
+def test_block_with_a_wrong_header_is_not_decrypted(swarm: SealedSwarm, tmp_path: Path) -> None:
     export = json.loads(json.dumps(swarm.exports[1]))
     export["chain"][0]["event_data"] = base64.b64encode(b"in plain, by who has no depot key").decode()
     (tmp_path / f"1{SUFFIX}").write_text(json.dumps(export))

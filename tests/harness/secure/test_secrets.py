@@ -1,4 +1,4 @@
-"""Nothing that a run leaves has a secret in it, whether it ends well or not; nor has any error message."""
+"""Test that no file of a run and no error message contains a secret, whether the run succeeds or fails."""
 
 import json
 import os
@@ -19,7 +19,7 @@ EPOCHS = 14
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
-    """Keys and bundles of a mission whose epochs are short."""
+    """Create the keys and bundles of a mission with short epochs."""
     home = Home.new(tmp_path_factory.mktemp("secrets") / "keys", ROSTER, seals=True, epoch_s=30.0)
     home.write_bundles(home.directory.parent / "bundles")
     return home
@@ -42,14 +42,14 @@ def scenario(directory: Path, home: Home, **keys: Any) -> Path:
 
 
 def run(asked: Path, *options: str) -> tuple[int, list[tuple[str, bytes]]]:
-    """Exit status, and all that the run said and left."""
+    """Run the scenario. Return the exit status, and all output and files."""
     out = asked.parent / "run"
     done = harness("run", asked, "--seed", "1", "--out", out, *options)
     left = list(left_in(out)) if out.exists() else []
     return done.returncode, [("its output", (done.stdout + done.stderr).encode()), *left]
 
 
-def test_what_a_run_leaves_has_no_secret(home: Home, tmp_path: Path) -> None:
+def test_files_of_a_run_contain_no_secret(home: Home, tmp_path: Path) -> None:
     status, left = run(scenario(tmp_path, home), "--backend", "sim")
     assert status in (0, 1), left[0]
     names = {Path(name).name for name, _ in left}
@@ -63,8 +63,8 @@ def test_what_a_run_leaves_has_no_secret(home: Home, tmp_path: Path) -> None:
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_what_a_run_of_processes_that_fails_leaves_has_no_secret(home: Home, tmp_path: Path) -> None:
-    """Agent 2 is a program that tells all that it is given, and dies."""
+def test_files_of_a_failed_run_of_processes_contain_no_secret(home: Home, tmp_path: Path) -> None:
+    """Agent 2 is a program that prints all its input and ends."""
     tells = ["sh", "-c", "cat *.mission.json; printenv; exit 3"]
     asked = scenario(tmp_path, home, agent_command={"2": tells}, capture=False, speedup=20, duration_s=40, timeline=[])
     status, left = run(asked, "--backend", "process")
@@ -74,8 +74,8 @@ def test_what_a_run_of_processes_that_fails_leaves_has_no_secret(home: Home, tmp
 
 
 @pytest.mark.parametrize("tells", ["error", "version"])
-def test_an_agent_in_virtual_time_that_tells_all_tells_no_secret(home: Home, tmp_path: Path, tells: str) -> None:
-    """It refuses its mission with all that it was given; or it says so of itself when it is asked."""
+def test_virtual_agent_that_repeats_its_input_reveals_no_secret(home: Home, tmp_path: Path, tells: str) -> None:
+    """The agent refuses its mission with a copy of its input, or puts it into its status."""
     says = {
         "error": "{'error': 'no: ' + str(given.get('bundle'))[-190:]}",
         "version": "{'sent': [], 'timer': None, 'trace': [], 'answer': str(given)}",
@@ -95,8 +95,8 @@ def test_an_agent_in_virtual_time_that_tells_all_tells_no_secret(home: Home, tmp
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_a_captured_vehicles_keys_forge_its_blocks_and_no_others(home: Home, tmp_path: Path) -> None:
-    """As processes: what is in the run's directory has no secret either."""
+def test_captured_keys_forge_only_blocks_of_their_vehicle(home: Home, tmp_path: Path) -> None:
+    """Play the run with processes, and check that its directory also contains no secret."""
     forged = [{"at_s": 60, "forge": {"message": "Commit Block", "sender": sender}} for sender in (3,)]
     forged += [{"at_s": 80, "forge": {"message": "Commit Block", "sender": 2}}]
     asked = scenario(tmp_path, home, speedup=20, timeline=forged, capture=False)

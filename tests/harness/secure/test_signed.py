@@ -1,4 +1,4 @@
-"""Characteristic 4 by signatures: the maker's trace is not needed, and what was forged or edited is found."""
+"""Test characteristic 4 with signatures: forged or edited blocks are found without the author's trace."""
 
 import base64
 import hashlib
@@ -40,7 +40,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def home(run: Path, tmp_path: Path) -> Path:
-    """What came home: exports of agents 1 and 2, no traces, no record; and the mission's public keys."""
+    """Return a directory with the exports of agents 1 and 2 and the public keys, without traces or run.json."""
     for name in ("1.chain.json", "2.chain.json"):
         shutil.copy(run / "agents" / name, tmp_path)
     shutil.copy(run / "public.json", tmp_path)
@@ -63,7 +63,7 @@ def recompute(export: dict[str, Any]) -> None:
 
 
 def edit_exports(home: Path, edit: Callable[[dict[str, Any]], None]) -> None:
-    """Edit the exports of all agents, and make their hashes fit again."""
+    """Edit the exports of all agents, and compute their hashes again."""
     for path in home.glob("*.chain.json"):
         export = json.loads(path.read_text())
         edit(export)
@@ -72,7 +72,7 @@ def edit_exports(home: Path, edit: Callable[[dict[str, Any]], None]) -> None:
 
 
 def edited(home: Path, edit: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    """Return the verdict after an edit of a block of agent 3 in agent 1's export, with recomputed hashes."""
+    """Return the verdict after an edit of a block of agent 3 in agent 1's export, with new hashes."""
     path = home / "1.chain.json"
     export = json.loads(path.read_text())
     edit(next(block for block in export["chain"] if block["agent_id"] == 3))
@@ -259,7 +259,7 @@ def test_older_export_does_not_replace_a_later_one(run: Path, tmp_path: Path) ->
     assert "is older than the one from before the final reconcile" in judgement["evidence"][0]["detail"]
 
 
-def test_public_keys_that_are_damaged_are_told(home: Path) -> None:
+def test_damaged_public_keys_are_reported(home: Path) -> None:
     (home / "public.json").write_text("{")
     done = harness("check", home)
     assert "public.json: not JSON; signatures of blocks are not checked" in done.stderr

@@ -1,4 +1,4 @@
-"""The table of threats: each row is what comes of it when it is played."""
+"""Test that each row of the table of attacks shows the real result."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ PAGE = (Path(__file__).parents[3] / "docs/explanation/security.md").read_text(en
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: re.sub(r"\W+", "-", f"{row.who} {row.does}"))
-def test_a_threat_comes_to_what_the_table_says(row: Row) -> None:
+def test_each_attack_has_the_result_in_the_table(row: Row) -> None:
     _, line = table([row])
     assert line in PAGE
 

@@ -1,4 +1,4 @@
-"""Play each cell of the table of cures in docs/appendix/livelock-measurements.md."""
+"""Play each cell of the table of protocol corrections in docs/appendix/livelock-measurements.md."""
 
 from pathlib import Path
 from typing import Any
@@ -17,14 +17,14 @@ SIZES = range(4, 9)
 
 
 def rows() -> list[tuple[str, list[str]]]:
-    """Return pairs of a cure and the cells of its row."""
+    """Return each correction with the cells of its table row."""
     table = PAGE.read_text(encoding="utf-8").partition("<!-- cures: begin -->\n")[2].partition("<!-- cures: end -->")[0]
     cells = [[cell.strip() for cell in line.strip("|\n").split("|")] for line in table.splitlines()[2:]]
     return [(cure, played) for cure, *played in cells]
 
 
 def refused(agents: int, *, partition: bool) -> dict[str, Any]:
-    """Some agents commit a block each that the others do not receive. Then agent 1 completes a block."""
+    """Return a scenario in which some agents commit blocks that the others miss, and agent 1 then completes a block."""
     alone = range(2, 2 + (agents + 1) // 2)
     heals_s = 20.0 * len(alone) + 16
     script = [{"at_s": 20.0 * place + 1, "agent": agent} for place, agent in enumerate(alone)]
@@ -46,7 +46,7 @@ def refused(agents: int, *, partition: bool) -> dict[str, Any]:
 
 
 def outcome(document: dict[str, Any], cure: str) -> str:
-    """Return the outcome of a run as the page names it: "round", or the number of chains at rest."""
+    """Return the result of a run in the words of the page: "round", or the number of chains of idle agents."""
     document = {key: value for key, value in document.items() if key not in ("expect", "about", "stagger")}
     for part in cure.split("`")[1::2]:
         for key, value in yaml.safe_load(part).items():
@@ -56,7 +56,7 @@ def outcome(document: dict[str, Any], cure: str) -> str:
 
 
 def in_short(outcomes: list[str]) -> str:
-    """One word if all are the same."""
+    """Return one word if all results are the same, or otherwise all of them."""
     return outcomes[0] if len({*outcomes}) == 1 else ", ".join(outcomes)
 
 

@@ -1,4 +1,4 @@
-"""The channel that radios share: cases that can be calculated by hand, determinism, and properties."""
+"""Test the shared radio channel with cases that can be calculated by hand, and with general properties."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -119,7 +119,7 @@ def test_station_counts_no_slots_during_several_frames_of_others(seed: int) -> N
 
 
 def starts_between_two_frames(energy_dbm: float, seed: int) -> float:
-    """Return when station 2 begins a frame that it queues at 1.0005 s.
+    """Return the time at which station 2 begins a frame that it queues at 1.0005 s.
 
     Stations 0 and 1 are hidden from each other. Both begin a frame at 1 s, and that of station 0 is much longer. At
     station 2, each frame has -80.1 dBm and their sum -77.1 dBm, and the station can receive neither.

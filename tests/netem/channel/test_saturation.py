@@ -1,4 +1,4 @@
-"""A closed form as a second opinion: stations that always have a frame to broadcast.
+"""Compare the simulated radio channel with a formula for stations that always have a frame to send.
 
 Bianchi (Performance Analysis of the IEEE 802.11 Distributed Coordination Function, IEEE Journal on Selected Areas in
 Communications 18(3), 2000) assumes that stations in range of each other send independently of each other in each slot,
@@ -53,7 +53,7 @@ def binomial(n: int, p: float, k: int) -> float:
 
 
 def saturated(radio: Contention, n: int) -> list[tuple[float, int]]:
-    """Return the seconds from one busy time to the next one, and the number of senders, for each busy time."""
+    """Return, for each busy time, the seconds until the next one and the number of senders."""
     channel = Channel(range(1, n + 1), radio, seed=1)
     for station in range(n):
         channel.send(station, 0.0, DATA_BYTES)

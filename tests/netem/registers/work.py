@@ -1,4 +1,4 @@
-"""Fill floating point and vector registers, under signals and beside children, and print the results."""
+"""Fill floating point and vector registers while signals and child processes occur, and print the results."""
 
 import hashlib
 import math

@@ -1,4 +1,4 @@
-"""Secured agents without a network. The test passes the datagrams of one agent to the others."""
+"""Run agents with keys without a network. The test passes each agent's datagrams to the others."""
 
 from ucp.events import LoggableEvent
 from ucp.secure.bundle import Bundle, KeySet

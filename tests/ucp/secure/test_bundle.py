@@ -1,4 +1,4 @@
-"""Files with keys: a written file is read back, a wrong one is rejected, and no message shows a secret."""
+"""Test key files: a written file is read back, a wrong one is rejected, and no message shows a secret."""
 
 import json
 import os

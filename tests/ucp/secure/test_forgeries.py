@@ -1,4 +1,4 @@
-"""Forgeries of ten classes, with a small share of the number that `python -m benchmarks.forgeries` makes."""
+"""Test ten kinds of forged datagrams, with fewer of each than `python -m benchmarks.forgeries` sends."""
 
 import pytest
 

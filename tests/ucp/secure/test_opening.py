@@ -1,4 +1,4 @@
-"""A reader with a bundle can open captured datagrams as scapy layers. A reader without keys cannot."""
+"""Test that captured datagrams can be decrypted as scapy layers with a vehicle's keys, and not without keys."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Sealed event data is HPKE (RFC 9180), and only the depot can open it."""
+"""Test encrypted event data: the method is HPKE (RFC 9180), and only the depot can decrypt them."""
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
@@ -13,7 +13,9 @@ EVENTS = b"what vehicle 7 logged"
 
 
 def test_key_schedule_gives_the_keys_of_rfc_9180() -> None:
-    """Test vector A.2.1 of RFC 9180: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, base mode."""
+    """The values are test vector A.2.1 of RFC 9180: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, base
+    mode.
+    """
     ephemeral = X25519PrivateKey.from_private_bytes(
         bytes.fromhex("f4ec9b33b792c372c1d2c2063507b684ef925b8c75a42dbcbf57d63ccd381600")
     )

@@ -1,4 +1,4 @@
-"""A secured agent on its vehicle: its bundle, its store, its export, and its files on disk."""
+"""Test the files of an agent with keys: its key file, its store, and its export."""
 
 import base64
 import json

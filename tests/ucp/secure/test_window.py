@@ -1,4 +1,4 @@
-"""The replay window of RFC 6479, compared with a set that keeps all numbers."""
+"""Compare the window of accepted sequence numbers (RFC 6479) with a set of all numbers."""
 
 from random import Random
 

@@ -1,4 +1,4 @@
-"""A driver of the reference for tests: each method takes one input and returns the handler runs that it causes."""
+"""Call the reference implementation in tests: each method gives it one input and returns the resulting handler runs."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class Step(NamedTuple):
 
 
 class Agent:
-    """The reference as an agent with the IDs of `roster`. `now` is in mission seconds."""
+    """The reference implementation as an agent among the agents of `roster`. `now` is in mission seconds."""
 
     def __init__(
         self, agent_id: int, roster: Iterable[int], initial_data: bytes, settings: Settings | None = None
@@ -42,7 +42,7 @@ class Agent:
         return self._steps()
 
     def expire(self, timer: Timer | str, now: float) -> list[Step]:
-        """Expire a timer, given itself or by its name. A stopped timer does not expire."""
+        """Let a timer expire, given as an object or by its name. A stopped timer does not expire."""
         name = timer if isinstance(timer, str) else timer.name
         expired = next(each for each in self.state.timers if each.name == name)
         if expired.active:

@@ -1,4 +1,4 @@
-"""Random inputs for an agent: messages, events, expired timers and requests to reconcile."""
+"""Create random inputs for an agent: messages, events, timer expiries and requests to reconcile."""
 
 from collections.abc import Callable
 from random import Random
@@ -30,7 +30,7 @@ Give = Callable[[Agent | ReferenceAgent], None]
 
 
 class Inputs:
-    """Draws inputs that fit the state of an agent, nearly fit it, or do not fit it at all.
+    """Creates inputs that fit the state of an agent, nearly fit it, or do not fit it at all.
 
     Timestamps of blocks are below `newest_us`. If it is small, some are equal.
     """
@@ -42,7 +42,7 @@ class Inputs:
         self.heard: list[Message] = []
 
     def draw(self, core: Agent, number: int, now: float) -> tuple[float, Give]:
-        """Draw the input with this number. Return its time, and a function that gives the input to an agent."""
+        """Return the time of input `number`, and a function that gives the input to an agent."""
         rng, ends = self.rng, core.next_timer()
         draw = rng.random()
         if draw < 0.08 and ends is not None:

@@ -1,4 +1,4 @@
-"""The reference, tested case by case from Chapter 3 of the thesis and the readings, without knowledge of `ucp`.
+"""Test the reference implementation against Chapter 3 of the thesis case by case, without use of `ucp`.
 
 The agent under test has ID 1. Agents 2 to 5 exist only as senders of messages. The tests follow the order of the
 algorithms.
@@ -54,12 +54,12 @@ def top(agent: Agent) -> bytes:
 
 
 def complete(agent: Agent, timestamp_us: int = 100, now: float = 0.0) -> list[Step]:
-    """Log one event that fills a block."""
+    """Log one event that completes a block, and return the resulting steps."""
     return agent.log(LoggableEvent(timestamp_us, 1, bytes(800)), now)
 
 
 def receive_commit(agent: Agent, block: Block, now: float = 0.0) -> list[Step]:
-    """Deliver a Commit Block message that succeeds the agent's top."""
+    """Deliver a Commit Block message whose block follows the agent's top block."""
     return agent.receive(2, CommitBlock(block, next_chain_hash(top(agent), block.block_hash)), now)
 
 
@@ -104,13 +104,13 @@ def agent_in_phase_3(block: Block, **settings: Any) -> Agent:
 
 
 def pop_top(agent: Agent, now: float = 0.0) -> list[Step]:
-    """Run one round of phase 1 in which the only answer is "no"."""
+    """Run one round of reconcile phase 1 in which the only answer is "no"."""
     answer_phase_1(agent, 2, contained=False)
     return agent.expire("phase one", now)
 
 
 def agent_with_stack(chain_count: int, stack_count: int, **settings: Any) -> Agent:
-    """Return an agent in phase 1 that popped `stack_count` blocks of its chain."""
+    """Return an agent in reconcile phase 1 that has removed `stack_count` blocks from its chain."""
     agent = agent_with_chain(chain_count + stack_count, **settings)
     agent.begin_reconcile(0.0)
     for _ in range(stack_count):
@@ -119,7 +119,7 @@ def agent_with_stack(chain_count: int, stack_count: int, **settings: Any) -> Age
 
 
 def agent_in_phase_3_with_stack(stack_count: int, chosen: bytes, **settings: Any) -> tuple[Agent, list[Step]]:
-    """Return an agent whose phase 2 chose `chosen` while its whole chain is on the stack, and those steps."""
+    """Return an agent whose reconcile phase 2 chose `chosen` after it removed its whole chain, and the steps."""
     agent = agent_with_stack(0, stack_count, **settings)
     answer_phase_1(agent, 2, contained=True)
     agent.expire("phase one", 5.0)
@@ -768,7 +768,7 @@ def test_tally_of_phase_2_is_in_hex_and_a_copy() -> None:
 
 
 def choose(answers: list[tuple[bytes | None, int]], **settings: Any) -> Step:
-    """Answer phase 2 as agents 2, 3, 4 and so on, and return the step of Algorithm 15."""
+    """Answer reconcile phase 2 as agents 2, 3, 4 and so on. Return the step of Algorithm 15."""
     agent = agent_in_phase_2(**settings)
     for sender, (block_hash, timestamp_us) in enumerate(answers, 2):
         answer_phase_2(agent, sender, block_hash, timestamp_us)
@@ -1100,7 +1100,7 @@ def test_restored_agent_is_in_a_reconcile() -> None:
 
 
 def run_swarm(seed: int, loss: float, **settings: Any) -> list[Agent]:
-    """Run five agents until all are idle, with delays of 2-50 ms, and check the invariants after each input."""
+    """Run five agents until all are idle, with delays of 2-50 ms, and check invariants after each input."""
     rng = random.Random(seed)
     agents = {agent_id: new_agent(agent_id, **settings) for agent_id in ROSTER}
     inputs: list[tuple[float, int, int, int, Message | LoggableEvent]] = []

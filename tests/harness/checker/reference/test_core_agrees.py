@@ -1,4 +1,4 @@
-"""The agent core and the independent reference do the same in the same state, whatever the input.
+"""Test that the agent and the independent reference take the same steps in the same state, for random inputs.
 
 `prove` compares them in every state within bounds. Here both get random inputs in random states beyond all bounds.
 """
@@ -35,7 +35,7 @@ def test_reference_has_each_setting_of_the_core_with_its_default() -> None:
 
 
 def runs_of(agent: Agent | ReferenceAgent) -> list[HandlerRun]:
-    """Return the handler runs since the last call without the inputs, which only the core records."""
+    """Return the handler runs since the last call without their inputs, which only the agent records."""
     return [replace(entry, input=None) for entry in agent.trace() if isinstance(entry, HandlerRun)]
 
 

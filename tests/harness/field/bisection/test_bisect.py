@@ -1,4 +1,4 @@
-"""Bisection: the commit that breaks a handler is found, and no temporary files remain."""
+"""Test the search for commits: it finds the commit that breaks a handler, and leaves no temporary files."""
 
 import json
 import os
@@ -30,7 +30,7 @@ def git(repository: Path, *arguments: str) -> str:
 
 @pytest.fixture(scope="module")
 def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make commits: good, unrelated, does not start, broken, unrelated.
+    """Create a repository with commits that are good, unrelated, not executable, broken, and unrelated again.
 
     One breaks a handler, and the one before cannot run.
     """
@@ -59,7 +59,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def records(tmp_path_factory: pytest.TempPathFactory, scenario: Path) -> Path:
-    """Write the records of a flight with a correct core."""
+    """Write the records of a flight with correct agents."""
     directory = tmp_path_factory.mktemp("flown")
     played = harness("run", scenario, "--backend", "sim", "--seed", 1, "--out", directory / "run")
     assert (directory / "run/run.json").exists(), played.stderr

@@ -1,4 +1,4 @@
-"""Live replay: a correct agent process agrees with the record of an agent, and a wrong one does not."""
+"""Test the replay with an agent process: a correct agent agrees with the record, and a wrong one does not."""
 
 import json
 import shlex

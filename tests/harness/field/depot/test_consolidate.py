@@ -1,4 +1,4 @@
-"""`ucp-harness consolidate`: each event occurs once, with its holders, and lost blocks are listed."""
+"""Test `ucp-harness consolidate`: each event occurs once with its holders, and lost blocks are listed."""
 
 import base64
 import csv

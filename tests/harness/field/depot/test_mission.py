@@ -1,4 +1,4 @@
-"""`ucp-harness mission`: writing mission files, and comparing the files of all vehicles."""
+"""Test `ucp-harness mission`, which writes mission files and compares the files of all vehicles."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The order of the blocks in a consolidated record."""
+"""Test the order of the blocks in a merged record."""
 
 from collections.abc import Sequence
 
@@ -67,7 +67,7 @@ def test_order_has_each_block_once_and_keeps_agreed_orders(chains: list[str], at
 
 
 def closure(chains: Sequence[str]) -> dict[str, set[str]]:
-    """Return the direct and indirect successors of each block in any chain."""
+    """Return all blocks that follow each block, directly or indirectly, in any chain."""
     after: dict[str, set[str]] = {letter: set() for letter in LETTERS}
     for letters in chains:
         for position, letter in enumerate(letters):

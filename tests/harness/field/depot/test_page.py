@@ -1,4 +1,4 @@
-"""The page of a consolidated record: it agrees with the record, loads nothing, and escapes all data."""
+"""Test the page of a merged record: it agrees with the record, loads no files, and escapes all data."""
 
 import base64
 import json
@@ -23,7 +23,7 @@ WIDE, NARROW = 1280, 390
 
 @pytest.fixture(scope="module")
 def consolidated_flight(tmp_path_factory: pytest.TempPathFactory) -> Consolidation:
-    """Merge the exports of four vehicles. One has no export, and one lost two blocks and has one on its stack."""
+    """Merge the exports of four vehicles. One has no export, and one lost two blocks and holds one on its stack."""
     directory = tmp_path_factory.mktemp("home")
     for path in write_flown(fly_vehicles(4, 700), directory):
         export: dict[str, Any] = json.loads(path.read_text())

@@ -1,4 +1,4 @@
-"""The final reconcile of exports by the protocol, without vehicles."""
+"""Test the final reconcile of exports by the protocol, without vehicles."""
 
 import random
 from pathlib import Path
@@ -19,7 +19,7 @@ RUNS = 25
 
 
 def random_run_exports(seed: int) -> dict[int, Export]:
-    """Return the exports of a random run with loss, a partition, kills and brown-outs, with or without an idle end."""
+    """Return the exports of a random run with loss, a partition, kills and power losses."""
     lots = random.Random(seed)
     count = lots.randint(2, 7)
     agents = sorted(lots.sample(range(1, 300), count))
@@ -71,7 +71,7 @@ def test_record_of_a_run_is_complete_and_reconciles_to_one_chain(seed: int, tmp_
 
 
 def events_held(exports: dict[int, Export]) -> list[tuple[int, bytes]]:
-    """Return each event in any export, with its agent: those of each block once, and those of current blocks."""
+    """Return each event in any export, with the agent that logged it."""
     import base64
 
     from ucp.events import decode_events

@@ -1,4 +1,4 @@
-"""Foreign agents for virtual time: the harness's own agent as a program, and small programs with errors."""
+"""Provide foreign agents for virtual time: the harness's own agent as a program, and small programs with errors."""
 
 import os
 import sys
@@ -39,7 +39,7 @@ if given.get('command') == 'export':
 
 
 def small(directory: Path, code: str = "pass") -> list[str]:
-    """Return the command of a small agent. It runs `code` before it writes each answer."""
+    """Return the command of a small agent program, which runs `code` before each answer."""
     path = directory / "agent.py"
     path.write_text(SMALL.replace("CODE", code.replace("\n", "\n    ")))
     return [sys.executable, "-S", "-E", str(path)]

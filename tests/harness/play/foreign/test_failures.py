@@ -1,4 +1,4 @@
-"""Errors of a foreign agent in virtual time. The run record has one sentence that names the agent, and its outcome."""
+"""Test errors of a foreign agent in virtual time. The record contains one sentence that names the agent."""
 
 import json
 import sys
@@ -27,7 +27,7 @@ def narrow_limits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
-    """Play a run in which agent 2 is a small agent with `code`, and agent 1 an agent of the harness."""
+    """Play a run in which agent 2 is a small program with `code`."""
     one = played_by({2: small(tmp_path, code)}, **{**SHORT, **keys})
     return run(one, 1, tmp_path / "run", Silent(), "sim")
 

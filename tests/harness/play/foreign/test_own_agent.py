@@ -1,4 +1,4 @@
-"""The harness's own agent gives the same run as a foreign agent and in the simulation, to the byte."""
+"""Test that the harness's own agent gives exactly the same run as a separate program and in the simulation."""
 
 import json
 from operator import itemgetter
@@ -55,7 +55,7 @@ def both(one: Scenario, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def test_own_agent_behaves_the_same_behind_lines() -> None:
-    """The scenario has all kinds of faults. The second mission reuses the process of the first."""
+    """The scenario contains all kinds of faults. The second mission reuses the process of the first."""
     for seed in (1, 2):
         within, outside = both(scenario(**EVENTFUL), seed)
         assert within == outside
@@ -63,7 +63,7 @@ def test_own_agent_behaves_the_same_behind_lines() -> None:
 
 
 def test_own_agent_with_keys_behaves_the_same_behind_lines() -> None:
-    """It seals and opens datagrams, keeps revocations over a reboot, and drops the same datagrams."""
+    """It encrypts and decrypts datagrams, remembers excluded vehicles after a reboot, and drops the same datagrams."""
     revoked = {"at_s": 200, "revoke": [1], "heard_by": [2]}
     forged = {"at_s": 120, "forge": {"message": "Commit Block", "sender": 2}}
     keys = {

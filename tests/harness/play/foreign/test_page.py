@@ -1,4 +1,4 @@
-"""The agent in docs/how-to/simulate-in-virtual-time.md works, with the harness's own agent as its core."""
+"""Test that the agent in docs/how-to/simulate-in-virtual-time.md works."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""Foreign agents over many missions: exploration, shrinking, a matrix, and the end of all programs."""
+"""Test foreign agents (separate programs) over many missions: searches, matrices, and the end of all programs."""
 
 import json
 import signal

@@ -1,4 +1,6 @@
-"""`ucp-harness keys`: secrets stay in the directory, a bundle has the keys of one vehicle, and output has no secret."""
+"""Test `ucp-harness keys`: secrets stay in their directory, a bundle has one vehicle's keys, and output has no
+secret.
+"""
 
 import json
 from pathlib import Path
@@ -13,7 +15,7 @@ from ucp.secure.bundle import load_bundle, load_public
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys of three vehicles with their bundles, shared by read-only tests."""
+    """Create the keys of three vehicles with their bundles, for tests that only read them."""
     home = tmp_path_factory.mktemp("keys") / "home"
     Home.new(home, [1, 7, 28], seals=True, epoch_s=60.0).write_bundles(home.parent / "bundles")
     return home

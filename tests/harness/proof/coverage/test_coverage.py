@@ -1,4 +1,4 @@
-"""States that runs reach exist: simulated runs, recorded runs and `prove` give them the same numbers."""
+"""Test that simulated runs, recorded runs and `prove` give the same numbers for the states that they reach."""
 
 import json
 from pathlib import Path

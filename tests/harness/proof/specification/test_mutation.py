@@ -1,4 +1,4 @@
-"""The comparison of agent core and specification, and the mistakes in the specification that it finds."""
+"""Test the comparison of agent and specification, and the detection of planted mistakes."""
 
 import pytest
 

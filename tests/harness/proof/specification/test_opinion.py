@@ -1,4 +1,4 @@
-"""The specification in TLA+ and the real agents: the same states within the same bounds, and the same verdicts."""
+"""Test that the TLA+ specification and the real agents have the same states and verdicts within the same bounds."""
 
 import json
 import shutil
@@ -34,7 +34,7 @@ def _tlc() -> None:
         (3, 2, "lossless", True, {"phase2_tie": "block", "vote_names_chain": True}, 106),
     ],
 )
-def test_they_come_to_the_same_states(
+def test_agent_and_specification_reach_equal_states(
     agents: int, blocks: int, network: Any, timers_any: bool, settings: dict[str, Any], states: int
 ) -> None:
     opinion = second_opinion(Bounds(agents, blocks, network, timers_any=timers_any, settings=settings))
@@ -51,7 +51,7 @@ def test_they_come_to_the_same_states(
     ("agents", "blocks", "network", "timers_any", "states"),
     [(2, 3, "lossless", True, 117), (2, 4, "lossless", False, 487), (2, 2, "lossy", True, 329)],
 )
-def test_they_come_to_the_same_states_where_nothing_crosses(
+def test_agent_and_specification_reach_equal_states_without_crossing(
     agents: int, blocks: int, network: Any, timers_any: bool, states: int
 ) -> None:
     bounds = Bounds(agents, blocks, network, timers_any=timers_any, settings=NO_GAP, crossing=False)
@@ -63,7 +63,7 @@ def test_they_come_to_the_same_states_where_nothing_crosses(
 
 
 def test_different_timers_give_equal_states_without_a_livelock() -> None:
-    """Where both do if timers are alike."""
+    """Both have an endless cycle if timers are equal."""
     stagger: Stagger = {"phase1_timeout_s": 2.5}
     opinion = second_opinion(Bounds(2, 4, "lossless", settings=NO_GAP, stagger=stagger))
     assert (opinion.states, opinion.specified) == (2627, 2627)
@@ -72,7 +72,7 @@ def test_different_timers_give_equal_states_without_a_livelock() -> None:
     assert opinion.to_json()["stagger"] == stagger
 
 
-def test_what_is_printed_and_cannot_be_meant_is_rejected_by_both() -> None:
+def test_misprints_of_the_thesis_are_rejected_by_both() -> None:
     opinion = second_opinion(Bounds(2, 2, "lossless", timers_any=True, quirks={"change_without_new_vote": True}))
     assert (opinion.flaw, opinion.violated) == ("2", "2")
     assert opinion.exit_status == 1
@@ -135,7 +135,7 @@ def test_sigterm_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.Monke
     assert not [*tmp_path.iterdir()]
 
 
-def test_without_java_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_java_error_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     done = harness("prove", "--second-opinion")
     assert done.returncode == 3

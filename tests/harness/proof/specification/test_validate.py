@@ -1,4 +1,4 @@
-"""Recorded runs held against the specification: of right agents all is allowed, of wrong ones not."""
+"""Test recorded runs against the specification: it allows all steps of correct agents, but not those of wrong ones."""
 
 import json
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ def of(name: str, **keys: Any) -> Recorded:
 
 @pytest.fixture(scope="module")
 def validation() -> Validation:
-    """Of right agents and wrong ones, all looked at together."""
+    """Validate the traces of correct and wrong agents together."""
     require_tlc()
     lost = [{"at_s": 30, "reboot": [2], "down_s": 5, "disk": "kept"}, {"at_s": 40, "kill": [3]}]
     right = [
@@ -55,7 +55,7 @@ def test_a_wrong_agent_is_rejected_with_line_and_handler(validation: Validation)
     assert validation.exit_status == 1
 
 
-def test_what_cannot_be_looked_at_is_told_beside_what_is_not_as_specified(tmp_path: Path) -> None:
+def test_unchecked_records_are_reported_beside_rejected_steps(tmp_path: Path) -> None:
     [run] = simulated(parse({"name": "short", **SHORT}), [1])
     trace = run.traces[0]
     header = {"schema": "ucp-trace/2", **trace.header.model_dump(exclude={"schema_"})}
@@ -73,7 +73,7 @@ def test_what_cannot_be_looked_at_is_told_beside_what_is_not_as_specified(tmp_pa
     assert document["steps"] == 19 + 20
 
 
-def test_what_is_not_all_looked_at_does_not_hold() -> None:
+def test_incomplete_exploration_does_not_hold() -> None:
     assert Validation(1, 1, 19, unread=["1.trace.jsonl: agent 1: line 21 is damaged"]).exit_status == 2
     assert Validation(1).exit_status == 2
 
@@ -99,7 +99,7 @@ def test_agents_that_are_processes_do_what_is_specified(tmp_path: Path) -> None:
     assert validation.steps > 10
 
 
-def test_what_is_no_run_is_one_sentence(tmp_path: Path) -> None:
+def test_path_without_a_run_gives_one_sentence(tmp_path: Path) -> None:
     done = harness("validate")
     assert done.returncode == 2
     assert "validate needs recorded runs, or a --scenario to play" in done.stderr

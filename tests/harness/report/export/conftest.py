@@ -1,4 +1,4 @@
-"""A run that all formats are made of: it is played once."""
+"""Play one run, which the tests of all formats share."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Runs to export: a complete one in virtual time without telemetry, and a telemetry log to add."""
+"""Create runs to export: a simulated run without telemetry, and a telemetry log for it."""
 
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ ABOUT: dict[str, Any] = {
 
 
 def play(directory: Path) -> Path:
-    """Three agents, of which one flies away, is cut off, and another reboots."""
+    """Play a run of three agents. One flies away and loses contact, and another reboots."""
     out = directory / "run"
     ended = harness("run", write_scenario(directory, duration_s=180, **ABOUT), "--backend", "sim", "--out", out)
     assert ended.returncode in (0, 1), ended.stderr
@@ -29,7 +29,7 @@ def play(directory: Path) -> Path:
 
 
 def add_telemetry(run: Path, vehicle: int = 1, seconds: int = 30) -> Path:
-    """Add telemetry of the first seconds of a mission that begins in 1970."""
+    """Add the telemetry of the first seconds of a mission that begins in 1970."""
     directory = run / "vehicles" / str(vehicle)
     directory.mkdir(parents=True, exist_ok=True)
     coder = mavlink.MAVLink(None, srcSystem=vehicle)

@@ -1,4 +1,4 @@
-"""Tables for notebooks: one row for each handler run, block, and run of a matrix."""
+"""Test tables for notebooks: one row for each handler run, block, and run of a matrix."""
 
 import sys
 from pathlib import Path
@@ -80,7 +80,7 @@ def test_table_of_a_matrix_has_a_row_for_each_run(tmp_path: Path) -> None:
     assert table.select(names).row(0) == tuple(finished.runs[0].verdicts[key] for key in ALL_CHECKS)
 
 
-def test_table_without_polars_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_without_polars_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("harness.present.polars", "harness.report.export.frames"):
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "polars", None)

@@ -1,4 +1,4 @@
-"""`ucp-harness export --mcap`: the exported run, read by the format's own library."""
+"""Test `ucp-harness export --mcap` by reading the file with the library of the format."""
 
 import json
 import shutil
@@ -33,7 +33,7 @@ def copy(run: Path, tmp_path: Path) -> Path:
 
 
 def read(file: Path) -> Messages:
-    """Time and content of each message, by topic; JSON is held to the schema that comes with it."""
+    """Return the time and content of each message by topic. JSON messages are checked against their schema."""
     by_topic: Messages = defaultdict(list)
     validators: dict[str, Any] = {}
     with file.open("rb") as stream:

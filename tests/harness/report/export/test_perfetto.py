@@ -1,4 +1,4 @@
-"""`ucp-harness export --perfetto`: read back by the protobuf that Perfetto itself is made of."""
+"""Test `ucp-harness export --perfetto` by reading the file with Perfetto's own format definition."""
 
 from collections import Counter
 from pathlib import Path
@@ -15,7 +15,7 @@ Track = tuple[str, str]
 
 
 class Read:
-    """A trace: its tracks as (group, name), and the events of each in the order in which Perfetto sorts them."""
+    """A trace: its tracks as (group, name), and the events of each in Perfetto's order."""
 
     def __init__(self, file: Path) -> None:
         trace = Trace()

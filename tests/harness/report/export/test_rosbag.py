@@ -1,4 +1,4 @@
-"""`ucp-harness export --rosbag`: read back by rosbags, and by the harness's own `import`."""
+"""Test `ucp-harness export --rosbag` by reading the bag with the package rosbags and with `import`."""
 
 from collections import defaultdict
 from pathlib import Path

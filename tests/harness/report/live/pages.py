@@ -1,4 +1,4 @@
-"""Pages that a command serves, and functions that wait for their contents."""
+"""Start a command that serves a page, and wait for the page's contents."""
 
 import signal
 import subprocess
@@ -13,7 +13,7 @@ from tests.harness.report.browser import Browser
 
 @contextmanager
 def page_of(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The command, and the address of its page; ended by Ctrl-C."""
+    """Start the command and yield it with the address of its page. Afterwards end it with Ctrl-C."""
     process = subprocess.Popen(
         [*COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -1,4 +1,4 @@
-"""Runs to watch."""
+"""Create runs to watch on the live page."""
 
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,12 @@ PLAYED = {
 
 
 def played(directory: Path, **keys: Any) -> Path:
-    """A run in virtual time with a partition, a loss and a return, in which vehicles have places."""
+    """Play a simulated run with a partition, a lost vehicle and its return, in which vehicles have positions."""
     return flown(directory, **{**PLAYED, **keys})
 
 
 def film(directory: Path, stride_s: float = 20.0) -> list[Change]:
-    """All that a feed says of a run that is over, read `stride_s` mission seconds at a time."""
+    """Return all changes in a finished run, read `stride_s` mission seconds at a time."""
     feed = Feed(directory)
     told, until_s = [feed.run_change(live=False)], 0.0
     while True:

@@ -1,4 +1,4 @@
-"""The server of a page, beside the run: one that fails, hangs or has much to say is no affair of the run's."""
+"""Test that a web server which fails, hangs or is slow does not affect the run."""
 
 import sys
 from pathlib import Path
@@ -18,7 +18,7 @@ MUCH = "head -c 300000 /dev/zero | tr '\\0' 'x' >&2; echo >&2"
 
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A program in the place of the server's, to be written."""
+    """Return the path of a program that a test writes in place of the server."""
     program = tmp_path / "server"
     program.touch(0o755)
     monkeypatch.setattr(sys, "executable", str(program))

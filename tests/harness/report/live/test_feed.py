@@ -1,4 +1,4 @@
-"""The stream of changes for the page. Active and finished runs give the same stream."""
+"""Test the stream of changes for the live page. Active and finished runs must give the same stream."""
 
 import json
 import shutil
@@ -83,7 +83,7 @@ def test_changes_do_not_depend_on_the_size_of_reads(run: Path) -> None:
 
 
 def test_growing_files_give_the_same_changes(run: Path, tmp_path: Path) -> None:
-    """Each file a little at a time, lines cut anywhere; later lives beside the first, as processes have them."""
+    """Let each file grow a little at a time, cut at any place, with restarted agents in separate files."""
     growing = tmp_path / "run"
     (growing / "agents").mkdir(parents=True)
     shutil.copy(run / "run.json", growing)
@@ -102,7 +102,7 @@ def test_growing_files_give_the_same_changes(run: Path, tmp_path: Path) -> None:
 
 
 def late_film(run: Path, growing: Path, lag: int = 3) -> list[Change]:
-    """Return the changes of a live run in which each agent writes its trace later than the agent before."""
+    """Return the changes of an active run in which each agent writes its trace later than the previous one."""
     (growing / "agents").mkdir(parents=True)
     shutil.copy(run / "run.json", growing)
     shutil.copy(run / "network.jsonl", growing)
@@ -120,7 +120,7 @@ def late_film(run: Path, growing: Path, lag: int = 3) -> list[Change]:
 
 
 def receivers(told: list[Change]) -> dict[tuple[int, int, float], str]:
-    """Return the mask of each message in the end: sender, sequence number and time -> mask."""
+    """Return the receivers of each message, by sender, sequence number and time."""
     masks = {}
     for kind, at_s, *rest in told:
         if kind == "m":
@@ -204,7 +204,7 @@ def test_directory_without_a_run_is_refused_in_one_sentence(
 
 
 def intervals(told: list[Change]) -> list[tuple[str, float, float, str]]:
-    """Each vote and reconcile that ended: its kind, its start and end, and its outcome or its reason."""
+    """Return each finished vote and reconcile: its kind, its start and end, and its result or reason."""
     began: dict[tuple[int, str], tuple[float, str]] = {}
     ended = []
     for _, at_s, agent, doing, more in of_kind("s", told):
@@ -219,14 +219,14 @@ def intervals(told: list[Change]) -> list[tuple[str, float, float, str]]:
 
 
 def of_report(traces: dict[int, Trace]) -> list[tuple[str, float, float, str]]:
-    """The same intervals as the report has them."""
+    """Return the same intervals as the report computes them."""
     history = history_of(traces, [], end_of_traces(traces), whole=False)
     votes = [("vote", vote.start_s, vote.end_s, vote.outcome) for vote in history.votes]
     return sorted([*votes, *(("reconcile", one.start_s, one.end_s, one.reason) for one in history.reconciles)])
 
 
 def reconcile_during_a_vote(directory: Path) -> tuple[list[Change], Trace]:
-    """Return changes and trace of an agent that begins a reconcile before its vote timer expires."""
+    """Return the changes and the trace of an agent that begins a reconcile before its vote timer expires."""
     trigger = TimerTrigger("vote_timer_expiration")
     runs = [
         handler_run(1.0, "process_next_deque_block", "proposed", sent=[SentMessage("Block Add Request", 0, "aa")]),

@@ -1,4 +1,4 @@
-"""The page in a real browser: a film of a finished run, and a run while it goes on."""
+"""Test the live page in a real browser, for a finished run and for an active one."""
 
 import json
 import shutil
@@ -99,7 +99,7 @@ def test_page_keeps_a_vote_open_when_a_reconcile_begins(browser: Browser, run: P
 
 
 def test_live_page_and_film_show_the_loss_of_the_network(browser: Browser, run: Path, tmp_path: Path) -> None:
-    """Receivers record messages late, and a partition takes part of the minute."""
+    """Receivers record messages late, and a partition lasts for a part of the minute."""
     partition = [{"at_s": 50, "partition": [[1, 2, 3], [4, 5, 6]]}, {"at_s": 80, "heal": True}]
     asked = scenario(agents=6, duration_s=150, network={"loss": 0.2}, timeline=partition, events={"mean_s": 4})
     lossy = play(asked, 1, tmp_path / "lossy", Silent(), "sim", delivers_all=True).directory
@@ -114,7 +114,7 @@ def test_live_page_and_film_show_the_loss_of_the_network(browser: Browser, run: 
     assert shares["live"] == shares["film"] == [pytest.approx(0.2, abs=0.04)] * 3
 
 
-def test_a_film_of_a_run_that_was_killed_says_so(browser: Browser, run: Path, tmp_path: Path) -> None:
+def test_film_of_a_killed_run_reports_the_kill(browser: Browser, run: Path, tmp_path: Path) -> None:
     killed = tmp_path / "run"
     shutil.copytree(run, killed)
     (killed / "run.json").unlink()

@@ -1,4 +1,4 @@
-"""`run --watch`: an active run, and requests from its page."""
+"""Test `run --watch`: the page of an active run, and requests from it."""
 
 import asyncio
 import json
@@ -31,7 +31,7 @@ def scenario(directory: Path) -> Path:
 
 
 class Page:
-    """A page without a browser: it receives changes and sends requests."""
+    """A page without a browser, which receives changes and sends requests."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket = socket

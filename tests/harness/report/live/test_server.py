@@ -1,4 +1,4 @@
-"""The server of the page: access, and slow or closed browsers."""
+"""Test the web server of the live page: access, and slow or closed browsers."""
 
 import asyncio
 import json

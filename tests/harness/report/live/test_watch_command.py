@@ -1,4 +1,4 @@
-"""`ucp-harness watch` and `run --watch`: the messages for impossible requests."""
+"""Test the error messages of `ucp-harness watch` and `run --watch`."""
 
 import socket
 import sys

@@ -1,4 +1,4 @@
-"""Exploration of a scenario up to the smallest run that violates a characteristic, and the file that plays it again."""
+"""Test the search for a violation, its reduction to a small scenario, and the file that repeats it."""
 
 import dataclasses
 import signal
@@ -25,7 +25,7 @@ def planted(result: Result, number: str) -> Result:
 
 
 def one_commit_is_lost(asked: Scenario, seed: int) -> Result:
-    """Violated as soon as chains differ: it takes one lost Commit Block."""
+    """Return a violation if chains differ, for which one lost Commit Block is enough."""
     result = simulated(asked, seed)
     return planted(result, "6") if result.figures["distinct_chains"] != 1 else result
 

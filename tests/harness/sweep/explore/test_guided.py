@@ -1,4 +1,6 @@
-"""A hunt finds what seeds alone do not, is the same however many play it, and goes on from night to night."""
+"""Test the random search: it finds more than seeds alone, gives the same result on any number of cores, and continues
+the next night.
+"""
 
 import dataclasses
 import json
@@ -100,7 +102,7 @@ def test_trial_records_ends_of_timers_and_failed_votes() -> None:
 
 
 def test_run_with_a_new_pattern_of_failed_votes_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though the local states of it are all known."""
+    """The run is stored although all its agent states are known."""
     limits, ((document, seed), *_) = initial_documents(ordinary(), range(1))
     patterns = iter((("voting", "phase one", "voting"),) * 2 + (("voting", "voting"),))
     monkeypatch.setattr(
@@ -217,7 +219,7 @@ def test_kept_runs_are_stored_once_over_several_nights(tmp_path: Path) -> None:
 
 
 def test_short_document_shows_an_agent_that_is_refused_forever() -> None:
-    """A hunt found this document: five agents rest with four chains, and all others refuse the block of one agent."""
+    """A random search found this document: five agents are idle with four chains, and all reject one agent's block."""
     script = [(1.0, 3), (42.944, 2), (48.087, 1), (82.944, 4)]
     document = {
         "name": "c",

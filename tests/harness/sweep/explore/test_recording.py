@@ -1,4 +1,4 @@
-"""A recorded run, scripted, is the very same run again."""
+"""Test that a recorded run, played from its script, gives the same run again."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Delta debugging: nothing that is left can be left out, however many processes try."""
+"""Test the reduction of scenarios: nothing can be removed from the result, with any number of processes."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A judge that needs no simulation: figures that follow from loss and seed."""
+"""Judge runs without a simulation: the figures follow from loss rate and seed."""
 
 import tempfile
 from collections.abc import Callable
@@ -38,7 +38,7 @@ def played(asked: Matrix, jobs: int, judge: Judge, directory: Path | None = None
 
 
 def judge(scenario: Scenario, seed: int) -> Result:
-    """Without loss all is well; with it seed 2 violates characteristic 3."""
+    """Return a good verdict without loss. With loss, seed 2 violates characteristic 3."""
     loss = scenario.network.loss
     assert isinstance(loss, float)
     verdict: Verdict = "violated" if loss and seed == 2 else "holds"

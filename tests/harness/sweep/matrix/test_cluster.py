@@ -1,4 +1,4 @@
-"""A matrix on a Dask cluster: a scheduler and workers as processes of their own, on loopback."""
+"""Test a matrix on a Dask cluster, whose scheduler and workers are local processes."""
 
 import contextlib
 import json
@@ -21,14 +21,14 @@ pytest.importorskip("distributed", reason="needs the extra `cluster`")
 
 
 class Cluster:
-    """Dask's processes, all of whose output is in `directory`."""
+    """The processes of Dask. Their output is in `directory`."""
 
     def __init__(self, directory: Path, stack: contextlib.ExitStack) -> None:
         self._directory, self._stack = directory, stack
         self._file = directory / "scheduler.json"
 
     def start_scheduler(self, **env: str) -> str:
-        """Return its address. The scheduler waits two seconds for the answer of a lost worker, by default 30."""
+        """Start the scheduler and return its address. It waits two seconds for a lost worker instead of 30."""
         env["DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT"] = "2s"
         self.scheduler = self._start("scheduler", "scheduler", "--port", "0", "--scheduler-file", self._file, **env)
         until(lambda: self._file.exists() and self._file.stat().st_size > 0)
@@ -113,7 +113,7 @@ def test_lost_scheduler_is_one_sentence_and_the_matrix_can_continue(tmp_path: Pa
 
 
 def refused(address: str) -> str:
-    """The sentence, of an error that ends the command with exit status 3."""
+    """Return the sentence of an error that ends the command with exit status 3."""
     with pytest.raises(MachineError) as told, cluster([1], abs, address) as outcomes:
         list(outcomes)
     assert "\n" not in str(told.value)

@@ -1,4 +1,4 @@
-"""`ucp-harness matrix` as a user calls it, on the simulation."""
+"""Test the command `ucp-harness matrix` with simulated runs."""
 
 import csv
 import json
@@ -17,7 +17,7 @@ from tests.harness.unsupported import refusing_to_start
 
 
 def written(directory: Path, **keys: Any) -> Path:
-    """A small matrix: two rates, three seeds, ten minutes."""
+    """Play a small matrix: two loss rates, three seeds, ten minutes."""
     scenario = {"agents": 4, "duration_s": 600, "events": {"source": "random"}}
     path = directory / "matrix.yaml"
     path.write_text(json.dumps({"name": "small", "scenario": scenario, "loss": [0.0, 1.0], "seeds": 3, **keys}))

@@ -1,4 +1,4 @@
-"""Intervals against published values."""
+"""Test confidence intervals against published values."""
 
 import math
 

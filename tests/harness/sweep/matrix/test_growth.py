@@ -1,4 +1,4 @@
-"""Growth in a matrix, with a judge in the place of the simulation."""
+"""Test laws of growth in a matrix, without simulation."""
 
 import csv
 import itertools
@@ -40,7 +40,7 @@ def played_record(asked: Matrix) -> MatrixRecord:
 
 
 def judge(scenario: Scenario, seed: int) -> Result:
-    """Each agent completes a block in 200 s. There are 3 N^1.5 B messages, none without loss.
+    """Return figures: each agent completes a block in 200 s, and there are 3 N^1.5 B messages.
 
     40 and more agents never settle.
     """

@@ -1,4 +1,4 @@
-"""The matrix file: its contents, and the messages about mistakes in it."""
+"""Test the matrix file: its contents, and the error messages about mistakes in it."""
 
 import json
 import re

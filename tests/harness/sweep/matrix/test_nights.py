@@ -1,4 +1,4 @@
-"""`--nights`: finished nights of one matrix are kept once; whatever else is there is left out, and said."""
+"""Test `--nights`: the results of finished nights are stored once, and other files are left out and reported."""
 
 import json
 from pathlib import Path

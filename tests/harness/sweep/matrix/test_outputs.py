@@ -1,4 +1,4 @@
-"""summary.md, junit.xml, table and picture, also with several numbers of agents and backends."""
+"""Test summary.md, junit.xml, table and picture, also for several numbers of agents and backends."""
 
 import csv
 import io
@@ -42,7 +42,7 @@ def test_each_cell_is_a_test_case() -> None:
     assert failure.get("message") == "characteristic 3 violated in 1 of 4 runs, seed 2"
 
 
-def test_a_failed_run_fails_its_case_whatever_was_said() -> None:
+def test_failed_run_fails_its_case_in_any_event() -> None:
     finished = played(matrix(seeds=[1, 3]), 1, breaks)
     (failure,) = cases(finished)["50\u00a0% loss"]
     assert "seed 3 failed: RuntimeError: <broken> | [away](?)" in (failure.text or "")
@@ -104,7 +104,7 @@ def test_number_of_agents_is_named_everywhere(tmp_path: Path) -> None:
     assert all(texts.count(panel.title) == 2 for panel in PANELS)
 
 
-def test_how_many_swarms_finished_is_a_column() -> None:
+def test_share_of_finished_swarms_is_a_column() -> None:
     def endless(scenario: Scenario, seed: int) -> Result:
         judged = judge(scenario, seed)
         verdict: Verdict = "never finishes" if scenario.network.loss and seed > 1 else "finished"

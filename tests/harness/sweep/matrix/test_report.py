@@ -1,4 +1,4 @@
-"""report.html: cells, runs and nights in one small, safe file."""
+"""Test report.html of a matrix: summaries, runs and nights in one small, safe file."""
 
 import html
 import json
@@ -31,7 +31,7 @@ def breaks(scenario: Scenario, seed: int) -> Result:
 
 
 def tiles(finished: Finished, name: str) -> dict[str, _heatmap.Tile]:
-    """Return the tiles of one figure, by the page section of their runs."""
+    """Return the tiles of one figure by the page section to which they link."""
     (figure,) = [one for one in known_figures(finished.record.cells) if one.metric.name == name]
     grids = _heatmap.heatmap(finished.record, figure).grids
     return {str(tile.href): tile for grid in grids for _, row in grid.rows for tile in row}
@@ -144,7 +144,7 @@ def test_nights_differ_in_their_panel() -> None:
     assert [len(one) for one in heights] == [1, 2]
 
 
-def test_a_trend_begins_with_the_second_night_and_the_page_says_so() -> None:
+def test_trend_begins_with_the_second_night_and_the_page_explains_it() -> None:
     finished = played(matrix(), 1, judge)
     assert "With --nights DIR, the command keeps each completed night" in to_html(finished, Path())
     assert "The trend needs two nights. nights has one night" in to_html(finished, Path(), over(finished, 1))

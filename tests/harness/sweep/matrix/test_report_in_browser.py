@@ -1,4 +1,4 @@
-"""The matrix report in a real browser: cells lead to their runs by mouse and by key, without any script."""
+"""Test the report of a matrix in a real browser: mouse and keyboard lead from a tile to its runs without scripts."""
 
 from pathlib import Path
 from typing import Literal
@@ -28,7 +28,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1280])
-def test_it_fits_the_screen_and_the_console_is_silent(
+def test_page_fits_the_screen_and_logs_no_error(
     browser: Browser, page: Path, width: int, scheme: Literal["light", "dark"]
 ) -> None:
     browser.show(page, width=width, scheme=scheme)

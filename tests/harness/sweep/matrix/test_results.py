@@ -1,4 +1,4 @@
-"""results.jsonl: each run is played once, even if the matrix is interrupted several times."""
+"""Test results.jsonl: each run is played once, even if the matrix is interrupted several times."""
 
 import json
 import re

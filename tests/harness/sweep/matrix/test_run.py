@@ -1,4 +1,4 @@
-"""A matrix from its runs to its files, with a judge in the place of the simulation."""
+"""Test a matrix from its runs to its files, without simulation."""
 
 import csv
 import itertools
@@ -130,7 +130,7 @@ def test_the_table_fits_eighty_columns_and_names_what_was_violated() -> None:
     assert "Means of 4 runs per cell, with 95 % intervals. All cells have the same seeds." in lines
 
 
-def test_a_single_run_has_no_interval_and_it_is_said() -> None:
+def test_single_run_has_no_interval_and_this_is_reported() -> None:
     record = played(matrix(seeds=1), 1, judge).record
     assert record.cells[0].estimates["reconciles"].low is None
     assert "\u00b1" not in shown(record)

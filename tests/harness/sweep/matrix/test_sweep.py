@@ -1,4 +1,4 @@
-"""Many tasks on all cores: order, failures, and that no process is left."""
+"""Test many tasks on all processor cores: order, failures, and no remaining processes."""
 
 import os
 import signal
@@ -56,7 +56,7 @@ def test_outcomes_may_come_in_order_of_completion() -> None:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_task_that_fails_says_why_and_the_others_go_on(jobs: int) -> None:
+def test_failed_task_gives_its_reason_and_others_continue(jobs: int) -> None:
     def work(number: int) -> float:
         return 1 / number
 

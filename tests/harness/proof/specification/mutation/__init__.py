@@ -1,4 +1,4 @@
-"""The mutation score of the specification: does the comparison with the agent core notice a mistake?
+"""Measure whether the comparison of agent and TLA+ specification detects mistakes in the specification.
 
 The gate compares the agent core with the specification in TLA+. This comparison is worth as much as the mistakes that
 it notices. `edits.yaml` therefore holds mistakes for each Algorithm. The program

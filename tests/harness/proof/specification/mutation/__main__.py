@@ -1,4 +1,6 @@
-"""`python -m tests.harness.proof.specification.mutation [JOBS]`: compute the mutation score of the specification."""
+"""Compute the share of planted mistakes that are detected: `python -m tests.harness.proof.specification.mutation
+[JOBS]`.
+"""
 
 from tests.harness.proof.specification.mutation.score import main
 

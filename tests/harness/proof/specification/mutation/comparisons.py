@@ -1,4 +1,4 @@
-"""Comparisons of the agent core with the specification, each of which can be repeated with an edited specification."""
+"""Compare the agent with the TLA+ specification, which may contain a planted mistake."""
 
 import abc
 import functools
@@ -48,15 +48,15 @@ class Comparison(Protocol):
     def name(self) -> str: ...
 
     def prepare(self) -> None:
-        """Compute the results of the core, which all comparisons share."""
+        """Compute the results of the agent, which all comparisons share."""
 
     def differences(self, specifications: Sequence[str]) -> list[str | None]:
-        """Return how each of these specifications of one agent differs from the core. None if it does not."""
+        """Return, for each specification, its first difference from the agent, or None."""
 
 
 @dataclass(frozen=True)
 class States:
-    """The states that TLC finds within bounds, compared with those that the prover finds."""
+    """A comparison of the states that TLC finds within bounds with the states that `prove` finds."""
 
     bounds: Bounds
 
@@ -70,7 +70,7 @@ class States:
 
     @functools.cached_property
     def real(self) -> set[_spec_states.Plain]:
-        """The states of the agent core."""
+        """Return the states of the agent."""
         graph = explore(Swarm(self.bounds), most_bytes=8e9, most_s=float("inf"))
         assert graph.ended == "complete", f"{self.name}: {graph.ended}"
         return set(_spec_states.real(graph))
@@ -96,7 +96,7 @@ class States:
 
 
 def _explored(bounds: Bounds, specifications: Mapping[int, str], states: int) -> dict[int, list[str]] | int:
-    """Let TLC explore several specifications at once, because it takes longer to start than to explore one.
+    """Let TLC explore several specifications at once, because its start takes longer than the exploration.
 
     Return the states that it finds for each number, as text, or the number of a specification for which it stops. It
     explores no more than `MOST_STEPS` times `states` steps of each.
@@ -200,7 +200,7 @@ class DirectedInputs(Inputs):
 
 
 class RandomInputs(Inputs):
-    """Inputs that fit the state of the agent, nearly fit it, or do not fit it at all."""
+    """A comparison of an agent's steps for random inputs with the steps that the specification allows."""
 
     COUNT: ClassVar = 2_500
 
@@ -230,7 +230,7 @@ def _settings_words(settings: Mapping[str, Any]) -> list[str]:
 
 @contextmanager
 def _modules_with(specification: str) -> Iterator[None]:
-    """Let TLC read this specification of one agent in place of the one of the repository."""
+    """Let TLC read this specification in place of the one in the repository."""
     before = _tlc.MODULES
     with tempfile.TemporaryDirectory(prefix="ucp-edited-spec-") as name:
         for path in before.glob("*.tla"):
@@ -244,7 +244,7 @@ def _modules_with(specification: str) -> Iterator[None]:
 
 
 def random_trace(seed: int, count: int, settings: dict[str, Any]) -> Trace:
-    """Return the trace of an agent that gets `count` random inputs, in incarnations of LIFE inputs each."""
+    """Return the trace of an agent that gets `count` random inputs, and restarts after every LIFE inputs."""
     rng, now = Random(seed), 0.0
     inputs = random_inputs.Inputs(rng, newest_us=4)
     used = Settings(**{"max_block_bytes": MAX_EVENT_BYTES + 2 * EVENT_HEADER_BYTES + 40, **settings})

@@ -1,4 +1,4 @@
-"""Mistakes as data: `edits.yaml`."""
+"""Read the list of mistakes to plant in the specification from `edits.yaml`."""
 
 import functools
 import re
@@ -20,7 +20,7 @@ class Reason(NamedTuple):
 
 
 class Edit(NamedTuple):
-    """A mistake in the specification: `new` in place of `old`, in the operator of this Algorithm (0: shared text).
+    """A mistake in the specification: `new` in place of `old`, in the part for this Algorithm (0 is common text).
 
     If the edit changes nothing, `reason` explains it.
     """
@@ -47,13 +47,13 @@ class Edit(NamedTuple):
 
 
 def specification() -> str:
-    """Return the text of the specification of one agent."""
+    """Return the text of the TLA+ specification of one agent."""
     return (_tlc.MODULES / "UCP.tla").read_text("utf-8")
 
 
 @functools.cache
 def edits() -> tuple[Edit, ...]:
-    """Return all mistakes, in the order of the Algorithms."""
+    """Return all mistakes in the order of the Algorithms."""
     by_algorithm = yaml.safe_load(EDITS_FILE.read_text("utf-8"))
     return tuple(
         Edit(algorithm, about, old, new, *(Reason(**reason) for reason in reasons))

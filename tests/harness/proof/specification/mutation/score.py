@@ -1,4 +1,4 @@
-"""The comparisons from the cheapest to the most expensive, and the first ones that find each mistake."""
+"""Run the comparisons, cheapest first, and record which one detects each planted mistake."""
 
 import hashlib
 import json
@@ -55,7 +55,7 @@ BATCH = 16
 
 
 class Found(NamedTuple):
-    """The result for one mistake: the first comparison that finds it, and the difference. None if none does."""
+    """The result for one mistake: the first comparison that detects it, and the difference. None if none detects it."""
 
     text: str
     """The digest of the edited specification."""
@@ -66,7 +66,7 @@ class Found(NamedTuple):
 
 
 def digest(edit: Edit) -> str:
-    """Return a digest of the edited specification without comments, and of the specification of the swarm."""
+    """Return a digest of the specification with the mistake, without comments."""
     texts = edit.applied(specification()), (_tlc.MODULES / "Swarm.tla").read_text("utf-8")
     code = [" ".join(re.sub(r"\(\*.*?\*\)|\\\*[^\n]*", "", text, flags=re.DOTALL).split()) for text in texts]
     return hashlib.sha256("\n".join(code).encode()).hexdigest()[:16]
@@ -83,13 +83,13 @@ def stored() -> dict[str, Found]:
 
 
 def store(results: Mapping[str, Found]) -> None:
-    """Write `score.json`, one line for each edit, in the order of the edits."""
+    """Write `score.json` with one line for each mistake."""
     lines = [f"{json.dumps(edit.name)}: {json.dumps(results[edit.name])}" for edit in edits() if edit.name in results]
     write_atomically(SCORE_FILE, "{\n" + ",\n".join(lines) + "\n}\n")
 
 
 def main() -> int:
-    """Find each mistake that has no valid result yet, and store the results."""
+    """Test each mistake that has no valid result yet, and store the results."""
     valid = stored()
     results = {edit.name: Found(digest(edit)) for edit in edits()}
     results |= {name: valid[name] for name, new in results.items() if name in valid and valid[name].text == new.text}
@@ -102,7 +102,7 @@ def main() -> int:
 
 
 def _find(comparison: Comparison, results: dict[str, Found], jobs: int) -> None:
-    """Compare the core with each specification whose mistake is not found yet, and note the differences."""
+    """Run a comparison for each mistake that is not detected yet, and record the differences."""
     name = comparison.name
     waiting = [edit for edit in edits() if (found := results[edit.name]).by is None and name not in found.missed_by]
     if not waiting:
@@ -133,9 +133,7 @@ def _row(title: str, group: Sequence[Edit], results: Mapping[str, Found]) -> str
 
 
 def tables() -> str:
-    """Return the tables of the page: the mistakes of each Algorithm, the reasons of those without effect, and the
-    comparisons that find the others first.
-    """
+    """Return the tables of the page: the mistakes in each Algorithm, and the comparisons that detect them first."""
     results = stored()
     lines = ["| Algorithm | mistakes | found | without effect | open |", "|--:|--:|--:|--:|--:|"]
     for algorithm, group in groupby(edits(), lambda edit: edit.algorithm):
@@ -152,7 +150,7 @@ def tables() -> str:
 
 
 def write_page() -> None:
-    """Put the tables into the page."""
+    """Write the tables into the page."""
     head, _, rest = PAGE.read_text("utf-8").partition(BEGIN)
     _, _, tail = rest.partition(END)
     write_atomically(PAGE, f"{head}{BEGIN}\n{tables()}\n{END}{tail}")
