@@ -48,7 +48,8 @@ LATER_S = (1.0, 40.0)
 
 def session(agent_id: int, keys: KeySet = KEYS, now: float = NOW) -> Session:
     begun = Session(keys.bundle(agent_id), make_boot(1_000_000, bytes(8)))
-    begun.epochs.set_clock(now)
+    begun.set_clock(0.0)
+    begun.set_clock(now)
     return begun
 
 

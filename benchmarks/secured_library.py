@@ -3,8 +3,9 @@
 In virtual time, with the same seed, all agents must export the same chains with keys and without: the same block
 hashes in the same order. A matrix is played at each of its loss rates. Without arguments the benchmark leaves out
 `growth_matrix`, because its swarms of 100 agents take hours with keys. Some parts of a scenario cannot be compared.
-The benchmark removes these parts from both runs, and prints them: injections, which agents with keys drop, and
-revocations, which need keys. If chains differ, it prints the name of the scenario, and the exit status is 1.
+The benchmark removes these parts from both runs, and prints them: injections, which agents with keys drop, revocations,
+which need keys, and restarts, after which agents with keys wait for echoes. If chains differ, it prints the name of the
+scenario, and the exit status is 1.
 """
 
 import argparse
@@ -22,6 +23,7 @@ from harness.sweep.matrix._matrix_file import load_matrix
 
 INJECTIONS = "injections, which agents with keys drop"
 REVOCATIONS = "revocations, which need keys"
+RESTARTS = "restarts, after which agents with keys wait for echoes"
 SEALING = "sealed event data, which changes the hashes"
 TOO_LARGE = "growth_matrix"
 """The matrix that takes hours with keys, because it has swarms of 100 agents."""
@@ -39,12 +41,14 @@ def in_both(name: str, scenario: Scenario) -> Compared:
     """Return the parts of a scenario that have the same meaning with and without keys."""
     timeline = [entry for entry in scenario.timeline if not entry.injection]
     heard = [entry for entry in timeline if not (entry.fault and entry.fault.needs_keys)]
+    alive = [entry for entry in heard if not (entry.fault and entry.fault.what in ("restart", "reboot"))]
     left_out = {
         INJECTIONS: len(timeline) < len(scenario.timeline),
         REVOCATIONS: len(heard) < len(timeline),
+        RESTARTS: len(alive) < len(heard),
         SEALING: scenario.security is not None and scenario.security.seal,
     }
-    plain = scenario.model_copy(update={"timeline": heard, "security": None})
+    plain = scenario.model_copy(update={"timeline": alive, "security": None})
     return Compared(name, plain, tuple(reason for reason, is_left_out in left_out.items() if is_left_out))
 
 

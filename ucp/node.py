@@ -100,7 +100,7 @@ class Node:
             ) from None
 
         def report_write_error(error: OSError) -> None:
-            self._log_line(f"the previous group secret is still on disk: {error.strerror}")
+            self._log_line(f"the bundle is out of date, and may have an old group secret: {error.strerror}")
 
         return agent_factory(mission, directory, report_write_error)
 

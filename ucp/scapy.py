@@ -66,8 +66,8 @@ from ucp.secure.envelope import (
     BOOT_BYTES,
     CLEAR,
     CLEAR_FIELDS,
+    CONTROL_NAMES,
     NAMES,
-    REVOCATION,
     TAG_BYTES,
     read_clear_header,
 )
@@ -210,7 +210,7 @@ class SecuredUCP(Packet):
     fields_desc = _fields(
         CLEAR_FIELDS,
         version=ByteField("version", SECURED_VERSION),
-        type=ByteEnumField("type", 0, NAMES | {REVOCATION: "Revocation"}),
+        type=ByteEnumField("type", 0, NAMES | CONTROL_NAMES),
         sender=IntField("sender", 1),
         length=LenField("length", None),
     )

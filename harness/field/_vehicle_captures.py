@@ -10,7 +10,7 @@ from harness.archive.packets.pcap import OUTBOUND, CaptureFile
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent
 from ucp.messages import HEADER, MalformedDatagramError, decode
-from ucp.secure.envelope import REVOCATION
+from ucp.secure.envelope import CONTROL_NAMES
 from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def read_capture(path: Path, agent_id: int, epoch_us: int | None, opener: "Opene
         except NotUcpError:
             continue
         except MalformedDatagramError:
-            capture.unreadable += is_sealed and datagram[3] != REVOCATION
+            capture.unreadable += is_sealed and datagram[3] not in CONTROL_NAMES
             continue
         outbound = direction == OUTBOUND or (not direction and sender == agent_id)
         if outbound == (sender == agent_id):

@@ -152,8 +152,10 @@ class KeyDirectories:
         from ucp.secure.bundle import bundle_name, write_bundle
 
         path = self.directories[agent_id] / bundle_name(agent_id)
-        if not (kept and path.exists()):
-            write_bundle(path, self.keys.bundles[agent_id])
+        again = path.exists()
+        if not (kept and again):
+            bundle = self.keys.bundles[agent_id]
+            write_bundle(path, bundle.used() if again else bundle)
         return path
 
 

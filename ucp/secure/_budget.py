@@ -6,12 +6,14 @@ holds some tokens, and each wrong signature takes one. Without tokens, the agent
 has a budget of its own, so that forgeries in its name do not affect the datagrams of other senders.
 """
 
+import math
+
 BURST = 32
 """Wrong signatures in the name of one sender without a pause."""
 
 
 class Budget:
-    """Tokens for wrong signatures. `per_s` tokens return in each mission second."""
+    """Tokens for wrong signatures. `per_s` tokens return in each mission second. An infinite `per_s` sets no limit."""
 
     __slots__ = ("_per_s", "_since_s", "_tokens")
 
@@ -29,4 +31,5 @@ class Budget:
 
     def take(self) -> None:
         """Take the token for a wrong signature."""
-        self._tokens -= 1
+        if self._per_s < math.inf:
+            self._tokens -= 1

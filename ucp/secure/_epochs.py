@@ -1,22 +1,30 @@
 """Epochs of the group secret.
 
 Mission time is divided into epochs. A one-way function computes the group secret of an epoch from the secret of the
-epoch before it. A vehicle keeps the secrets of the current epoch and of the one before, and erases older ones. An
+epoch before it. A vehicle keeps the secrets of the clock's epoch and of the one before, and erases older ones. An
 attacker who captures the vehicle therefore cannot decrypt older datagrams.
 
-The clocks of the vehicles need not agree. An authentic datagram of a later epoch moves its receiver on to this epoch.
-The limit is `MAX_EPOCHS_AHEAD` epochs ahead of the receiver's own clock. Otherwise an attacker with keys could move
-some vehicles so far ahead that they no longer accept datagrams of the vehicles that the attacker did not reach.
+The clocks of the vehicles need not agree, and the clock of a vehicle may be lost after a reboot:
+
+- Only the vehicle's own clock erases secrets. The clock's epoch is at least that of the bundle, plus the time since the
+  start. A clock that shows 1970 therefore does not take the vehicle back.
+- A vehicle opens datagrams of any epoch up to `MAX_EPOCHS_AHEAD` after its clock's. They do not move its clock.
+- A vehicle sends in the latest epoch that it has received, so that vehicles with a faster clock can open its
+  datagrams. It follows others up to `MAX_EPOCHS_FOLLOWED` epochs only. An attacker with the keys of one vehicle can
+  thus make others send in a later epoch, but all vehicles can still open their datagrams.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable
 
 from ucp.secure.bundle import LAST_EPOCH, Bundle
 from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret
 
-MAX_EPOCHS_AHEAD = 8
-"""Maximum number of epochs that a datagram may be ahead of the receiver's clock: 80 minutes with epochs of 600 s."""
+MAX_EPOCHS_AHEAD = 4096
+"""Maximum number of epochs that a datagram may be ahead of the receiver's clock: four weeks with epochs of 600 s."""
+MAX_EPOCHS_FOLLOWED = MAX_EPOCHS_AHEAD // 2
+"""Maximum number of epochs that a vehicle sends ahead of its clock. The clocks of receivers may be behind its own."""
 MAX_CACHED_KEYS = 4096
 """Maximum number of cached sender keys. Above it, the cache is emptied."""
 
@@ -24,8 +32,8 @@ MAX_CACHED_KEYS = 4096
 class Epochs:
     """The group secrets of one vehicle.
 
-    `save` is called with the vehicle's new bundle after each change of the epoch. The new bundle no longer contains
-    the older secrets.
+    `save` is called with the vehicle's new bundle after each change of the clock's epoch. The new bundle no longer
+    contains the older secrets.
     """
 
     def __init__(
@@ -35,49 +43,60 @@ class Epochs:
         sender_keys: Callable[[bytes, bytes, int, int, bytes], SenderKeys] = SenderKeys,
     ) -> None:
         self._bundle = bundle
-        self.current = bundle.epoch
-        """The epoch in which this vehicle sends."""
         self._mission = bundle.public.mission
         self._save = save
         self._derive_keys = sender_keys
         self._previous_secret: bytes | None = None
-        """The secret of the epoch before the current one. None if this incarnation has not known it."""
-        self._clock = bundle.epoch
-        self._clock_interval = math.inf, -math.inf
-        """Start and end of the clock's epoch in mission seconds. The interval is empty before the first call."""
+        """The secret of the epoch before the clock's. None if this incarnation has not known it."""
+        self._later: deque[bytes] = deque()
+        """The secrets of the epochs after the clock's, as far as they were needed."""
+        self._followed = 0
+        self._started_s: float | None = None
+        self._until_s = -math.inf
+        """Mission second at which the clock's epoch ends."""
+        self._first = bundle.epoch
         self._sender_keys: dict[tuple[int, int, bytes], SenderKeys] = {}
 
     @property
     def bundle(self) -> Bundle:
-        """The vehicle's bundle, with the group secret of the current epoch."""
+        """The vehicle's bundle, with the group secret of the clock's epoch."""
         return self._bundle
 
+    @property
+    def current(self) -> int:
+        """The epoch in which this vehicle sends."""
+        return max(self._bundle.epoch, self._followed)
+
     def set_clock(self, now: float) -> None:
-        """Set the clock to mission second `now`, and move on to the clock's epoch if it is a later one."""
-        since, until = self._clock_interval
-        if since <= now < until:
+        """Set the clock to mission second `now`, and erase older secrets if its epoch is a later one."""
+        if now < self._until_s:
             return
+        if self._started_s is None:
+            self._started_s = now
         epoch_s = self._bundle.public.epoch_s
-        epoch = int(now // epoch_s)
-        self._clock_interval = epoch * epoch_s, (epoch + 1) * epoch_s
-        self._clock = min(LAST_EPOCH, max(0, epoch))
-        if self._clock > self.current:
-            self.advance_to(self._clock)
+        shown, since_start = int(now // epoch_s), int((now - self._started_s) // epoch_s)
+        epoch = min(LAST_EPOCH, max(shown, self._first + since_start))
+        if epoch > self._bundle.epoch:
+            self._advance_to(epoch)
+        self._until_s = min((shown + 1) * epoch_s, self._started_s + (since_start + 1) * epoch_s)
 
     def can_open(self, epoch: int) -> bool:
         """Return whether the vehicle has the secret of this epoch, or may compute it."""
-        if epoch > self.current:
-            return epoch <= min(LAST_EPOCH, self._clock + MAX_EPOCHS_AHEAD)
-        return epoch == self.current or (epoch == self.current - 1 and self._previous_secret is not None)
+        later = epoch - self._bundle.epoch
+        return 0 <= later <= MAX_EPOCHS_AHEAD or (later == -1 and self._previous_secret is not None)
 
-    def advance_to(self, epoch: int) -> None:
-        """Move on to a later epoch, and erase the secrets of epochs before the previous one."""
+    def follow(self, epoch: int) -> None:
+        """Send at least in this epoch. A vehicle with the group secret sent in it."""
+        self._followed = max(self._followed, min(epoch, self._bundle.epoch + MAX_EPOCHS_FOLLOWED))
+
+    def _advance_to(self, epoch: int) -> None:
+        """Move the clock to a later epoch, and erase the secrets of epochs before the previous one."""
         before, secret = self._previous_secret, self._bundle.group_secret
-        for _ in range(epoch - self.current):
-            before, secret = secret, next_epoch_secret(secret, self._mission)
+        for _ in range(epoch - self._bundle.epoch):
+            before = secret
+            secret = self._later.popleft() if self._later else next_epoch_secret(secret, self._mission)
         self._previous_secret = before
         self._bundle = self._bundle.at_epoch(epoch, secret)
-        self.current = epoch
         self._sender_keys = {known: keys for known, keys in self._sender_keys.items() if known[0] >= epoch - 1}
         self._save(self._bundle)
 
@@ -95,10 +114,11 @@ class Epochs:
         self._sender_keys[epoch, sender, boot] = keys
 
     def _secret(self, epoch: int) -> bytes:
-        if epoch == self.current - 1:
+        later = epoch - self._bundle.epoch
+        if later == -1:
             assert self._previous_secret is not None, "can_open(epoch) is true"
             return self._previous_secret
-        secret = self._bundle.group_secret
-        for _ in range(epoch - self.current):
-            secret = next_epoch_secret(secret, self._mission)
-        return secret
+        while len(self._later) < later:
+            newest = self._later[-1] if self._later else self._bundle.group_secret
+            self._later.append(next_epoch_secret(newest, self._mission))
+        return self._later[later - 1] if later else self._bundle.group_secret

@@ -43,7 +43,9 @@ def agent_factory(
             report_write_error(error)
 
     _check_bundle(bundle, mission, f"`security.bundle`: {path}")
-    return _factory(mission, Session(bundle, make_boot(time.time_ns() // 1000, os.urandom(8)), save))
+    earlier_us = -1 if bundle.started_us is None else bundle.started_us
+    started_us = max(time.time_ns() // 1000, earlier_us + 1)  # the clock may be lost
+    return _factory(mission, Session(bundle, make_boot(started_us, os.urandom(8)), save))
 
 
 def virtual_agent_factory(mission: Mission, bundle: Any, boot: Any) -> Callable[..., SecuredAgent]:

@@ -11,13 +11,16 @@ _WORDS = WINDOW // _WORD_BITS + 1
 
 
 class ReplayWindow:
-    """The window of one incarnation of one sender. The caller accepts only sequence numbers of authentic datagrams."""
+    """The window of one incarnation of one sender, which accepts sequence numbers from `first` on.
+
+    The caller accepts only sequence numbers of authentic datagrams.
+    """
 
     __slots__ = ("_newest", "_words")
 
-    def __init__(self) -> None:
-        self._newest = -1
-        self._words = [0] * _WORDS
+    def __init__(self, first: int = 0) -> None:
+        self._newest = first - 1
+        self._words = [2**_WORD_BITS - 1 if first else 0] * _WORDS
 
     def is_fresh(self, sequence: int) -> bool:
         """Return whether the number is inside or above the window, and was not accepted before."""

@@ -29,6 +29,7 @@ DEFAULT_EPOCH_S = 600.0
 MAX_EPOCH_S = 31 * 86400.0
 """Maximum length of an epoch, 31 days. No mission is longer."""
 LAST_EPOCH = 2**32 - 1
+LAST_START_US = 2**63
 
 PUBLIC_SCHEMA = "ucp-keys/1"
 BUNDLE_SCHEMA = "ucp-bundle/1"
@@ -85,17 +86,26 @@ class PublicKeys:
 
 @dataclass(frozen=True)
 class Bundle:
-    """The keys of one vehicle: the public keys, its private key, and the group secret of epoch `epoch`."""
+    """The keys of one vehicle: the public keys, its private key, and the group secret of epoch `epoch`.
+
+    `started_us` is the start of the last incarnation with this bundle, in microseconds UTC. None if no agent has used
+    the bundle.
+    """
 
     public: PublicKeys
     agent_id: int
     private_key: bytes = field(repr=False)
     group_secret: bytes = field(repr=False)
     epoch: int = 0
+    started_us: int | None = None
 
     def at_epoch(self, epoch: int, group_secret: bytes) -> "Bundle":
         """Return the bundle of the same vehicle in a later epoch."""
         return replace(self, epoch=epoch, group_secret=group_secret)
+
+    def used(self) -> "Bundle":
+        """Return the bundle for a vehicle that may have flown before in this mission."""
+        return replace(self, started_us=self.started_us or 0)
 
     def to_json(self) -> dict[str, Any]:
         """Return the content of the bundle's file, secrets included."""
@@ -106,6 +116,7 @@ class Bundle:
             "private_key": self.private_key.hex(),
             "group_secret": self.group_secret.hex(),
             "epoch": self.epoch,
+            **({} if self.started_us is None else {"started_us": self.started_us}),
         }
 
     @classmethod
@@ -117,10 +128,13 @@ class Bundle:
             raise KeyFileError("`agent_id` must be one of `vehicles`")
         if type(epoch) is not int or not 0 <= epoch <= LAST_EPOCH:
             raise KeyFileError(f"`epoch` must be a whole number 0..{LAST_EPOCH}")
+        started_us = document.get("started_us")
+        if started_us is not None and (type(started_us) is not int or not 0 <= started_us < LAST_START_US):
+            raise KeyFileError("`started_us` must be a time in microseconds")
         private_key = key_in(document, "private_key", KEY_BYTES)
         if public_key_of(private_key) != public.vehicles[agent_id]:
             raise KeyFileError(f"`private_key` is not that of vehicle {agent_id}")
-        return cls(public, agent_id, private_key, key_in(document, "group_secret", KEY_BYTES), epoch)
+        return cls(public, agent_id, private_key, key_in(document, "group_secret", KEY_BYTES), epoch, started_us)
 
 
 @dataclass(frozen=True)

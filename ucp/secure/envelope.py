@@ -37,10 +37,14 @@ SEAL_BYTES = TAG_BYTES + SIGNATURE_BYTES
 LAST_SEQUENCE = 2**32 - 1
 REVOCATION = 10
 """Type of a revocation. The authority signs it."""
+CHALLENGE, ECHO = 11, 12
+"""Types of the datagrams that prove that a sender exists now. `ucp.secure._challenges` explains them."""
 CONTROL_POSITION = 2**32
 """Position of the first control datagram, a datagram of the types from 10 on. Messages have lower positions."""
-TYPES = frozenset(range(1, REVOCATION + 1))
+TYPES = frozenset(range(1, ECHO + 1))
 
+CONTROL_NAMES = {REVOCATION: "Revocation", CHALLENGE: "Challenge", ECHO: "Echo"}
+"""Type of a control datagram, which has no message of the protocol -> its name."""
 NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
 """Type of a message -> its name."""
 

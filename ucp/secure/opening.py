@@ -7,7 +7,7 @@ an opener accepts them in any order and any number of times. It still rejects da
 from ucp.messages import MalformedDatagramError
 from ucp.secure.bundle import Bundle
 from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret, verify
-from ucp.secure.envelope import REVOCATION, read_clear_header
+from ucp.secure.envelope import CONTROL_NAMES, read_clear_header
 from ucp.secure.sealed_datagrams import OpenedDatagram, decrypt, parse_body, signing_domain
 
 EPOCHS_AHEAD = 4096
@@ -29,11 +29,11 @@ class Opener:
     def open(self, datagram: bytes) -> OpenedDatagram:
         """Return the content of a datagram.
 
-        Raises MalformedDatagramError if the datagram is a revocation, which has no message, is not authentic, belongs
-        to an epoch before the bundle's, or comes from a sender that is not on the roster.
+        Raises MalformedDatagramError if the datagram has no message because it is a control datagram, is not authentic,
+        belongs to an epoch before the bundle's, or comes from a sender that is not on the roster.
         """
         clear = read_clear_header(datagram)
-        if clear.type == REVOCATION:
+        if clear.type in CONTROL_NAMES:
             raise MalformedDatagramError("no message")
         public_key = self._public.vehicles.get(clear.sender)
         if public_key is None:

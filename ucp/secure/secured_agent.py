@@ -18,7 +18,7 @@ from ucp.export import export_chain
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.secure._known_revocations import KnownRevocations
 from ucp.secure._signatures import BlockSignatures
-from ucp.secure.envelope import BOOT_BYTES, LAST_SEQUENCE, REQUESTS, REVOCATION, ClearHeader
+from ucp.secure.envelope import BOOT_BYTES, CHALLENGE, LAST_SEQUENCE, REQUESTS, REVOCATION, ClearHeader
 from ucp.secure.export_head import head_of
 from ucp.secure.revocation import RevocationError
 from ucp.secure.sealed_datagrams import OpenedDatagram, Request
@@ -67,6 +67,8 @@ class SecuredAgent(Agent):
         self._answered_requests: dict[int, Request] = {}
         """Sequence of a response in the outbox -> the request that it answers."""
         self._exports = 0
+        self._now = 0.0
+        """Mission second of the last datagram or revocation."""
         self._revocation_due = False
         self._revocation_sent_at: float | None = None
 
@@ -88,13 +90,14 @@ class SecuredAgent(Agent):
     # From the air
 
     def receive_datagram(self, data: bytes, now: float) -> None:
-        self.session.epochs.set_clock(now)
+        self.session.set_clock(now)
+        self._now = now
         try:
             clear = self.session.crypto.read(data)
             if reason := self._drop_reason(clear):
                 raise MalformedDatagramError(reason)
-            if clear.type == REVOCATION:
-                self._receive_revocation(self.session.open_revocation(data, clear), clear.sender, now)
+            if clear.type >= REVOCATION:
+                self._receive_control(data, clear, now)
                 return
             opened = self.session.open(data, clear, now)
             if clear.revocations != self._revocations.digest:
@@ -104,6 +107,19 @@ class SecuredAgent(Agent):
             self._drop(now, malformed.reason, RecordedBytes(in_base64(data)))
             return
         self._handle_opened(opened, now)
+
+    def _receive_control(self, data: bytes, clear: ClearHeader, now: float) -> None:
+        """Handle a datagram that is no message of the protocol. Raises MalformedDatagramError."""
+        if clear.type == REVOCATION:
+            self._receive_revocation(self.session.open_revocation(data, clear), clear.sender, now)
+            return
+        if clear.type == CHALLENGE:
+            self.session.receive_challenge(data, clear, now)
+            self._revocation_sent_at = None  # the sender waits for revocations before it trusts others
+        else:
+            self.session.receive_echo(data, clear, now)
+        if clear.revocations != self._revocations.digest:
+            self._schedule_revocations(now)
 
     def _drop_reason(self, clear: ClearHeader) -> str | None:
         if clear.sender == self.agent_id:
@@ -143,9 +159,10 @@ class SecuredAgent(Agent):
     def sealed_to_send(self) -> Sequence[OutgoingDatagram]:
         """Return the datagrams to broadcast now, in order. Answers wait by `answer_spread_s`."""
         due = self._due_to_send()
-        if not self._revocation_due and not due:
+        if not (due or self._revocation_due or self.session.has_control_datagrams):
             return ()
-        self.session.epochs.set_clock(self.state.now)
+        now = self.state.now if due else self._now
+        self.session.set_clock(now)
         outgoing = []
         if self._revocation_due:
             self._revocation_due = False
@@ -153,6 +170,7 @@ class SecuredAgent(Agent):
             outgoing += [
                 OutgoingDatagram(self.session.seal_revocation(body, digest)) for body in self._revocations.bodies
             ]
+        outgoing += map(OutgoingDatagram, self.session.control_datagrams(self._revocations.digest, now))
         for sequence, message, plain in due:
             if sequence > LAST_SEQUENCE:
                 self.problem = "the agent has used all sequence numbers of this boot: restart it so that it sends again"
@@ -194,6 +212,7 @@ class SecuredAgent(Agent):
             raise MalformedDatagramError("not signed by the authority") from None
         if not is_new:
             return
+        self._now = now
         request = {"command": "revoke", "revocation": in_base64(body), **(origin or {})}
         if self._tracing:
             self._trace.append(CommandEntry(now, "revoke", request))

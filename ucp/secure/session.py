@@ -9,15 +9,20 @@ there are no round trips.
 A receiver does its cheapest checks first. A datagram changes no state of the session before its signature is verified.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 from ucp.messages import TYPE_CODES, MalformedDatagramError, Message
 from ucp.secure._budget import Budget
+from ucp.secure._challenges import ALL, ECHO_INTERVAL_S, TRUST_DELAY_S, Challenges
 from ucp.secure._epochs import Epochs
 from ucp.secure._window import ReplayWindow
-from ucp.secure.bundle import Bundle
-from ucp.secure.crypto_suite import SenderKeys
+from ucp.secure.bundle import LAST_START_US, Bundle
+from ucp.secure.crypto_suite import SenderKeys, SignatureClaim
 from ucp.secure.envelope import (
+    CHALLENGE,
+    ECHO,
     LAST_SEQUENCE,
     REQUEST,
     REQUEST_OF,
@@ -40,7 +45,7 @@ from ucp.secure.sealed_datagrams import (
 )
 
 WRONG_SIGNATURES_PER_S = 1000.0
-"""Wrong signatures of senders that a receiver verifies in a mission second, about a tenth of a processor core."""
+"""Wrong signatures of senders that a receiver verifies in a mission second. They take a tenth of a processor core."""
 REVOCATIONS_PER_S = 50.0
 """Wrong signatures of the authority that a receiver verifies in a mission second."""
 
@@ -48,20 +53,29 @@ REVOCATIONS_PER_S = 50.0
 class _Incarnation:
     """The newest known incarnation of another sender, with its accepted sequence numbers and its newest requests."""
 
-    __slots__ = ("boot", "requests", "window")
+    __slots__ = ("boot", "control", "latest_boot", "requests", "window")
 
-    def __init__(self, boot: bytes) -> None:
+    def __init__(self, boot: bytes, first: int = 0, latest_boot: bytes = b"") -> None:
         self.boot = boot
-        self.window = ReplayWindow()
+        self.latest_boot = max(boot, latest_boot)
+        """The greatest boot of this sender so far. It is greater than `boot` if the sender lost its clock."""
+        self.window = ReplayWindow(first)
+        self.control = -1
+        """Sequence of the newest received challenge."""
         self.requests: dict[int, int] = {}
         """Type of a request -> sequence of the newest request of this type that was received."""
+
+    def is_later(self, boot: bytes) -> bool:
+        """Return whether another incarnation with this boot is later than all known ones."""
+        return boot > self.latest_boot
 
 
 class Session:
     """The session of one incarnation of a vehicle.
 
     `boot` consists of the incarnation's start in microseconds UTC (8 bytes) and 8 random bytes. `save_bundle` is called
-    with the new bundle after each change of the epoch.
+    with the new bundle at once, so that a later incarnation knows of this one, and after each change of the epoch.
+    `wrong_signatures_per_s` limits the wrong signatures of senders that this vehicle verifies.
     """
 
     def __init__(
@@ -70,6 +84,7 @@ class Session:
         boot: bytes,
         save_bundle: Callable[[Bundle], None] = lambda _: None,
         crypto: CryptoFunctions = CRYPTO_FUNCTIONS,
+        wrong_signatures_per_s: float = WRONG_SIGNATURES_PER_S,
     ) -> None:
         self.agent_id = bundle.agent_id
         self.boot = boot
@@ -78,16 +93,38 @@ class Session:
         self.public_keys = bundle.public.vehicles
         self.crypto = crypto
         self.private_key = crypto.signer(bundle.private_key)
-        self.epochs = Epochs(bundle, save_bundle, crypto.sender_keys)
+        self._is_first = bundle.started_us is None
+        started = replace(bundle, started_us=int.from_bytes(boot[:8], "big") % LAST_START_US)
+        save_bundle(started)
+        self.epochs = Epochs(started, save_bundle, crypto.sender_keys)
+        self.challenges = Challenges()
+        self._is_complete: bool | None = None
+        """True if this vehicle has received all datagrams of the mission that it accepts. None before the start."""
+        self._held: dict[int, _Incarnation] = {}
+        """Senders that have answered a challenge, before this vehicle trusts them."""
+        self._echoed_at: dict[int, float] = {}
+        self._echoes: list[Request] = []
+        """The challenges to answer."""
+        self._next_sequence = 0
+        """The sequence after the greatest one that this vehicle has sent."""
         self._domain = signing_domain(self.mission)
         self._incarnations: dict[int, _Incarnation] = {}
         self._control = 0
         """Sequence of the next control datagram."""
-        per_s = WRONG_SIGNATURES_PER_S / len(self.public_keys)
+        per_s = wrong_signatures_per_s / len(self.public_keys)
         self._budgets = {agent_id: Budget(per_s) for agent_id in self.public_keys}
         self.revocation_budget = Budget(REVOCATIONS_PER_S)
         self._own_requests: dict[int, int] = {}
         """Type of a request -> sequence of this vehicle's newest request of this type."""
+
+    def set_clock(self, now: float) -> None:
+        """Set the clock to mission second `now`. The first call is at the start of the incarnation.
+
+        The replay windows are complete if no earlier incarnation used the bundle, and the mission has just begun.
+        """
+        self.epochs.set_clock(now)
+        if self._is_complete is None:
+            self._is_complete = self._is_first and abs(now) < self.epochs.bundle.public.epoch_s
 
     # To the air
 
@@ -96,6 +133,7 @@ class Session:
     ) -> bytes:
         """Return the sealed datagram of a message. The caller must use each sequence once, up to LAST_SEQUENCE."""
         self.record_sent(sequence, message)
+        self._next_sequence = max(self._next_sequence, sequence + 1)
         code = TYPE_CODES[type(message)]
         body = message.body()
         if code in REQUEST_OF:
@@ -116,10 +154,32 @@ class Session:
 
     def seal_revocation(self, body: bytes, revocations: int) -> bytes:
         """Return the sealed datagram of a revocation."""
-        header = ClearHeader(REVOCATION, self.agent_id, self._control, self.epochs.current, self.boot, revocations)
+        return self._seal_control(REVOCATION, body, revocations)
+
+    @property
+    def has_control_datagrams(self) -> bool:
+        """True if a challenge or an echo waits to be sent."""
+        return bool(self._echoes) or self.challenges.is_due
+
+    def control_datagrams(self, revocations: int, now: float) -> Iterator[bytes]:
+        """Yield the challenges and echoes to broadcast now."""
+        if not self._is_complete and self.challenges.first_at is None:
+            self.challenges.ask(ALL, now)
+        for target in self.challenges.take_due(now):
+            self.challenges.sent(target, self._control)
+            yield self._seal_control(CHALLENGE, target.to_bytes(4, "big"), revocations)
+        echoes, self._echoes = self._echoes, []
+        for request in echoes:
+            body = REQUEST.pack(*request) + self._next_sequence.to_bytes(4, "big")
+            yield self._seal_control(ECHO, body, revocations)
+
+    def _seal_control(self, code: int, body: bytes, revocations: int) -> bytes:
+        header = ClearHeader(code, self.agent_id, self._control, self.epochs.current, self.boot, revocations)
         self._control += 1
-        clear = header.pack(len(body) + TAG_BYTES)
-        return clear + self._own_keys().encrypt(header.position, body, clear)
+        length = len(body) + (TAG_BYTES if code == REVOCATION else SEAL_BYTES)
+        clear = header.pack(length)
+        signature = b"" if code == REVOCATION else self.private_key.sign(self._domain + clear + body)
+        return clear + self._own_keys().encrypt(header.position, body + signature, clear)
 
     def _own_keys(self) -> SenderKeys:
         epoch = self.epochs.current
@@ -136,10 +196,21 @@ class Session:
 
         Raises MalformedDatagramError.
         """
+        if self._is_complete is None:
+            self.set_clock(now)
+        if self._held:
+            self._trust_held(now)
         incarnation = self._incarnations.get(clear.sender)
         if not self.epochs.can_open(clear.epoch):
             raise MalformedDatagramError("epoch out of range")
-        if incarnation is not None and clear.boot < incarnation.boot:
+        if incarnation is None and not self._is_complete:
+            self._decrypt(datagram, clear)
+            self.epochs.follow(clear.epoch)
+            self.challenges.ask(ALL, now)
+            raise MalformedDatagramError("not confirmed")
+        if incarnation is not None and clear.boot != incarnation.boot and not incarnation.is_later(clear.boot):
+            self._decrypt(datagram, clear)
+            self.challenges.ask(clear.sender, now)
             raise MalformedDatagramError("old boot")
         if (
             incarnation is not None
@@ -151,8 +222,7 @@ class Session:
         if incarnation is None or clear.boot != incarnation.boot:
             incarnation = self._incarnations[clear.sender] = _Incarnation(clear.boot)
         incarnation.window.accept(clear.sequence)
-        if clear.epoch > self.epochs.current:
-            self.epochs.advance_to(clear.epoch)
+        self.epochs.follow(clear.epoch)
         if clear.type in REQUESTS:
             incarnation.requests[clear.type] = max(clear.sequence, incarnation.requests.get(clear.type, 0))
         return self.crypto.parse_body(clear, body)
@@ -166,10 +236,69 @@ class Session:
             raise MalformedDatagramError("epoch out of range")
         return decrypted(self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot), datagram, clear)
 
+    def receive_challenge(self, datagram: bytes, clear: ClearHeader, now: float) -> None:
+        """Schedule an echo of a challenge. Raises MalformedDatagramError.
+
+        A challenge may be recorded if it is not newer than all known ones. Few of these are answered.
+        """
+        if not self.epochs.can_open(clear.epoch):
+            raise MalformedDatagramError("epoch out of range")
+        incarnation = self._incarnations.get(clear.sender)
+        if incarnation is None:
+            is_new = self._is_complete
+        else:
+            is_newer = clear.boot == incarnation.boot and clear.sequence > incarnation.control
+            is_new = is_newer or incarnation.is_later(clear.boot)
+        if not is_new and now < self._echoed_at.get(clear.sender, -math.inf) + ECHO_INTERVAL_S:
+            raise MalformedDatagramError("replayed")
+        body = self._authenticate(datagram, clear, now)
+        if len(body) != 4:
+            raise MalformedDatagramError("wrong length")
+        if is_new:
+            if incarnation is None or clear.boot != incarnation.boot:
+                incarnation = self._incarnations[clear.sender] = _Incarnation(clear.boot)
+            incarnation.control = clear.sequence
+        self.epochs.follow(clear.epoch)
+        if int.from_bytes(body, "big") in (ALL, self.agent_id):
+            self._echoed_at[clear.sender] = now
+            self._echoes.append(Request(clear.sender, clear.boot, clear.sequence))
+
+    def receive_echo(self, datagram: bytes, clear: ClearHeader, now: float) -> None:
+        """Accept the sender of an echo, if it answers a challenge of this vehicle. Raises MalformedDatagramError."""
+        if not self.epochs.can_open(clear.epoch):
+            raise MalformedDatagramError("epoch out of range")
+        _, body, _ = self._decrypt(datagram, clear)
+        if len(body) != REQUEST.size + 4:
+            raise MalformedDatagramError("wrong length")
+        request = Request(*REQUEST.unpack_from(body))
+        is_own = (request.sender, request.boot) == (self.agent_id, self.boot)
+        if not is_own or not self.challenges.is_pending(request.sequence, clear.sender):
+            raise MalformedDatagramError("answers no request")
+        self._authenticate(datagram, clear, now)
+        self.epochs.follow(clear.epoch)
+        known = self._incarnations.get(clear.sender)
+        if known is None or known.boot != clear.boot:
+            first, latest_boot = int.from_bytes(body[REQUEST.size :], "big"), known.latest_boot if known else b""
+            self._held[clear.sender] = _Incarnation(clear.boot, first, latest_boot)
+            self._trust_held(now)
+
+    def _trust_held(self, now: float) -> None:
+        """Accept the senders that have answered a challenge, unless this vehicle still collects echoes."""
+        first_at = self.challenges.first_at
+        answered = len(self._held.keys() | self._incarnations.keys())
+        collects = not self._is_complete and first_at is not None and now < first_at + TRUST_DELAY_S
+        if not collects or answered == len(self.public_keys) - 1:
+            self._incarnations |= self._held
+            self._held.clear()
+
+    def _decrypt(self, datagram: bytes, clear: ClearHeader) -> tuple[SenderKeys, bytes, SignatureClaim]:
+        """Return keys, body and claim of a datagram. Raises MalformedDatagramError if its tag is wrong."""
+        keys = self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot)
+        return keys, *self.crypto.decrypt(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
+
     def _authenticate(self, datagram: bytes, clear: ClearHeader, now: float) -> bytes:
         """Return the decrypted body. Raises MalformedDatagramError if decryption or the signature fails."""
-        keys = self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot)
-        body, claim = self.crypto.decrypt(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
+        keys, body, claim = self._decrypt(datagram, clear)
         if not self._budgets[clear.sender].has_token(now):
             raise MalformedDatagramError("too many wrong signatures")
         if not self.crypto.verify(claim):
@@ -194,6 +323,6 @@ class Session:
         if request.sender not in self.public_keys:
             return False
         incarnation = self._incarnations.get(request.sender)
-        if incarnation is None or request.boot > incarnation.boot:
+        if incarnation is None or incarnation.is_later(request.boot):
             return True
         return request.boot == incarnation.boot and request.sequence >= incarnation.requests.get(request_type, 0)

@@ -20,7 +20,7 @@ from harness.archive.packets.datagram import MessageSummary, NotUcpError, summar
 from harness.archive.packets.pcap import INBOUND, OUTBOUND, CaptureFile, Frame
 from ucp.block import MAX_AGENT_ID
 from ucp.messages import TYPE_CODES, MalformedDatagramError, decode
-from ucp.secure.envelope import REVOCATION, VERSION, read_clear_header
+from ucp.secure.envelope import CHALLENGE, CONTROL_NAMES, ECHO, REVOCATION, VERSION, read_clear_header
 
 if TYPE_CHECKING:
     from ucp.secure.opening import Opener
@@ -173,11 +173,19 @@ def _plain(payload: bytes) -> Datagram:
     return Datagram(sender, sequence, summarize(message))
 
 
+_CONTROL_REASONS = {
+    REVOCATION: "a revocation of keys",
+    CHALLENGE: "a challenge, which asks for a sign of life",
+    ECHO: "an echo, which answers a challenge",
+}
+"""Type of a control datagram -> why it has no message."""
+
+
 def _secured(payload: bytes, opener: "Opener | None") -> Datagram:
     """Return a datagram of a secured mission. Without `opener`, only its sender, sequence number and type are known."""
     clear = read_clear_header(payload)
-    if clear.type == REVOCATION:
-        raise NotUcpError("a revocation of keys")
+    if clear.type in CONTROL_NAMES:
+        raise NotUcpError(_CONTROL_REASONS[clear.type])
     if opener is not None:
         sender, sequence, message = opener.open(payload).datagram
         return Datagram(sender, sequence, summarize(message))

@@ -32,6 +32,8 @@ def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
         return
     if any(_is_revocation(aside) for trace in evidence.traces.values() for _, aside in trace.asides):
         return  # agents broadcast revocations, and ignore known ones, without a line in the trace
+    if evidence.secured and any(fault.kind.ends_incarnation for fault in record.faults):
+        return  # agents broadcast challenges and echoes after a restart, without a line in the trace
     for agent_id, trace in evidence.traces.items():
         counted = record.datagrams.get(str(agent_id))
         if counted is None or trace.problem or not trace.header.has_inputs:

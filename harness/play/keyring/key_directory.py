@@ -130,7 +130,7 @@ class Home:
         try:
             directory.mkdir(mode=HOME_MODE, parents=True, exist_ok=True)
             for agent_id, path in paths.items():
-                write_bundle(path, bundles[agent_id])
+                write_bundle(path, bundles[agent_id].used() if path.exists() else bundles[agent_id])
         except OSError as error:
             raise _write_error(directory, error) from None
         return [*paths.values()]

@@ -11,7 +11,7 @@ from dataclasses import replace
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import Bundle
-from ucp.secure.envelope import read_clear_header
+from ucp.secure.opening import Opener
 from ucp.secure.sealed_datagrams import Request
 from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
@@ -27,23 +27,22 @@ class CapturedKeys:
         self.agent_id = bundle.agent_id
         self._bundle = bundle
         self._random_bytes = random_bytes
-        self._receiver = self._session(bundle.agent_id, 0)
+        self._opener = Opener(bundle)
         self._sessions: dict[int, Session] = {}
         """Forged sender -> its session."""
         self._signatures: dict[bytes, bytes] = {}
         """Block hash -> the genuine signature, from received datagrams."""
 
-    def opened(self, datagram: bytes, now: float) -> tuple[Message, Request] | None:
+    def opened(self, datagram: bytes) -> tuple[Message, Request] | None:
         """Return the message in a datagram, and the identification that an answer must contain.
 
         Return None if the datagram cannot be decrypted.
         """
-        self._receiver.epochs.set_clock(now)
         try:
-            clear = read_clear_header(datagram)
-            opened = self._receiver.open(datagram, clear, now)
-        except (MalformedDatagramError, KeyError):  # the sender belongs to another mission
+            opened = self._opener.open(datagram)
+        except MalformedDatagramError:
             return None
+        clear = opened.clear
         message = opened.datagram.message
         if type(message) in CARRY_A_BLOCK:
             self._signatures[message.block.block_hash] = opened.block_signature  # type: ignore[union-attr]

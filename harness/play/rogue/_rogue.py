@@ -159,7 +159,7 @@ class Rogue:
             return sender, message.NAME, message, None
         clear = read_clear_header(datagram)
         self._secured = True
-        opened = self._captured.opened(datagram, now) if self._captured else None
+        opened = self._captured.opened(datagram) if self._captured else None
         return clear.sender, NAMES.get(clear.type, ""), *(opened or (None, None))
 
     def begin(self, number: int, injection: Injection, now: float) -> None:

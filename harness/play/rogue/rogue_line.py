@@ -3,7 +3,7 @@
 from typing import Any
 
 from ucp.messages import MalformedDatagramError, block_named, decode
-from ucp.secure.envelope import NAMES, read_clear_header
+from ucp.secure.envelope import CONTROL_NAMES, NAMES, read_clear_header
 from ucp.secure.envelope import VERSION as SECURED
 
 OF_NO_INJECTION = -1
@@ -32,8 +32,8 @@ def _secured(datagram: bytes) -> dict[str, Any]:
         clear = read_clear_header(datagram)
     except MalformedDatagramError as malformed:
         return {"refused": malformed.reason}
-    if clear.type not in NAMES:
-        return {"refused": "a revocation"}
+    if clear.type in CONTROL_NAMES:
+        return {"refused": f"no message: {CONTROL_NAMES[clear.type]}"}
     return {"message": NAMES[clear.type], "sender": clear.sender, "sequence": clear.sequence, "block": None}
 
 

@@ -72,8 +72,9 @@ class SimulatedKeys:
 
     def key_fields(self, agent_id: int, incarnation: int, now: float) -> dict[str, Any]:
         """Return the keys for an agent in another language, as fields of its first input line."""
+        bundle = self.mission.bundles[agent_id]
         return {
-            "bundle": self.mission.bundles[agent_id].to_json(),
+            "bundle": (bundle if incarnation == 1 else bundle.used()).to_json(),
             "boot": self._boot(agent_id, incarnation, now).hex(),
         }
 

@@ -3,6 +3,7 @@
 `ucp.secure` decides which datagrams an agent accepts. This module makes no assumption about it.
 """
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -42,7 +43,9 @@ class SecurityGate:
         from ucp.secure.secured_agent import SecuredAgent
         from ucp.secure.session import Session
 
-        agent = SecuredAgent(Session(self._keys.bundle(agent_id), BOOT), agent_id, *arguments, **options)
+        session = Session(self._keys.bundle(agent_id), BOOT, wrong_signatures_per_s=math.inf)
+        session.set_clock(0.0)  # the agent has flown since the start of the mission
+        agent = SecuredAgent(session, agent_id, *arguments, **options)
         if revoked:
             agent.revoke(self._revocation(), 0.0)
         return agent

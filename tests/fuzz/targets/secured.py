@@ -27,7 +27,7 @@ from ucp.messages import (
     Message,
     NextInSequenceResponse,
 )
-from ucp.secure._epochs import MAX_CACHED_KEYS, MAX_EPOCHS_AHEAD
+from ucp.secure._epochs import MAX_CACHED_KEYS, MAX_EPOCHS_FOLLOWED
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret
@@ -50,6 +50,7 @@ BLOCKS = [Block(2, 1_000_000, b"of two"), Block(3, 1_000_000, b"of three"), Bloc
 BEFORE_ITS_SIGNATURE = {
     *("truncated", "oversized", "wrong magic", "not secured", "wrong version", "impossible sender", "unknown type"),
     *("own sender", "sender not on the roster", "revoked sender", "not signed by the authority", "known already"),
+    *("not confirmed", "too many wrong signatures"),
     *("epoch out of range", "old boot", "replayed", "not authentic", "not signed by its sender"),
 }
 
@@ -183,14 +184,15 @@ class _Driven:
     def _receive(self, data: bytes) -> None:
         agent, before = self.agent, _of(self.agent)
         dropped, handled = agent.dropped.copy(), agent.received.total()
-        epoch = agent.session.epochs.current
+        trusted = {*agent.session._incarnations}
+        epoch = agent.session.epochs.bundle.epoch
         agent.receive_datagram(data, self.now)
         reasons = agent.dropped - dropped
-        has_moved_on = agent.session.epochs.current != epoch
+        has_moved_on = agent.session.epochs.bundle.epoch != epoch or {*agent.session._incarnations} != trusted
         if reasons and set(reasons) <= BEFORE_ITS_SIGNATURE and not has_moved_on:
             require(_of(agent) == before, f"dropped as {list(reasons)}, and the agent is another")
         if not reasons and agent.received.total() == handled:
-            require(read_clear_header(data).type == 10, "neither dropped nor handled")
+            require(read_clear_header(data).type >= 10, "neither dropped nor handled")
         self.look()
 
     def _wait(self, seconds: float) -> None:
@@ -214,7 +216,7 @@ class _Driven:
         agent, session = self.agent, self.agent.session
         for datagram in agent.datagrams_to_send():
             require(len(datagram) <= MAX_DATAGRAM_BYTES, "it sends what no datagram holds")
-            if read_clear_header(datagram).type != 10:
+            if read_clear_header(datagram).type < 10:
                 Opener(KEYS.bundle(2)).open(datagram)
         for entry in agent.trace():
             entry.to_line()
@@ -225,8 +227,8 @@ class _Driven:
         require(len(session.epochs._sender_keys) <= MAX_CACHED_KEYS, "it keeps too many keys")
         require(len(agent._answered_requests) == 0, "it keeps what its answers answered")
         require(len(agent.signatures) <= held + len(state.completed), "it keeps signatures of what it does not hold")
-        ahead = session.epochs.current - max(0, int(self.now // KEYS.public.epoch_s))
-        require(ahead <= MAX_EPOCHS_AHEAD, "others have driven it too far")
+        ahead = session.epochs.current - session.epochs.bundle.epoch
+        require(ahead <= MAX_EPOCHS_FOLLOWED, "others have driven it too far")
 
 
 def _of(agent: SecuredAgent) -> dict[str, Any]:

@@ -18,7 +18,9 @@ def test_scenarios_of_every_kind_have_the_same_chains_with_keys() -> None:
     assert compare(asked, range(1, 2), 1) == {}
     exceptions = {name: without for name, _, without in asked if without}
     assert exceptions == {
-        "revoked_in_partition": (secured_library.REVOCATIONS,),
+        "attrition": (secured_library.RESTARTS,),
+        "late_joiner": (secured_library.RESTARTS,),
+        "revoked_in_partition": (secured_library.REVOCATIONS, secured_library.RESTARTS),
         "secure": (secured_library.INJECTIONS,),
     }
 

@@ -69,7 +69,7 @@ def test_opener_opens_later_epochs_and_rejects_earlier_and_far_ones() -> None:
     message = ChainContainQuery(bytes(32))
     datagrams = []
     for sequence, epoch in enumerate((0, 1, 5)):
-        sender.epochs.set_clock(epoch * KEYS.public.epoch_s)
+        sender.set_clock(epoch * KEYS.public.epoch_s)
         datagrams.append(sealed(message, sequence, sender))
     for sequence, datagram in reversed(list(enumerate(datagrams))):  # in any order, and twice
         assert reads.open(datagram).datagram == reads.open(datagram).datagram == (2, sequence, message)

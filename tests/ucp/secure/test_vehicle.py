@@ -37,7 +37,7 @@ def test_old_secrets_are_erased_on_disk_when_an_epoch_ends(tmp_path: Path) -> No
     write_bundle(path, KEYS.bundle(1))
     first = load_bundle(path).group_secret.hex()
     made = agent_factory(secured_mission(), tmp_path, raise_write_error)(1, ROSTER, b"test")
-    made.session.epochs.set_clock(KEYS.public.epoch_s * 3)
+    made.session.set_clock(KEYS.public.epoch_s * 3)
     assert load_bundle(path).epoch == 3
     assert first not in path.read_text()
     assert path.stat().st_mode & 0o777 == 0o600

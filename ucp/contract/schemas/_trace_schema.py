@@ -47,6 +47,8 @@ SECURED_DROPS = (
     "block not signed by its maker",
     "not signed by the authority",
     "known already",
+    "not confirmed",
+    "too many wrong signatures",
 )
 """Further reasons in a secured mission."""
 

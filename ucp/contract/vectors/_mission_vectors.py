@@ -457,7 +457,10 @@ def late_timers() -> Story:
 
 
 def secured() -> Story:
-    """The mission has keys and seals events. Replayed datagrams and a revoked sender are dropped. The agent reboots."""
+    """The mission has keys and seals events. Replayed datagrams and a revoked sender are dropped. The agent reboots.
+
+    After the reboot, the agent accepts no datagrams of other agents until they answer its challenge.
+    """
     from ucp.contract.vectors._secured_story import SecuredStory  # needs the extra `secure`
 
     story = SecuredStory()
@@ -479,7 +482,10 @@ def secured() -> Story:
     story.command("export")
     story.complete_a_block()
     story.reboot(down_s=900.0)
+    story.echo(A, B)
     story.hear(C, ChainContainQuery(chain.top_chain_hash))
+    story.hear(B, RequestForBlock(first.block_hash))
+    story.wait_until(story.now + 2.0)
     story.hear(B, RequestForBlock(first.block_hash))
     story.wait()
     story.command("export")

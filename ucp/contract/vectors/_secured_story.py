@@ -1,5 +1,6 @@
 """Record an example of a secured mission, in which the other agents encrypt and sign their messages."""
 
+import base64
 from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -11,7 +12,7 @@ from ucp.messages import CARRY_A_BLOCK, TYPE_CODES, Message
 from ucp.sealed import seal_to
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import KeySet, bundle_name
-from ucp.secure.envelope import REQUEST_OF, REVOCATION
+from ucp.secure.envelope import CHALLENGE, CONTROL_NAMES, REQUEST_OF, read_clear_header
 from ucp.secure.opening import Opener
 from ucp.secure.revocation import Revocation
 from ucp.secure.sealed_datagrams import Request
@@ -32,6 +33,8 @@ class SecuredStory(Story):
         self._incarnations = 0
         self._opener = Opener(KEYS.bundle(AGENT_ID))
         self._peers = {peer: Session(KEYS.bundle(peer), make_boot(peer, b"a chance")) for peer in ROSTER}
+        for session in self._peers.values():
+            session.set_clock(0.0)
         self._requests: dict[int, Request] = {}
         """Type of a request -> the agent's last request of this type."""
         super().__init__(max_block_bytes=MAX_BLOCK_BYTES)
@@ -56,6 +59,19 @@ class SecuredStory(Story):
         self.now += 0.125
         self._exchange({"datagram": next(given["datagram"] for given in inputs if "datagram" in given)})
 
+    def echo(self, *peers: int) -> None:
+        """Let peers answer the agent's challenge, which is among its last datagrams."""
+        (challenge,) = (sent for sent in self._sent() if sent[3] == CHALLENGE)
+        for peer in peers:
+            session = self._peers[peer]
+            session.set_clock(self.now)
+            session.receive_challenge(challenge, read_clear_header(challenge), self.now)
+            (echo,) = session.control_datagrams(0, self.now)
+            self.hear_datagram(echo)
+
+    def _sent(self) -> list[bytes]:
+        return [base64.b64decode(sent) for sent in self.output["sent"]]
+
     def _signature(self, block: Block) -> bytes:
         return sign_block(self._peers[block.agent_id].private_key, KEYS.public.mission, block.block_data())
 
@@ -65,7 +81,8 @@ class SecuredStory(Story):
     def _of_life(self) -> dict[str, Any]:
         self._incarnations += 1
         boot = make_boot(1_795_258_278_064_591 + self._incarnations, b"a chance")
-        return {"bundle": KEYS.bundle(AGENT_ID).to_json(), "boot": boot.hex()}
+        bundle = KEYS.bundle(AGENT_ID)
+        return {"bundle": (bundle if self._incarnations == 1 else bundle.used()).to_json(), "boot": boot.hex()}
 
     def _encoded(self, sender: int, sequence: int, message: Message) -> bytes:
         code = TYPE_CODES[type(message)]
@@ -77,7 +94,7 @@ class SecuredStory(Story):
         """Return the message in a datagram of the agent, and store its request. Return None for a list of excluded
         vehicles.
         """
-        if datagram[3] == REVOCATION:
+        if datagram[3] in CONTROL_NAMES:
             return None
         opened = self._opener.open(datagram)
         self._requests[opened.clear.type] = Request(AGENT_ID, opened.clear.boot, opened.clear.sequence)

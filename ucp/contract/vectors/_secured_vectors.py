@@ -31,7 +31,8 @@ NOW_US = 1_795_260_078_064_591
 def session(agent_id: int, keys: KeySet = KEYS) -> Session:
     """Return the session of an agent in the epoch of the test vectors."""
     begun = Session(keys.bundle(agent_id), BOOT)
-    begun.epochs.set_clock(NOW)
+    begun.set_clock(0.0)
+    begun.set_clock(NOW)
     return begun
 
 
@@ -48,11 +49,11 @@ def cases() -> Iterator[tuple[str, bytes]]:
     yield "version 2", good[:2] + b"\2" + good[3:]
     yield "half a header", good[:20]
     yield "without its last byte", good[:-1]
-    yield "type 11", good[:3] + b"\x0b" + good[4:]
+    yield "type 13", good[:3] + b"\x0d" + good[4:]
     yield "its own", session(AGENT_ID).seal(0, RequestForBlock(BLOCK_HASH), None, None, 0)
     yield "of nobody on the roster", good[:4] + (5).to_bytes(4, "big") + good[8:]
     yield "of the epoch before the last", good[:14] + (EPOCH - 2).to_bytes(4, "big") + good[18:]
-    yield "nine epochs ahead", good[:14] + (EPOCH + 9).to_bytes(4, "big") + good[18:]
+    yield "4097 epochs ahead", good[:14] + (EPOCH + 4097).to_bytes(4, "big") + good[18:]
     yield "with another revocation's number", good[:35] + b"\1" + good[36:]
     yield "of another mission", session(OTHER, OTHER_KEYS).seal(1, RequestForBlock(BLOCK_HASH), None, None, 0)
     yield "with another tag", good[:-1] + bytes([good[-1] ^ 1])

@@ -20,6 +20,7 @@ local BOOT_BYTES = 16
 local TAG_BYTES = 16
 local SIGNATURE_BYTES = 64
 local REVOCATION = 10
+local ECHO = 12
 local MAX_DATAGRAM_BYTES = 1472
 local HASH_BYTES = 32
 local BLOCK_HEADER_BYTES = 12
@@ -39,6 +40,8 @@ local NAMES = {
   [8] = "Request for Block",
   [9] = "Block Response",
   [10] = "Revocation",
+  [11] = "Challenge",
+  [12] = "Echo",
 }
 
 local fields = {
@@ -228,7 +231,7 @@ local function header(reader, info)
   if length:uint() ~= size - info.header_bytes then
     return "wrong length"
   end
-  if not BODIES[info.code] and not (info.secured and info.code == REVOCATION) then
+  if not BODIES[info.code] and not (info.secured and info.code >= REVOCATION and info.code <= ECHO) then
     return "unknown type"
   end
 end

@@ -9,7 +9,7 @@ from harness.play.simulation.foreign._answer import AgentLacksError, Outcome
 from harness.play.simulation.foreign._foreign_agent import ForeignAgent
 from ucp.messages import MalformedDatagramError
 from ucp.secure.bundle import Bundle
-from ucp.secure.envelope import REVOCATION, read_clear_header
+from ucp.secure.envelope import CONTROL_NAMES, read_clear_header
 from ucp.secure.opening import Opener
 from ucp.secure.secured_agent import OutgoingDatagram
 from ucp.trace import in_base64
@@ -34,9 +34,7 @@ class SecuredForeignAgent(ForeignAgent):
         sent, self._sent = self._sent, []
         for data, _ in sent:
             try:
-                self.messages_sent -= (
-                    read_clear_header(data).type == REVOCATION
-                )  # a revocation is not a message of the agent
+                self.messages_sent -= read_clear_header(data).type in CONTROL_NAMES  # they are no messages of the agent
                 opened = self._opener.open(data)
             except MalformedDatagramError:
                 yield OutgoingDatagram(data)

@@ -1,0 +1,60 @@
+"""Challenges: the proof that a sender exists now, as in the Echo option of OSCORE (RFC 9175).
+
+An incarnation that has not received everything since the start of the mission cannot distinguish a new datagram from a
+recorded one: its replay windows are incomplete. It broadcasts a *challenge*. Each other vehicle answers with an *echo*,
+which names the challenge and the sender's next sequence. An echo is signed, and it cannot have been recorded before the
+challenge. From then on, the receiver accepts datagrams of this sender from this sequence on.
+
+A receiver also challenges a sender whose boot is older than the known one. The boot may be recorded, or the sender may
+have lost its clock and its disk.
+
+The receiver collects the echoes for `TRUST_DELAY_S`, or until all vehicles have answered. During this time it receives
+the revocations that it missed, before it trusts any sender.
+"""
+
+CHALLENGE_INTERVAL_S = 5.0
+"""Minimum time in mission seconds between two challenges to the same vehicles."""
+ECHO_INTERVAL_S = 1.0
+"""Minimum time in mission seconds between two echoes of challenges that may be recorded."""
+TRUST_DELAY_S = 2.0
+"""Mission seconds between the first challenge and the first accepted sender, if some vehicles do not answer."""
+ALL = 0
+"""Target of a challenge to all vehicles."""
+
+
+class Challenges:
+    """The challenges of one incarnation. A target is an agent ID or `ALL`."""
+
+    def __init__(self) -> None:
+        self.first_at: float | None = None
+        """Mission second of the first challenge to all vehicles."""
+        self._due: set[int] = set()
+        self._sent_at: dict[int, float] = {}
+        self._pending: dict[int, int] = {}
+        """Target -> sequence of the newest challenge."""
+
+    @property
+    def is_due(self) -> bool:
+        """True if a challenge waits to be sent."""
+        return bool(self._due)
+
+    def ask(self, target: int, now: float) -> None:
+        """Schedule a challenge, unless one was sent recently."""
+        if now >= self._sent_at.get(target, now - CHALLENGE_INTERVAL_S) + CHALLENGE_INTERVAL_S:
+            self._due.add(target)
+
+    def take_due(self, now: float) -> list[int]:
+        """Return the targets of the challenges to send at mission second `now`."""
+        due, self._due = sorted(self._due), set()
+        self._sent_at.update(dict.fromkeys(due, now))
+        if ALL in due and self.first_at is None:
+            self.first_at = now
+        return due
+
+    def sent(self, target: int, sequence: int) -> None:
+        """Record the sequence of a challenge."""
+        self._pending[target] = sequence
+
+    def is_pending(self, sequence: int, sender: int) -> bool:
+        """Return whether an echo of `sender` answers the newest challenge to it."""
+        return sequence in (self._pending.get(ALL), self._pending.get(sender))
