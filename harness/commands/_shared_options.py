@@ -1,6 +1,7 @@
 """Define options and arguments that several commands share."""
 
 import contextlib
+import re
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -22,6 +23,20 @@ BundleOption = Annotated[
     Path | None,
     typer.Option("--bundle", help="Key bundle of any vehicle, to read a secured mission."),
 ]
+
+
+_DURATION = re.compile(r"(\d{1,9}(?:\.\d{1,6})?)(s|m|h|)")
+_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
+MAX_TIME_S = 31 * 86400.0
+
+
+def seconds_of(option: str, text: str) -> float:
+    """Return the seconds in a time such as 90s, 30m or 8h. Raises BadParameter that names the option."""
+    duration = _DURATION.fullmatch(text.strip())
+    seconds = float(duration[1]) * _UNITS[duration[2]] if duration else 0.0
+    if not 0 < seconds <= MAX_TIME_S:
+        raise typer.BadParameter(f"{option} {text!r} is no time: 90s, 30m or 8h are, up to 31 days")
+    return seconds
 
 
 def complete_scenario(typed: str) -> list[str]:

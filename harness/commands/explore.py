@@ -9,16 +9,13 @@ from rich.console import Console
 
 from harness.archive.recorded_scenario import load_recorded_scenario
 from harness.archive.run_listing import RUNS
-from harness.commands._shared_options import complete_scenario
+from harness.commands._shared_options import complete_scenario, seconds_of
 from harness.commands.terminal import complain, output, print_json
 from harness.run.parallel import cores
 from harness.scenario import Scenario
 from harness.sweep import explore
 
 HUNT = "Hunt for new states"
-_DURATION = re.compile(r"(\d{1,9}(?:\.\d{1,6})?)(s|m|h|)")
-_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0}
-MAX_HUNT_S = 31 * 86400.0
 
 
 def explore_command(
@@ -123,7 +120,7 @@ def _hunt(
             request,
             directory,
             first_seed=recorded_seed or 0 if first_seed is None else first_seed,
-            for_s=float("inf") if for_time is None else _seconds(for_time),
+            for_s=float("inf") if for_time is None else seconds_of("--for", for_time),
             most_runs=float("inf") if runs is None else runs,
             jobs=jobs or cores(),
             watcher=watcher,
@@ -145,11 +142,3 @@ def _hunt(
 
 def _directory_name(name: str) -> str:
     return f"{re.sub(r'[^A-Za-z0-9_-]+', '_', name)[:80]}-corpus"
-
-
-def _seconds(text: str) -> float:
-    duration = _DURATION.fullmatch(text.strip())
-    seconds = float(duration[1]) * _UNITS[duration[2]] if duration else 0.0
-    if not 0 < seconds <= MAX_HUNT_S:
-        raise typer.BadParameter(f"--for {text!r} is no time: 90s, 30m or 8h are, up to 31 days")
-    return seconds

@@ -7,7 +7,7 @@ import typer
 
 from harness.archive.directory import default_path
 from harness.backend_names import BackendName
-from harness.commands._shared_options import complete_scenario
+from harness.commands._shared_options import complete_scenario, seconds_of
 from harness.commands.terminal import StatusLine, complain, end_sweep, print_json, print_lines
 from harness.errors import INTERRUPTED
 from harness.play.variant import Variant, load_variant
@@ -55,8 +55,10 @@ def matrix_command(
         typer.Option(metavar="DIR", help="Keep this night in DIR, and draw the trend of all nights in it."),
     ] = None,
     bisect: Annotated[
-        float | None,
-        typer.Option(min=0, metavar="MINUTES", help="Find the commits of worse figures, for at most this time."),
+        str | None, typer.Option(metavar="TIME", help="Find the commits of worse figures, for 20m at most.")
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Begin no run after 6h; the most uncertain cells come first.")
     ] = None,
 ) -> None:
     """Play a scenario over loss rates, swarm sizes and many seeds.
@@ -73,22 +75,29 @@ def matrix_command(
     baseline = load_baseline(against, request) if against else None
     nights_directory = nights_of_matrix.opened(nights) if nights else None
     directory = (out or default_path(request.name)).absolute()
-    if variant is not None and (against, nights, scheduler, coverage) != (None, None, None, False):
-        raise typer.BadParameter("--variant excludes --against, --nights, --scheduler and --coverage: leave them out")
+    if variant is not None and (against, nights, scheduler, budget, coverage) != (None, None, None, None, False):
+        others = "--against, --nights, --scheduler, --budget and --coverage"
+        raise typer.BadParameter(f"--variant excludes {others}: leave them out")
     if bisect is not None and against is None:
         raise typer.BadParameter("--bisect needs --against: it searches the commits since the baseline")
+    bisect_s = None if bisect is None else seconds_of("--bisect", bisect)
+    budget_s = None if budget is None else seconds_of("--budget", budget)
+    if budget_s is not None and scheduler is not None:
+        raise typer.BadParameter(
+            "--budget excludes --scheduler, which distributes all runs at once: leave out one of them"
+        )
     if scheduler is None:
         spread = on_cores(request, jobs or cores(), shown=True)
     else:
         spread = on_cluster(request, scheduler, shown=True)
     if variant is not None:
         _compare_with_variant(request, load_variant(variant), directory, spread, as_json)
-    finished = matrix.run_matrix(request, directory, spread, covers=coverage)
+    finished = matrix.run_matrix(request, directory, spread, covers=coverage, budget_s=budget_s)
     if baseline is not None:
         finished = name_changes(compare_with(finished, baseline), baseline, jobs or cores())
-        if bisect is not None:
+        if bisect_s is not None:
             with StatusLine() as status:
-                finished = name_culprits(finished, baseline, 60 * bisect, status.show)
+                finished = name_culprits(finished, baseline, bisect_s, status.show)
     earlier = None
     if nights_directory is not None:
         nights_of_matrix.keep(finished.record, nights_directory)

@@ -56,7 +56,8 @@ def _cases(record: MatrixRecord) -> Iterator[Case]:
             yield Case(name, skipped="; ".join(lacking))
         elif cell is None or cell.runs < len(record.matrix.seed_list):
             ended = cell.runs if cell else 0
-            yield Case(name, skipped=f"interrupted: {ended} of {len(record.matrix.seed_list)} runs had ended")
+            why = "the time was used up" if record.outcome == "completed" else "interrupted"
+            yield Case(name, skipped=f"{why}: {ended} of {len(record.matrix.seed_list)} runs had ended")
         else:
             yield Case(name)
 

@@ -42,6 +42,8 @@ class MatrixRecord(BaseModel):
     started_at: str
     wall_s: float
     outcome: Literal["completed", "interrupted"]
+    budget_s: float | None = None
+    """Seconds after which the command began no further run, or null without a limit."""
     cells: list[Cell]
     failed: list[RunWithoutResult] = []
     unsupported: list[RunWithoutResult] = []

@@ -2,7 +2,7 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +13,7 @@ from harness.errors import InterruptedRunError, ScenarioError
 from harness.run.parallel import FailedTask, cores, sweep
 from harness.run.provenance import versions
 from harness.scenario import Scenario
+from harness.sweep.matrix._budget import informative
 from harness.sweep.matrix._cell import Run, sum_up
 from harness.sweep.matrix._cell_play import Judge, Player, simulated
 from harness.sweep.matrix._cluster import cluster
@@ -27,7 +28,7 @@ from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
 from harness.sweep.matrix.nights import Baseline
 
 Outcomes = Iterator[tuple[Task, Run | FailedTask]]
-Spread = Callable[[Sequence[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
+Spread = Callable[[Iterable[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
 """Distributes tasks, and yields their outcomes in order of completion."""
 
 
@@ -70,6 +71,7 @@ def run_matrix(
     judge: Judge | None = None,
     *,
     covers: bool = False,
+    budget_s: float | None = None,
 ) -> Finished:
     """Play every run of a matrix, and summarise the runs for each combination of values.
 
@@ -77,16 +79,19 @@ def run_matrix(
       it are not played again. Without it, a new directory under `runs/`.
     - `spread`: how runs are distributed. Without it, they use all cores of this machine.
     - `judge`: plays and checks one run in virtual time. Without it, the simulation.
+    - `budget_s`: no run begins after this time. The most uncertain cells come first. Without it, all runs are played.
     - `covers`: also measure which share of the protocol's states the runs reach, which takes longer.
 
     Ctrl-C ends the matrix early, with the runs that have ended. Raises HarnessError if it cannot be played.
     """
     with opened((out or default_path(matrix.name)).absolute(), matrix) as results:
         judge = judge or partial(simulated, tracing=matrix.traces)
-        return _run_missing(matrix, results, spread or on_cores(matrix, cores()), judge, covers)
+        return _run_missing(matrix, results, spread or on_cores(matrix, cores()), judge, covers, budget_s)
 
 
-def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge, covers: bool) -> Finished:
+def _run_missing(
+    matrix: Matrix, results: Results, spread: Spread, judge: Judge, covers: bool, budget_s: float | None
+) -> Finished:
     started = time.monotonic()
     play = Player(matrix, results.directory / "runs", judge, covers)
     tasks = [task for task in matrix.tasks if task not in results.runs]
@@ -95,7 +100,8 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
     play.refuse(dict.fromkeys(task.point for task in tasks))
     interrupted, tally = False, CoverageTally() if covers else None
     try:
-        with spread(tasks, play) as outcomes:
+        chosen = tasks if budget_s is None else informative(tasks, results.runs, budget_s)
+        with spread(chosen, play) as outcomes:
             for task, run in outcomes:
                 results.add(_failed(task, run.reason) if isinstance(run, FailedTask) else run)
                 if tally is not None and isinstance(run, Run) and run.reached is not None:
@@ -114,6 +120,7 @@ def _run_missing(matrix: Matrix, results: Results, spread: Spread, judge: Judge,
         started_at=results.started_at,
         wall_s=round(time.monotonic() - started, 1),
         outcome="interrupted" if interrupted else "completed",
+        budget_s=budget_s,
         cells=cells,
         results=[run.model_copy(update={"reached": None}) for run in runs if run.judged and is_paired(run.point)],
         failed=[_without_result(run, run.failed) for run in runs if run.failed is not None],

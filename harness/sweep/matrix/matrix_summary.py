@@ -63,6 +63,8 @@ def verdict(record: MatrixRecord) -> str:
     parts = [f"{text.value(runs)} runs"]
     if record.outcome == "interrupted":
         parts[0] += f" of {text.value(record.runs_asked)}, interrupted"
+    elif runs < record.runs_asked:
+        parts[0] += f" of {text.value(record.runs_asked)} in the given time"
     bad = sum(map(violated, record.cells))
     parts.append(f"{bad} with violations" if bad else "no violations")
     if record.failed:

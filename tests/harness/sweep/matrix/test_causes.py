@@ -160,6 +160,6 @@ def test_page_has_each_cell_and_night_with_its_commit(tmp_path: Path) -> None:
 
 
 def test_option_bisect_needs_a_baseline() -> None:
-    refused = harness("matrix", "growth_matrix", "--bisect", "5")
+    refused = harness("matrix", "growth_matrix", "--bisect", "5m")
     assert refused.returncode == 2
     assert "--bisect needs --against" in refused.stderr

@@ -1,0 +1,53 @@
+"""Choose the order of runs when the time does not suffice for all of them: the most informative cell first.
+
+A further run tells most about the cell whose figures are least certain. Every cell therefore begins with two runs. From
+then on, the next run belongs to the cell with the widest interval: that of the share of runs with one chain, or that of
+the messages per block relative to their mean. Cells whose runs agree stay at a few runs, and the time goes to the cells
+whose runs differ.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._estimate import BY_NAME, Estimate
+from harness.sweep.matrix._matrix_file import Point, Task
+
+_FIRST_RUNS = 2
+
+
+def informative(
+    tasks: Sequence[Task],
+    runs: Mapping[Task, Run],
+    budget_s: float,
+    clock: Callable[[], float] = time.monotonic,
+) -> Iterator[Task]:
+    """Yield tasks until the budget is used up. `runs` has the results so far, and grows while this function yields."""
+    until = clock() + budget_s
+    begun = Counter(task.point for task in runs)
+    left: dict[Point, list[Task]] = {}
+    for task in tasks:
+        left.setdefault(task.point, []).append(task)
+    while left and clock() < until:
+        point = max(left, key=lambda point: _information(point, runs, begun[point]))
+        begun[point] += 1
+        yield left[point].pop(0)
+        if not left[point]:
+            del left[point]
+
+
+def _information(point: Point, runs: Mapping[Task, Run], begun: int) -> float:
+    """Return the width of the widest interval of the cell, as the runs that have begun will probably leave it."""
+    if begun < _FIRST_RUNS:
+        return float(2 * _FIRST_RUNS - begun)
+    ended = [run.figures for task, run in runs.items() if task.point == point and run.judged]
+    if len(ended) < _FIRST_RUNS:
+        return 1.0 / begun
+    share, messages = (BY_NAME[name].estimate(ended) for name in ("uniform", "messages_per_block"))
+    width = max(_width(share), _width(messages) / abs(messages.mean or 1.0))
+    return float(width * (len(ended) / begun) ** 0.5)
+
+
+def _width(estimate: Estimate) -> float:
+    return 0.0 if estimate.low is None or estimate.high is None else estimate.high - estimate.low

@@ -1,0 +1,70 @@
+"""`--budget`: uncertain cells come first, no run begins late, and the night says what it left out."""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from harness.sweep.matrix import matrix_outputs, run_matrix
+from harness.sweep.matrix._budget import informative
+from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._matrix_file import Task
+from harness.sweep.matrix.matrix_run import on_cores
+from harness.sweep.matrix.matrix_summary import verdict
+from tests.harness.command import harness
+from tests.harness.sweep.matrix.stub import matrix
+
+LOSS = (0.0, 0.1, 0.2)
+
+
+def ticking(seconds: list[float]) -> Callable[[], float]:
+    """Return a clock that goes on by one second at each call."""
+
+    def clock() -> float:
+        seconds[0] += 1
+        return seconds[0]
+
+    return clock
+
+
+def order(most: float, chains: Callable[[float, int], int], late: int = 0) -> list[Task]:
+    """Return the tasks in the order in which they begin. Each result is known after `late` further tasks."""
+    asked, runs, begun = matrix(loss=LOSS, seeds=20), dict[Task, Run](), list[Task]()
+    for task in informative(asked.tasks, runs, most, ticking([0.0])):
+        begun.append(task)
+        if len(begun) > late:
+            known = begun[len(begun) - 1 - late]
+            figures = {"distinct_chains": chains(known.point.loss, known.seed), "messages_per_block": 20}
+            runs[known] = Run(**known.point._asdict(), seed=known.seed, figures=figures)
+    return begun
+
+
+@pytest.mark.parametrize("late", [0, 3])
+def test_uncertain_cell_gets_the_time_after_two_runs_of_each(late: int) -> None:
+    begun = order(24, lambda loss, seed: 1 + seed % 2 if loss == 0.1 else 1, late)
+    assert Counter(task.point.loss for task in begun[:6]) == dict.fromkeys(LOSS, 2)
+    counts = Counter(task.point.loss for task in begun)
+    assert counts[0.1] > max(counts[0.0], counts[0.2]) >= 2
+    assert [task.seed for task in begun if task.point.loss == 0.1] == list(range(1, counts[0.1] + 1))
+
+
+def test_all_runs_are_played_if_the_time_suffices() -> None:
+    begun = order(1000, lambda loss, seed: 1)
+    assert sorted(begun) == sorted(matrix(loss=LOSS, seeds=20).tasks)
+
+
+def test_run_that_did_not_begin_is_no_interruption(tmp_path: Path) -> None:
+    asked = matrix(seeds=3)
+    finished = run_matrix(asked, tmp_path, on_cores(asked, 1), budget_s=1e-9)
+    assert (finished.record.outcome, finished.record.exit_status, finished.runs) == ("completed", 0, [])
+    assert verdict(finished.record).startswith("0 runs of 6 in the given time")
+    matrix_outputs.write(finished, tmp_path)
+    assert (tmp_path / "junit.xml").read_text().count('message="the time was used up: 0 of 3 runs had ended"') == 2
+
+
+def test_wrong_budget_is_refused() -> None:
+    for arguments, why in ((["--budget", "soon"], "is no time"), (["--budget", "1h", "--scheduler", "x"], "excludes")):
+        refused = harness("matrix", "growth_matrix", *arguments)
+        assert refused.returncode == 2
+        assert why in refused.stderr
