@@ -13,7 +13,7 @@ import time
 from random import Random
 
 from harness.proof import Bounds
-from harness.proof.coverage import Existing, Reached, existing
+from harness.proof.coverage import ExistingStates, ReachedStates, existing
 from harness.scenario import Scenario
 from harness.sweep.explore.guided._hunt import Candidate, Hunt
 from harness.sweep.explore.guided._hunt_trial import initial_documents, play_trial
@@ -33,16 +33,16 @@ SCENARIOS = {
 SEEDS_OF_ROUND = 1_000_000
 
 
-def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, Reached]:
+def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, ReachedStates]:
     """Return the number of runs with random seeds, and the agent states that they reached."""
-    reached, runs, ends_s = Reached(), 0, time.process_time() + budget_s
+    reached, runs, ends_s = ReachedStates(), 0, time.process_time() + budget_s
     while time.process_time() < ends_s:
         reached.add(play_trial(scenario, first_seed + runs).reached)
         runs += 1
     return runs, reached
 
 
-def hunted(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, Reached]:
+def hunted(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, ReachedStates]:
     """Return the number of runs of a search, and the agent states that they reached, including the start of the
     search.
     """
@@ -87,7 +87,7 @@ def compare(scenario: Scenario, rounds: int, seconds: float) -> None:
     print_row("median", "", "", "", "", f"{statistics.median(ratios):.1f} ({min(ratios):.1f}..{max(ratios):.1f})")
 
 
-def of(reached: Reached, there: Existing | None) -> str:
+def of(reached: ReachedStates, there: ExistingStates | None) -> str:
     """Return the number of agent states as text, with the number of those that exist within the bounds."""
     if there is None:
         return str(len(reached.states))

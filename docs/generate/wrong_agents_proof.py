@@ -16,7 +16,7 @@ from harness.proof.bounds import Bounds
 from harness.proof.graph._exploration import explore
 from harness.proof.model._any_sender import collect
 from harness.proof.model._flaws import Flaw
-from harness.proof.model._global_states import Swarm
+from harness.proof.model._global_states import ModelSwarm
 from harness.proof.questions import _convergence
 from ucp.agent import HANDLERS
 from ucp.quirks import QUIRKS
@@ -65,14 +65,14 @@ def _first_flaw(bounds: Bounds, most_s: float) -> tuple[Flaw | None, int, Ended]
     if bounds.network == "any":
         collected = collect(bounds, most_bytes=MOST_BYTES, most_s=most_s)
         return collected.flaw, len(collected.way), collected.ended
-    graph = explore(Swarm(bounds), most_bytes=MOST_BYTES, most_s=most_s)
+    graph = explore(ModelSwarm(bounds), most_bytes=MOST_BYTES, most_s=most_s)
     instants = 0 if graph.flawed is None else len(graph.path(graph.flawed)) - 1
     return graph.flaw, instants, graph.ended
 
 
 def violation(quirk: str, most_s: float = MOST_S) -> str:
     """Return the first property that does not hold within small bounds."""
-    graph = explore(Swarm(_with(quirk, SMALL)), most_bytes=MOST_BYTES, most_s=most_s)
+    graph = explore(ModelSwarm(_with(quirk, SMALL)), most_bytes=MOST_BYTES, most_s=most_s)
     if graph.flaw is not None:
         return f"characteristic {graph.flaw.kind}" if graph.flaw.kind.isdecimal() else graph.flaw.kind
     if graph.ended != "complete":

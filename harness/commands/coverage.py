@@ -16,7 +16,7 @@ from harness.commands.terminal import StatusLine, complain, output, print_json, 
 from harness.errors import WRONG_REQUEST, RunDirectoryError
 from harness.proof import Bounds, coverage, specification
 from harness.proof.bounds import EVENT_FILLS_BLOCK
-from harness.proof.coverage import Reached
+from harness.proof.coverage import ReachedStates
 from harness.scenario import load_scenario
 from ucp.settings import Settings
 
@@ -36,7 +36,7 @@ def coverage_command(
 
     All local states are those that `prove` finds within the given bounds.
     """
-    reached = Reached()
+    reached = ReachedStates()
     settings: dict[str, Any] | None = None
     for path in runs:
         evidence = checker.gather(RunArchive(path))

@@ -177,7 +177,7 @@ def _compare(against: str, bounds: Bounds, limits: Limits, out: Path | None, as_
             complain(f"state reduction is disabled: it assumes the released core, and {against} has another one")
             bounds = replace(bounds, reduced=False)
         proof = prove.prove(bounds, limits, out, watch=lambda progress: status_line.show(_progress_text(progress)))
-        comparison = original.Comparison(proof, original.prove_original(against, code, bounds, limits))
+        comparison = original.ProofComparison(proof, original.prove_original(against, code, bounds, limits))
     _print_result(comparison.to_json(), comparison.in_words(), as_json)
     raise typer.Exit(comparison.exit_status)
 

@@ -10,7 +10,7 @@ from typing import Literal
 LOOK_EVERY = 200
 """Number of states between two reports of the progress."""
 LOOK_EVERY_S = 0.1
-"""Minimum time in seconds between two checks of memory and time in `Budget.check`."""
+"""Minimum time in seconds between two checks of memory and time in `ExplorationBudget.check`."""
 _STATM = Path("/proc/self/statm")
 Ended = Literal["complete", "flaw", "memory", "time", "interrupted"]
 
@@ -32,7 +32,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Figures:
+class ExplorationFigures:
     """The size of an exploration. All figures except `steps` and the times are the same for any number of processor
     cores.
 
@@ -51,7 +51,7 @@ class Figures:
     processor_s: float
 
 
-class GivenUpError(Exception):
+class LimitReachedError(Exception):
     """An error: the exploration reached its limit of memory or time."""
 
     def __init__(self, ended: Ended) -> None:
@@ -59,7 +59,7 @@ class GivenUpError(Exception):
         self.ended = ended
 
 
-class Budget:
+class ExplorationBudget:
     """The limits of an exploration: memory in bytes, and time in seconds from its start."""
 
     def __init__(self, most_bytes: float, most_s: float) -> None:
@@ -88,7 +88,7 @@ class Budget:
             return False
         self._next_look_s = seconds + LOOK_EVERY_S
         if (ended := self.ended(elsewhere_bytes)) is not None:
-            raise GivenUpError(ended)
+            raise LimitReachedError(ended)
         return True
 
 

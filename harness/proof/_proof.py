@@ -8,19 +8,19 @@ from typing import Any
 
 from harness.archive.directory import default_path
 from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED, HarnessError
-from harness.proof._progress_bar import Budget, Ended, Figures, GivenUpError, Progress
+from harness.proof._progress_bar import Ended, ExplorationBudget, ExplorationFigures, LimitReachedError, Progress
 from harness.proof.bounds import Bounds, BoundsError
 from harness.proof.examples._example import Example, keep, play
-from harness.proof.examples._path_script import NO_CLOCKS, Script
-from harness.proof.graph._exploration import Graph, explore
+from harness.proof.examples._path_script import NO_CLOCKS, PathScript
+from harness.proof.graph._exploration import StateGraph, explore
 from harness.proof.graph._workers import Workers
 from harness.proof.model._any_sender import collect
 from harness.proof.model._flaws import Flaw
-from harness.proof.model._global_states import AGENTS, ZONE, Swarm
+from harness.proof.model._global_states import AGENTS, ZONE, ModelSwarm
 from harness.proof.model._snapshot import ReductionError, UncoveredError
 from harness.proof.questions import _convergence as liveness
 from harness.proof.questions import _livelock
-from harness.proof.questions._convergence import Liveness
+from harness.proof.questions._convergence import ConvergenceResult
 from harness.proof.questions._graph_cycles import cycles
 from harness.proof.questions._livelock import Livelock
 from harness.run.simulate import choose_path
@@ -97,10 +97,10 @@ class Proof:
     """
 
     bounds: Bounds
-    figures: Figures
+    figures: ExplorationFigures
     ended: Ended
     flaw: Flaw | None
-    liveness: Liveness | None = None
+    liveness: ConvergenceResult | None = None
     whole_ended: Ended = "complete"
     example: Example | None = None
     fork: Example | None = None
@@ -228,7 +228,7 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Pr
     name, path = _claimed(bounds, out)
     began_s = time.process_time()
     found = collect(bounds, most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
-    figures = Figures(
+    figures = ExplorationFigures(
         found.states,
         found.looked_at,
         found.transitions,
@@ -242,7 +242,7 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Pr
     proof = Proof(bounds, figures, found.ended, found.flaw, way=found.way, shown=dict.fromkeys(sorted(found.shown)))
     if found.flaw is not None:
         limits = replace(limits, most_s=min(RUN_LOOKED_FOR_S, limits.most_s - found.seconds))
-        swarm = Swarm(_with_instants(bounds))
+        swarm = ModelSwarm(_with_instants(bounds))
         with Workers(swarm, limits.cores) as workers:
             graph = explore(swarm, **limits.of_exploring, workers=workers, watch=watch)
         if graph.flawed is not None and graph.flaw is not None and graph.flaw.kind == found.flaw.kind:
@@ -266,10 +266,10 @@ def _claimed(bounds: Bounds, out: Path | None) -> tuple[str, Path]:
 def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Progress], None]) -> Proof:
     name, path = _claimed(bounds, out)
     began_s = time.process_time()
-    swarm = Swarm(bounds)
+    swarm = ModelSwarm(bounds)
     with Workers(swarm, limits.cores) as workers:
         graph = explore(swarm, **limits.of_exploring, workers=workers, watch=watch)
-        figures = Figures(
+        figures = ExplorationFigures(
             len(graph.states),
             graph.looked_at,
             graph.transitions,
@@ -282,7 +282,7 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
         )
         proof = Proof(bounds, figures, graph.ended, graph.flaw)
         if proof.complete:
-            budget = Budget(limits.most_bytes, limits.most_s - graph.seconds)
+            budget = ExplorationBudget(limits.most_bytes, limits.most_s - graph.seconds)
 
             def asked_now(asked: str) -> None:
                 if budget.check(workers.memory_bytes):
@@ -290,7 +290,7 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
 
             try:
                 proof.liveness = liveness.look(graph, asked_now, workers)
-            except GivenUpError as given_up:
+            except LimitReachedError as given_up:
                 proof.whole_ended = given_up.ended
             except KeyboardInterrupt:
                 proof.whole_ended = "interrupted"
@@ -298,7 +298,7 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
     return proof
 
 
-def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
+def _show(proof: Proof, graph: StateGraph, path: Path, name: str) -> None:
     """Write a scenario for each violation, the first one to `path`."""
     live = proof.liveness
     ways_round = live.cycles if live is not None else cycles(graph) if proof.ended in ("memory", "time") else []
@@ -325,9 +325,9 @@ def _show(proof: Proof, graph: Graph, path: Path, name: str) -> None:
         proof.reluctant = _example(graph, live.reluctant, sentence, beside, f"{name} votes")
 
 
-def _example(graph: Graph, number: int, sentence: str, path: Path, name: str) -> Example:
+def _example(graph: StateGraph, number: int, sentence: str, path: Path, name: str) -> Example:
     way = graph.path(number)
-    script = Script(graph, way)
+    script = PathScript(graph, way)
     played = play(script.document(name))
     said = [f"{sentence[:1].upper()}{sentence[1:]}: {len(way) - 1} instants after the beginning."]
     said += [f"This path needs a condition: it happens only {NO_CLOCKS}."] if script.contradictory else []

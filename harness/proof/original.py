@@ -37,7 +37,7 @@ class OriginalError(HarnessError):
 
 
 @dataclass(frozen=True)
-class Original:
+class OriginalProof:
     """The proof of the original agent core. `findings` contains a sentence by key, and `lines` the printed result."""
 
     name: str
@@ -47,11 +47,11 @@ class Original:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ProofComparison:
     """A proof of the agent core in use, next to a proof of the original core."""
 
     proof: Proof
-    original: Original
+    original: OriginalProof
 
     @property
     def new(self) -> dict[str, str]:
@@ -119,7 +119,7 @@ def code_of(original: str) -> Iterator[Path]:
         yield history.tree
 
 
-def prove_original(name: str, code: Path, bounds: Bounds, limits: Limits) -> Original:
+def prove_original(name: str, code: Path, bounds: Bounds, limits: Limits) -> OriginalProof:
     """Explore the agent core in the directory `code` within the same bounds and limits. Raises OriginalError if that
     fails.
     """
@@ -138,7 +138,7 @@ def prove_original(name: str, code: Path, bounds: Bounds, limits: Limits) -> Ori
         )
         try:
             found = json.loads(ended.stdout)
-            return Original(name, found["findings"], found["complete"], found["lines"])
+            return OriginalProof(name, found["findings"], found["complete"], found["lines"])
         except (ValueError, KeyError, TypeError):
             raise OriginalError(
                 f"--against {name}: the prover cannot explore this core: {ended.last_error_line}"

@@ -10,9 +10,9 @@ from itertools import combinations
 from typing import NamedTuple
 
 from harness.play.rogue.lies import NOBODYS, made_block
-from harness.proof.attacker._forgeries import Material, PendingQuestions, asked, forgeries
+from harness.proof.attacker._forgeries import ForgeryMaterial, PendingQuestions, asked, forgeries
 from harness.proof.bounds import Bounds
-from harness.proof.model._instant import Action
+from harness.proof.model._instant import AgentAction
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
 from ucp.block import Block
@@ -33,7 +33,7 @@ class _AgentKnowledge(NamedTuple):
     named: frozenset[bytes]
 
 
-class Ages:
+class ForgedTimestamps:
     """Timestamps before, between and after those of `blocks` honest blocks. They let up to `lies` forged blocks have
     any age.
     """
@@ -54,16 +54,16 @@ class Attacker:
         assert bounds.captured is not None, "a vehicle is captured"
         self.captured = bounds.captured
         self._local = local
-        ages = Ages(bounds.blocks, max(1, bounds.lies))
+        ages = ForgedTimestamps(bounds.blocks, max(1, bounds.lies))
         blocks = [made_block(self.captured, timestamp_us) for timestamp_us in ages.of_blocks]
         self.made = {block.block_hash: block for block in blocks}
         """The blocks that the attacker may make, by block hash."""
         self._own = frozenset(blocks)
         self._times_us = ages.said
         self._knowledge: dict[int, _AgentKnowledge] = {}
-        self._forgeries: dict[tuple[int, Material], tuple[int, ...]] = {}
+        self._forgeries: dict[tuple[int, ForgeryMaterial], tuple[int, ...]] = {}
 
-    def lies(self, locals_: tuple[int, ...]) -> Iterator[tuple[Action, ...]]:
+    def lies(self, locals_: tuple[int, ...]) -> Iterator[tuple[AgentAction, ...]]:
         """Yield the actions of the attacker that have an effect: each message with each set of receivers that it
         affects.
         """
@@ -72,7 +72,9 @@ class Attacker:
         )
         for message in messages:
             differ = [
-                Action(place, "lie", message) for place, local in enumerate(locals_) if self._differs(local, message)
+                AgentAction(place, "lie", message)
+                for place, local in enumerate(locals_)
+                if self._differs(local, message)
             ]
             for count in range(1, len(differ) + 1):
                 yield from combinations(differ, count)
@@ -83,7 +85,7 @@ class Attacker:
         step = self._local.lie(local, message)
         return step.local != local or bool(step.sent or step.started)
 
-    def material(self, locals_: tuple[int, ...]) -> Iterator[tuple[int, Material]]:
+    def material(self, locals_: tuple[int, ...]) -> Iterator[tuple[int, ForgeryMaterial]]:
         """Yield each living agent's index, with the blocks and hashes from which the attacker can form messages to
         it.
         """
@@ -92,7 +94,7 @@ class Attacker:
         named = frozenset(block.block_hash for block in blocks).union(*(look.named for look in looks.values()))
         for place in looks:
             others = frozenset(look.asked for other, look in looks.items() if other != place)
-            yield place, Material(blocks, named, others - {PendingQuestions()}, self._times_us)
+            yield place, ForgeryMaterial(blocks, named, others - {PendingQuestions()}, self._times_us)
 
     def _look(self, local: int) -> _AgentKnowledge:
         look = self._knowledge.get(local)
@@ -100,7 +102,7 @@ class Attacker:
             look = self._knowledge[local] = looked_at(self._local.state(local))
         return look
 
-    def _to(self, local: int, material: Material) -> Iterable[int]:
+    def _to(self, local: int, material: ForgeryMaterial) -> Iterable[int]:
         key = local, material
         numbers = self._forgeries.get(key)
         if numbers is None:
@@ -127,7 +129,7 @@ class AttackerKnowledge:
         self._blocks = {made_block(self._captured, ordinal * MICROSECONDS) for ordinal in ordinals}
         self._named = {NOBODYS, *(block.block_hash for block in self._blocks)}
         self._proposals: dict[int, set[PendingQuestions]] = {}
-        self._times_us = Ages(bounds.blocks, 0).said
+        self._times_us = ForgedTimestamps(bounds.blocks, 0).said
 
     def hears(self, sender: int, message: Message) -> None:
         """Add the blocks and hashes in a message that an agent sent to the attacker's knowledge."""
@@ -138,12 +140,12 @@ class AttackerKnowledge:
             self._named.add(message.block.block_hash)
             self._blocks.add(message.block)
 
-    def material(self, agent_id: int) -> Material:
+    def material(self, agent_id: int) -> ForgeryMaterial:
         """Return the blocks and hashes from which the attacker can form messages to an agent."""
         others = [asked for sender, proposals in self._proposals.items() if sender != agent_id for asked in proposals]
-        return Material(frozenset(self._blocks), frozenset(self._named), frozenset(others), self._times_us)
+        return ForgeryMaterial(frozenset(self._blocks), frozenset(self._named), frozenset(others), self._times_us)
 
-    def forgeries(self, state: AgentState, material: Material) -> list[Message]:
+    def forgeries(self, state: AgentState, material: ForgeryMaterial) -> list[Message]:
         """Return the attacker's messages that can have an effect on an agent in this state."""
         return list(forgeries(state, self._captured, material))
 

@@ -38,7 +38,7 @@ class PendingQuestions(NamedTuple):
     block: bytes | None = None
 
 
-class Material(NamedTuple):
+class ForgeryMaterial(NamedTuple):
     """The contents of an attacker's messages: blocks, block hashes, queries of other agents, and timestamps."""
 
     blocks: frozenset[Block]
@@ -59,7 +59,7 @@ def asked(state: AgentState) -> PendingQuestions:
     )
 
 
-def forgeries(state: AgentState, captor: int, material: Material) -> Iterator[Message]:
+def forgeries(state: AgentState, captor: int, material: ForgeryMaterial) -> Iterator[Message]:
     """Yield the messages in the name of vehicle `captor` that can affect the agent, or affect other agents through its
     answer.
     """
@@ -70,7 +70,7 @@ def forgeries(state: AgentState, captor: int, material: Material) -> Iterator[Me
         yield from _questions(state, material.others)
 
 
-def _answers(state: AgentState, captor: int, material: Material) -> Iterator[Message]:
+def _answers(state: AgentState, captor: int, material: ForgeryMaterial) -> Iterator[Message]:
     """Yield forged answers to the agent's own queries. An agent counts each sender of answers once."""
     waits = asked(state)
     if waits.vote is not None and captor not in state.voters:

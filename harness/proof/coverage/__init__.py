@@ -6,7 +6,16 @@ See docs/explanation/coverage.md.
 with everything that exists within the bounds of `harness.proof`.
 """
 
-from harness.proof.coverage._share import Existing, Share, existing, in_words, to_json
-from harness.proof.coverage.reached import Reached, Watcher, reached_in
+from harness.proof.coverage._share import CoverageShare, ExistingStates, existing, in_words, to_json
+from harness.proof.coverage.reached import CoverageWatcher, ReachedStates, reached_in
 
-__all__ = ["Existing", "Reached", "Share", "Watcher", "existing", "in_words", "reached_in", "to_json"]
+__all__ = [
+    "CoverageShare",
+    "CoverageWatcher",
+    "ExistingStates",
+    "ReachedStates",
+    "existing",
+    "in_words",
+    "reached_in",
+    "to_json",
+]

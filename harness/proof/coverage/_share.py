@@ -6,17 +6,17 @@ from typing import Any
 
 from harness.proof._progress_bar import Ended
 from harness.proof.bounds import Bounds
-from harness.proof.coverage.reached import BRANCHES, Branch, Reached
+from harness.proof.coverage.reached import BRANCHES, Branch, ReachedStates
 from harness.proof.graph._exploration import explore
 from harness.proof.model._any_sender import collect
-from harness.proof.model._global_states import Swarm
+from harness.proof.model._global_states import ModelSwarm
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
-from harness.proof.model._shape import Held, Shape, shape_of
+from harness.proof.model._shape import HeldBlockOrder, Shape, shape_of
 
 
 @dataclass
-class Existing:
+class ExistingStates:
     """The agent states and (state, input) pairs that exist within `bounds`. They are complete if `ended` is
     "complete".
     """
@@ -27,26 +27,26 @@ class Existing:
     ended: Ended = "complete"
 
 
-def existing(bounds: Bounds, *, most_bytes: float = 4e9, most_s: float = float("inf")) -> Existing:
+def existing(bounds: Bounds, *, most_bytes: float = 4e9, most_s: float = float("inf")) -> ExistingStates:
     """Return all agent states and (state, input) pairs within the bounds, or those found before a limit of memory or
     time.
     """
-    there = Existing(bounds, set(), set())
+    there = ExistingStates(bounds, set(), set())
     if bounds.network == "any":
         collected = collect(bounds, most_bytes=most_bytes, most_s=most_s, keep=lambda local: _add(there, local))
         there.ended = collected.ended
     else:
-        swarm = Swarm(bounds, every_count=True)
+        swarm = ModelSwarm(bounds, every_count=True)
         there.ended = explore(swarm, most_bytes=most_bytes, most_s=most_s).ended
         _add(there, swarm.local)
     return there
 
 
-def _add(there: Existing, local: LocalStates) -> None:
-    shapes: list[tuple[Held, Shape, int]] = []
+def _add(there: ExistingStates, local: LocalStates) -> None:
+    shapes: list[tuple[HeldBlockOrder, Shape, int]] = []
     for number in range(len(local.known)):
         state = local.state(number)
-        held = Held(state)
+        held = HeldBlockOrder(state)
         shape = shape_of(state, held)
         shapes.append((held, shape, held.number(shape)))
     there.states.update(number for _, _, number in shapes)
@@ -64,7 +64,7 @@ SCHEMA = "ucp-coverage/1"
 
 
 @dataclass(frozen=True)
-class Share:
+class CoverageShare:
     """The number of existing states, inputs or branches that runs reached, and the number reached outside the
     bounds.
     """
@@ -74,7 +74,7 @@ class Share:
     beyond: int
 
     @classmethod
-    def of(cls, reached: set[int], existing: set[int]) -> "Share":
+    def of(cls, reached: set[int], existing: set[int]) -> "CoverageShare":
         inside = len(reached & existing)
         return cls(inside, len(existing), len(reached) - inside)
 
@@ -94,12 +94,12 @@ class Share:
         return {"reached": self.reached, "exist": self.exist, "beyond": self.beyond}
 
 
-def not_taken(reached: Reached) -> list[Branch]:
+def not_taken(reached: ReachedStates) -> list[Branch]:
     """Return the branches in the agent contract that no run has taken."""
     return [branch for branch in BRANCHES if not reached.branches[branch]]
 
 
-def to_json(reached: Reached, there: Existing | None) -> dict[str, Any]:
+def to_json(reached: ReachedStates, there: ExistingStates | None) -> dict[str, Any]:
     """Return the coverage as a JSON document. With `there`, it also contains the shares of all existing states."""
     missing = not_taken(reached)
     document = {
@@ -126,13 +126,13 @@ def to_json(reached: Reached, there: Existing | None) -> dict[str, Any]:
             "faults": list(bounds.faults),
             "settings": dict(bounds.settings),
             "complete": there.ended == "complete",
-            "local_states": Share.of(reached.states, there.states).to_json(),
-            "pairs": Share.of(reached.pairs, there.pairs).to_json(),
+            "local_states": CoverageShare.of(reached.states, there.states).to_json(),
+            "pairs": CoverageShare.of(reached.pairs, there.pairs).to_json(),
         },
     }
 
 
-def in_words(reached: Reached, there: Existing | None) -> Iterator[str]:
+def in_words(reached: ReachedStates, there: ExistingStates | None) -> Iterator[str]:
     """Yield lines of text about the coverage."""
     yield (
         f"{reached.steps:,} handler runs: {len(reached.states):,} local states, {len(reached.pairs):,} pairs of one "
@@ -142,8 +142,8 @@ def in_words(reached: Reached, there: Existing | None) -> Iterator[str]:
         yield f"share of the states within {there.bounds.in_words()}:"
         if there.ended != "complete":
             yield f"  the state space is incomplete ({there.ended}), so the shares are too large"
-        yield f"  {Share.of(reached.states, there.states).in_words('local states')}"
-        yield f"  {Share.of(reached.pairs, there.pairs).in_words('pairs')}"
+        yield f"  {CoverageShare.of(reached.states, there.states).in_words('local states')}"
+        yield f"  {CoverageShare.of(reached.pairs, there.pairs).in_words('pairs')}"
     missing = not_taken(reached)
     yield f"{len(BRANCHES) - len(missing)} of {len(BRANCHES)} branches of the 20 handlers"
     by_handler: dict[str, list[str]] = {}

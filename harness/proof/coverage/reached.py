@@ -13,7 +13,7 @@ from harness.checker.recorded_inputs import decoded
 from harness.checker.reference.state import State
 from harness.checker.steps import check
 from harness.play.simulation.simulation import Simulation
-from harness.proof.model._shape import Held, Shape, shape_of
+from harness.proof.model._shape import HeldBlockOrder, Shape, shape_of
 from harness.run.simulate import MemoryRecorder, Simulated, simulate_in_memory
 from harness.scenario import Scenario
 from ucp.agent import HANDLERS
@@ -31,11 +31,11 @@ BRANCHES: tuple[Branch, ...] = tuple(
 MOST = 2_000_000
 """Maximum number of local states, and of pairs. More would need too much memory."""
 KEPT = 20_000
-"""Maximum number of cached `Held` objects."""
+"""Maximum number of cached `HeldBlockOrder` objects."""
 
 
 @dataclass
-class Reached:
+class ReachedStates:
     """The agent states that runs reached, and the (state, input) pairs whose input had an effect or an answer."""
 
     states: set[int] = field(default_factory=set)
@@ -46,7 +46,7 @@ class Reached:
     untold: str | None = None
     """The reason why some steps are unknown. None if all are known."""
 
-    def add(self, other: "Reached") -> None:
+    def add(self, other: "ReachedStates") -> None:
         """Add the states, pairs and branches of another object to this one."""
         for mine, its in ((self.states, other.states), (self.pairs, other.pairs)):
             if len(mine) < MOST:
@@ -58,17 +58,17 @@ class Reached:
         self.untold = self.untold or other.untold
 
 
-class Watcher:
+class CoverageWatcher:
     """Records the reached states, pairs and branches after each judged step of an agent. Callers may replace
     `reached`.
     """
 
     def __init__(self) -> None:
-        self.reached = Reached()
-        self._held: dict[tuple[object, ...], Held] = {}
+        self.reached = ReachedStates()
+        self._held: dict[tuple[object, ...], HeldBlockOrder] = {}
         self._number_before = 0
         self._shape_before: Shape = ()
-        self._held_before: Held | None = None
+        self._held_before: HeldBlockOrder | None = None
         self._input: HandlerRun | None = None
         self._answers = False
 
@@ -95,7 +95,7 @@ class Watcher:
                 reached.pairs.add(self._held_before.number((self._shape_before, given)))
         self._number_before, self._shape_before, self._held_before = number, shape, held
 
-    def _what_it_holds(self, state: State) -> Held:
+    def _what_it_holds(self, state: State) -> HeldBlockOrder:
         key: tuple[object, ...] = (state.chain.top_chain_hash,)
         if state.blocks_to_be_committed or state.reconcile_stack:
             aside = (*state.blocks_to_be_committed, *state.reconcile_stack)
@@ -104,11 +104,11 @@ class Watcher:
         if held is None:
             if len(self._held) >= KEPT:
                 self._held.clear()
-            held = self._held[key] = Held(state)
+            held = self._held[key] = HeldBlockOrder(state)
         return held
 
 
-def _given(run: HandlerRun | None, held: Held) -> tuple[Any, ...] | None:
+def _given(run: HandlerRun | None, held: HeldBlockOrder) -> tuple[Any, ...] | None:
     """Return the abstract form of an input for an agent that held these blocks, or None if no bounds contain such an
     input.
     """
@@ -122,9 +122,9 @@ def _given(run: HandlerRun | None, held: Held) -> tuple[Any, ...] | None:
     return ("event",) if isinstance(trigger, EventTrigger) else None
 
 
-def reached_in(evidence: Evidence) -> Reached:
+def reached_in(evidence: Evidence) -> ReachedStates:
     """Return the states, pairs and branches that the agents of a run reached, according to their traces."""
-    watcher = Watcher()
+    watcher = CoverageWatcher()
     evidence.watch = watcher.step
     judgement = check(evidence)
     if judgement.verdict == "not applicable":

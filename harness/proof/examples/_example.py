@@ -49,7 +49,7 @@ class Example:
 
 
 @dataclass(frozen=True)
-class Played:
+class PlayedExample:
     """A simulated run: its bad verdicts, and the endless cycle of its agents, if there is one."""
 
     document: Document
@@ -58,20 +58,20 @@ class Played:
     chains: int
 
 
-def play(document: Document) -> Played:
+def play(document: Document) -> PlayedExample:
     try:
         simulated = simulate(parse(document), SEED, tracing=True)
         result, cycle = simulated.result, simulated.evidence.cached(cycle_of)
     except AgentFailedError as error:
         result, cycle = result_of_failure(error), None
-    return Played(document, _bad(result), cycle, len({*result.chains.values()}))
+    return PlayedExample(document, _bad(result), cycle, len({*result.chains.values()}))
 
 
 def _bad(result: Result) -> dict[str, Judgement]:
     return {key: result.judgements[key] for key in result.bad}
 
 
-def keep(played: Played, path: Path, bounds: Bounds, instants: int, sentences: Sequence[str]) -> Example:
+def keep(played: PlayedExample, path: Path, bounds: Bounds, instants: int, sentences: Sequence[str]) -> Example:
     """Write a played scenario to `path`, with `sentences` as its comment, and return it as an example."""
     comment = [
         *sentences,

@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 
 from harness.proof.attacker._timeline_entries import AttackEntries
 from harness.proof.bounds import EVENT_FILLS_BLOCK
-from harness.proof.examples._path_times import Ages, TimerRun, instants_s, windows_s
-from harness.proof.graph._exploration import Graph
-from harness.proof.model._global_states import AGENTS, Move
-from harness.proof.model._instant import Action, Wave
+from harness.proof.examples._path_times import BlockAges, TimerRun, instants_s, windows_s
+from harness.proof.graph._exploration import StateGraph
+from harness.proof.model._global_states import AGENTS, SwarmTransition
+from harness.proof.model._instant import AgentAction, MessageRound
 from harness.proof.model._known_states import DEAD
-from harness.proof.model._snapshot import Step
+from harness.proof.model._snapshot import AgentStep
 from harness.scenario.strict_model import format_pairs
 from netem.medium import LATENCY
 
@@ -62,7 +62,7 @@ class _Agent:
     started: int = 0
 
 
-class Completion(NamedTuple):
+class CompletionInterval(NamedTuple):
     """The interval in which an agent may complete a block, in seconds after the start of the path."""
 
     agent: int
@@ -70,10 +70,10 @@ class Completion(NamedTuple):
     latest_s: float
 
 
-class Script:
+class PathScript:
     """Follows a path through the state graph step by step, and collects the entries of a scenario."""
 
-    def __init__(self, graph: Graph, path: Sequence[int]) -> None:
+    def __init__(self, graph: StateGraph, path: Sequence[int]) -> None:
         self._graph = graph
         self._swarm = graph.swarm
         self._moves = [self._move(before, after) for before, after in pairwise(path)]
@@ -86,7 +86,7 @@ class Script:
         self._agents = [_Agent(place + 1, local) for place, local in enumerate(begin[AGENTS:])]
         self._sent: Counter[tuple[int, str]] = Counter()
         self._events: list[Document] = []
-        self._ages = Ages()
+        self._ages = BlockAges()
         self.contradictory = False
         """True if no clocks give all ties the required results. `document` sets it."""
         self.losses = 0
@@ -130,7 +130,7 @@ class Script:
             **({"lateness": lateness} if lateness else {}),
         }
 
-    def completions(self) -> Iterator[Completion]:
+    def completions(self) -> Iterator[CompletionInterval]:
         """Yield the interval for the completion of each block that the timer durations allow."""
         agents = [agent.agent_id for agent in self._agents]
         for move, (earliest_s, latest_s) in zip(
@@ -138,10 +138,10 @@ class Script:
         ):
             for action in move.actions:
                 if action.what == "complete":
-                    yield Completion(agents[action.place], earliest_s, latest_s)
+                    yield CompletionInterval(agents[action.place], earliest_s, latest_s)
             agents = [agents[old] for old in move.places]
 
-    def _move(self, before: int, after: int) -> Move:
+    def _move(self, before: int, after: int) -> SwarmTransition:
         """Return a transition from one state to the next, without message losses if there is one."""
         state, wanted = self._graph.states[before], self._graph.states[after]
         for lossy in (False, True) if self._swarm.bounds.network == "lossy" else (False,):
@@ -177,7 +177,7 @@ class Script:
 
     # Events
 
-    def _play(self, move: Move, at_s: float) -> None:
+    def _play(self, move: SwarmTransition, at_s: float) -> None:
         """Play one moment of the path: first the actions of the agents, then the reception of all messages."""
         earliest = self._end_s + MOMENT_S if self._end_s else 0.0
         ends = [
@@ -214,7 +214,7 @@ class Script:
         for agent, local in zip(self._agents, move.state[AGENTS:], strict=True):
             agent.local = local
 
-    def _act(self, agent: _Agent, action: Action, now: float) -> Step:
+    def _act(self, agent: _Agent, action: AgentAction, now: float) -> AgentStep:
         if action.what == "complete":
             self._events.append({"at_s": now, "agent": agent.agent_id})
             self._ages.completed(action.number)
@@ -230,9 +230,9 @@ class Script:
             self._timeline.append({"at_s": now, "reboot": [agent.agent_id], "down_s": MOMENT_S, "disk": "kept"})
             return self._swarm.local.reboot(agent.local)
         self._timeline.append({"at_s": now, "kill": [agent.agent_id]})
-        return Step(DEAD, (), ())
+        return AgentStep(DEAD, (), ())
 
-    def _apply(self, agent: _Agent, step: Step, now: float) -> list[_Broadcast]:
+    def _apply(self, agent: _Agent, step: AgentStep, now: float) -> list[_Broadcast]:
         """Apply a step to an agent, and return the messages that it broadcasts."""
         agent.local = step.local
         if self._attack_entries is not None and step.local != DEAD:
@@ -252,7 +252,7 @@ class Script:
             flights.append(_Broadcast(agent.agent_id, message, name, self._sent[agent.agent_id, name], now))
         return flights
 
-    def _in_wave_order(self, wave: Wave, flights: Sequence[_Broadcast]) -> list[_Broadcast]:
+    def _in_wave_order(self, wave: MessageRound, flights: Sequence[_Broadcast]) -> list[_Broadcast]:
         """Return the broadcasts in the order in which the round of messages lists them."""
         left, ordered = list(flights), []
         for place, message in wave.air:
@@ -262,7 +262,7 @@ class Script:
             ordered.append(flight)
         return ordered
 
-    def _hear(self, wave: Wave, air: Sequence[_Broadcast], acted_s: float) -> list[_Broadcast]:
+    def _hear(self, wave: MessageRound, air: Sequence[_Broadcast], acted_s: float) -> list[_Broadcast]:
         """Let each agent receive its messages of one round, and return their answers."""
         answers: dict[int, list[_Broadcast]] = {}
         received: set[int] = set()
@@ -313,7 +313,7 @@ class Script:
                     self._late[agent.agent_id][number] = self._end_s + MOMENT_S - ends_s
 
 
-def _waves_in_order(last: Wave | None) -> list[Wave]:
+def _waves_in_order(last: MessageRound | None) -> list[MessageRound]:
     waves = []
     while last is not None:
         waves.append(last)

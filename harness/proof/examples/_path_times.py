@@ -92,7 +92,7 @@ def _bounds(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: b
     return later
 
 
-class Ages:
+class BlockAges:
     """The required order of the timestamps of all blocks on a path.
 
     Blocks are identified by their ordinals in the states of the path. The ordinals change along the path.

@@ -8,7 +8,7 @@ from itertools import chain, islice
 from struct import Struct
 from typing import NamedTuple, overload
 
-from harness.proof.model._global_states import AGENTS, State, Swarm
+from harness.proof.model._global_states import AGENTS, ModelSwarm, State
 from harness.proof.model._instant import Actions
 from harness.proof.questions._attractor import ByTimer
 
@@ -17,7 +17,7 @@ _Following = dict[Actions, dict[int, None]]
 """Actions of an instant -> numbers of the possible successors, in order."""
 
 
-class Expansion(NamedTuple):
+class StateExpansion(NamedTuple):
     """The successors of one state of the swarm. `ways` is the number of transitions that lead to them.
 
     The other fields have the numbers of successors without losses and without new blocks. `by_timer` has, for each
@@ -30,7 +30,7 @@ class Expansion(NamedTuple):
     crossing: tuple[int, ...]
 
 
-def expanded(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
+def expanded(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
     """Return the successors of a state. `number_of` is called for each successor in order, and returns its number."""
     lossy = swarm.bounds.network == "lossy"
     ways = 0
@@ -44,12 +44,14 @@ def expanded(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
     return _quiet(swarm, state, number_of, ending, losing_nothing)._replace(ways=ways)
 
 
-def quiet(swarm: Swarm, state: State, number_of: NumberOf) -> Expansion:
+def quiet(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
     """Return the successors of a state that need no lost message and no new block. The number of transitions is 0."""
     return _quiet(swarm, state, number_of, [*swarm.ending(state)], {})
 
 
-def _quiet(swarm: Swarm, state: State, number_of: NumberOf, ending: Sequence[Actions], known: _Following) -> Expansion:
+def _quiet(
+    swarm: ModelSwarm, state: State, number_of: NumberOf, ending: Sequence[Actions], known: _Following
+) -> StateExpansion:
     """Return the successors without message losses and new blocks. `known` may already contain some of them."""
     after = {
         actions: known[actions]
@@ -63,7 +65,7 @@ def _quiet(swarm: Swarm, state: State, number_of: NumberOf, ending: Sequence[Act
             choices = [after[actions] for actions in after if tied.issuperset(actions)]
             by_timer.append(tuple(dict.fromkeys(chain.from_iterable(choices))))
     crossing = dict.fromkeys(chain.from_iterable(after[actions] for actions in after if len(actions) > 1))
-    return Expansion(0, tuple(by_timer), tuple(crossing))
+    return StateExpansion(0, tuple(by_timer), tuple(crossing))
 
 
 @contextmanager
@@ -78,7 +80,7 @@ def cycles_left_alone() -> Iterator[None]:
             gc.enable()
 
 
-class States(Sequence[State]):
+class StateStore(Sequence[State]):
     """The states of a swarm, numbered in the order in which they were added. Each one is stored as bytes."""
 
     def __init__(self, agents: int) -> None:
@@ -107,7 +109,7 @@ class States(Sequence[State]):
         return self._form.unpack(self._rows[number])
 
 
-class Followers(Sequence[ByTimer]):
+class SuccessorStore(Sequence[ByTimer]):
     """The successors of each state, grouped by the timer that expires. One flat array holds them all: a count, then
     that many successors.
     """

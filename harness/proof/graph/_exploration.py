@@ -9,27 +9,27 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
-from harness.proof._progress_bar import LOOK_EVERY, Budget, Ended, GivenUpError, Progress
-from harness.proof.graph._expansion import Expansion, Followers, States, cycles_left_alone, expanded
+from harness.proof._progress_bar import LOOK_EVERY, Ended, ExplorationBudget, LimitReachedError, Progress
+from harness.proof.graph._expansion import StateExpansion, StateStore, SuccessorStore, cycles_left_alone, expanded
 from harness.proof.graph._workers import Workers
 from harness.proof.model._flaws import Flaw
-from harness.proof.model._global_states import State, Swarm
+from harness.proof.model._global_states import ModelSwarm, State
 
 NO_PARENT = -1
 
 
 @dataclass
-class Graph:
+class StateGraph:
     """The explored states by number, and the predecessor of each. They are all reachable states if `ended` is
     "complete".
 
     `quiet` and `crossing` have the fields `by_timer` and `crossing` of the expansion of each state.
     """
 
-    swarm: Swarm
-    states: States = field(init=False)
+    swarm: ModelSwarm
+    states: StateStore = field(init=False)
     parents: "array[int]" = field(default_factory=lambda: array("q"))
-    quiet: Followers = field(default_factory=Followers)
+    quiet: SuccessorStore = field(default_factory=SuccessorStore)
     crossing: dict[int, tuple[int, ...]] = field(default_factory=dict)
     transitions: int = 0
     depth: int = 0
@@ -45,7 +45,7 @@ class Graph:
     """Memory and processor time of the workers, and the number of steps that they have computed."""
 
     def __post_init__(self) -> None:
-        self.states = States(self.swarm.bounds.agents)
+        self.states = StateStore(self.swarm.bounds.agents)
 
     @property
     def flaw(self) -> Flaw | None:
@@ -63,7 +63,7 @@ class Graph:
                     self.shown.setdefault(key, number)
         return number
 
-    def take_in(self, expansion: Expansion) -> None:
+    def take_in(self, expansion: StateExpansion) -> None:
         """Add the successors of the next state in the order of numbers."""
         number = len(self.quiet)
         self.transitions += expansion.ways
@@ -84,18 +84,18 @@ class Graph:
 
 @cycles_left_alone()
 def explore(
-    swarm: Swarm,
+    swarm: ModelSwarm,
     *,
     most_bytes: float,
     most_s: float,
     workers: Workers | None = None,
     watch: Callable[[Progress], None] = lambda progress: None,
-) -> Graph:
+) -> StateGraph:
     """Explore all states, until a limit of memory or time is reached or a state shows a violation.
 
     The result is the same with and without workers.
     """
-    graph, budget = Graph(swarm), Budget(most_bytes, most_s)
+    graph, budget = StateGraph(swarm), ExplorationBudget(most_bytes, most_s)
     try:
         for progress in _all(graph, budget, workers):
             watch(progress)
@@ -103,7 +103,7 @@ def explore(
             if ended is not None:
                 graph.ended = ended
                 break
-    except GivenUpError as given_up:
+    except LimitReachedError as given_up:
         graph.ended = given_up.ended
     except KeyboardInterrupt:
         graph.ended = "interrupted"
@@ -111,7 +111,7 @@ def explore(
     return graph
 
 
-def _all(graph: Graph, budget: Budget, workers: Workers | None) -> Iterator[Progress]:
+def _all(graph: StateGraph, budget: ExplorationBudget, workers: Workers | None) -> Iterator[Progress]:
     graph.reach(graph.swarm.initial, NO_PARENT)
     layer_ends = 1
     for looked_at, expansion in enumerate(_expansions(graph, budget, workers), 1):
@@ -124,7 +124,7 @@ def _all(graph: Graph, budget: Budget, workers: Workers | None) -> Iterator[Prog
             yield graph.progress(budget.seconds)
 
 
-def _expansions(graph: Graph, budget: Budget, workers: Workers | None) -> Iterator[Expansion]:
+def _expansions(graph: StateGraph, budget: ExplorationBudget, workers: Workers | None) -> Iterator[StateExpansion]:
     """Yield the successors of each state in order. States that are added during the loop are included.
 
     Workers compute many states.

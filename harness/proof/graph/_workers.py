@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 
 from harness.errors import HarnessError
 from harness.proof._progress_bar import memory_bytes
-from harness.proof.graph._expansion import Expansion, expanded
+from harness.proof.graph._expansion import StateExpansion, expanded
 from harness.proof.model._block_renaming import Completed
-from harness.proof.model._global_states import AGENTS, ZONE, State, Swarm
+from harness.proof.model._global_states import AGENTS, ZONE, ModelSwarm, State
 from harness.proof.model._known_states import DEAD
 from harness.proof.questions._attractor import Check
 from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
@@ -51,7 +51,7 @@ class StateBatch(NamedTuple):
     states: "array[int]"
 
 
-class Forks(NamedTuple):
+class ForkedStates(NamedTuple):
     """A task for a worker: idle states in which agents have different chains. The answer is a `NeededVotes`."""
 
     batch: StateBatch
@@ -66,7 +66,7 @@ class Successors(NamedTuple):
     """
 
     batch: StateBatch
-    expansions: list[tuple[int, Expansion]]
+    expansions: list[tuple[int, StateExpansion]]
 
 
 class NeededVotes(NamedTuple):
@@ -77,7 +77,7 @@ class NeededVotes(NamedTuple):
     votes: list[int | None] | None
 
 
-class Answer(NamedTuple):
+class WorkerAnswer(NamedTuple):
     """An answer of a worker process, with the time and memory that it has used so far."""
 
     answer: Successors | NeededVotes
@@ -120,7 +120,7 @@ class _NumberTranslator:
 class _StateTranslator:
     """One end of the connection between two processes. It translates the numbers of states."""
 
-    def __init__(self, swarm: Swarm) -> None:
+    def __init__(self, swarm: ModelSwarm) -> None:
         local, zones = swarm.local, swarm.zones
         self._swarm = swarm
         self._locals = _NumberTranslator(len(local.known), local.content, local.adopt)
@@ -159,16 +159,16 @@ class _WorkerFunction:
     need.
     """
 
-    def __init__(self, swarm: Swarm) -> None:
+    def __init__(self, swarm: ModelSwarm) -> None:
         self._swarm = swarm
         self._translator = _StateTranslator(swarm)
         self._reported: dict[State, int] = {}
         self._next_number = count()
         self._votes = ExtraVotes(swarm)
 
-    def __call__(self, task: StateBatch | Forks) -> Answer:
-        answer = self._needed(task) if isinstance(task, Forks) else self._following(task)
-        return Answer(answer, memory_bytes(), time.process_time(), self._swarm.local.steps)
+    def __call__(self, task: StateBatch | ForkedStates) -> WorkerAnswer:
+        answer = self._needed(task) if isinstance(task, ForkedStates) else self._following(task)
+        return WorkerAnswer(answer, memory_bytes(), time.process_time(), self._swarm.local.steps)
 
     def _following(self, task: StateBatch) -> Successors:
         fresh: list[State] = []
@@ -189,7 +189,7 @@ class _WorkerFunction:
             expansions.append((len(fresh) - known, expansion))
         return Successors(self._translator.encode(fresh), expansions)
 
-    def _needed(self, task: Forks) -> NeededVotes:
+    def _needed(self, task: ForkedStates) -> NeededVotes:
         self._reported.clear()  # there are no further tasks for successors
         try:
             return NeededVotes([self._votes.needed(fork) for fork in self._translator.decode(task.batch)])
@@ -200,13 +200,13 @@ class _WorkerFunction:
 class _WorkerHandle:
     """A worker process, as the main process sees it."""
 
-    def __init__(self, swarm: Swarm) -> None:
+    def __init__(self, swarm: ModelSwarm) -> None:
         self.memory_bytes = 0.0
         self.processor_s = 0.0
         self.steps = 0
         self._steps_at_fork = swarm.local.steps
         self._translator = _StateTranslator(swarm)
-        self._worker: Worker[StateBatch | Forks, Answer] = Worker(_WorkerFunction(swarm))
+        self._worker: Worker[StateBatch | ForkedStates, WorkerAnswer] = Worker(_WorkerFunction(swarm))
         self._numbers: list[int] = []
         """The main process's numbers of the states that the worker reported, in order of the reports."""
 
@@ -218,7 +218,7 @@ class _WorkerHandle:
         self._worker.connection.send(self._translator.encode(states))
 
     def give_forks(self, states: Sequence[State]) -> None:
-        self._worker.connection.send(Forks(self._translator.encode(states)))
+        self._worker.connection.send(ForkedStates(self._translator.encode(states)))
 
     def receive(self) -> Successors | NeededVotes:
         try:
@@ -231,13 +231,15 @@ class _WorkerHandle:
             raise answer
         if isinstance(answer, FailedTask):
             raise HarnessError(f"a worker process failed: {answer.reason}")
-        assert isinstance(answer, Answer)
+        assert isinstance(answer, WorkerAnswer)
         self.memory_bytes = answer.memory_bytes
         self.processor_s = answer.processor_s
         self.steps = answer.steps - self._steps_at_fork
         return answer.answer
 
-    def expansions_of(self, answer: Successors, first: int, add: Callable[[State, int], int]) -> Iterator[Expansion]:
+    def expansions_of(
+        self, answer: Successors, first: int, add: Callable[[State, int], int]
+    ) -> Iterator[StateExpansion]:
         """Yield the successors of each state in the answer, beginning with state number `first`. `add` stores new
         states in the graph.
         """
@@ -246,7 +248,7 @@ class _WorkerHandle:
         for parent, (new, expansion) in enumerate(answer.expansions, first):
             for _ in range(new):
                 numbers.append(add(next(fresh), parent))
-            yield Expansion(
+            yield StateExpansion(
                 expansion.ways,
                 tuple(tuple(numbers[reported] for reported in after) for after in expansion.by_timer),
                 tuple(numbers[reported] for reported in expansion.crossing),
@@ -262,7 +264,7 @@ Give = Callable[["_WorkerHandle", Sequence[State]], None]
 class Workers:
     """A pool of `size` worker processes. They start with the first task and stop when the context ends."""
 
-    def __init__(self, swarm: Swarm, size: int) -> None:
+    def __init__(self, swarm: ModelSwarm, size: int) -> None:
         self._swarm = swarm
         self._size = size
         self._handles: list[_WorkerHandle] = []
@@ -293,7 +295,7 @@ class Workers:
 
     def expansions(
         self, states: Sequence[State], first: int, add: Callable[[State, int], int], check: Check = lambda: None
-    ) -> Iterator[Expansion]:
+    ) -> Iterator[StateExpansion]:
         """Yield the successors of each state in order, beginning with number `first`. `states` may grow during the
         loop.
         """

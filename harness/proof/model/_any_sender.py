@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 
 from harness.proof._progress_bar import Ended, Progress, memory_bytes
 from harness.proof.attacker._attacker import AttackerKnowledge
-from harness.proof.attacker._forgeries import Material
+from harness.proof.attacker._forgeries import ForgeryMaterial
 from harness.proof.bounds import Bounds
 from harness.proof.model._flaws import Flaw
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
-from harness.proof.model._snapshot import Step
+from harness.proof.model._snapshot import AgentStep
 from harness.proof.model._zones import NOTHING_RUNS, Zones
 
 LOOK_EVERY = 500
@@ -32,7 +32,7 @@ Said = tuple[int, int]
 
 
 @dataclass
-class Collected:
+class CollectedFigures:
     """The figures of an exploration of single agents. `said` counts the different messages of all senders."""
 
     bounds: Bounds
@@ -60,16 +60,16 @@ def collect(
     most_s: float,
     watch: Callable[[Progress], None] = lambda progress: None,
     keep: Callable[[LocalStates], None] = lambda local: None,
-) -> Collected:
+) -> CollectedFigures:
     """Collect all agent states and messages, until a limit of memory or time is reached or a violation is found.
 
     `keep` is called with the local states of each division of the blocks.
     """
-    collected, began = Collected(bounds), time.monotonic()
+    collected, began = CollectedFigures(bounds), time.monotonic()
     try:
         for makers in divisions(bounds.agents, bounds.blocks, bounds.captured):
             collected.divisions += 1
-            division = _Division(collected, makers)
+            division = _BlockDistribution(collected, makers)
             try:
                 for progress in division.collect(began):
                     watch(progress)
@@ -108,10 +108,10 @@ def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator
     return iter(begun)
 
 
-class _Division:
+class _BlockDistribution:
     """The exploration of one distribution of the blocks among the agents."""
 
-    def __init__(self, collected: Collected, makers: tuple[int, ...]) -> None:
+    def __init__(self, collected: CollectedFigures, makers: tuple[int, ...]) -> None:
         self._collected = collected
         self._bounds = bounds = collected.bounds
         self._own = {
@@ -129,7 +129,7 @@ class _Division:
 
         It has the blocks of its vehicle from the beginning.
         """
-        self._lied: dict[int, tuple[Material, int]] = {}
+        self._lied: dict[int, tuple[ForgeryMaterial, int]] = {}
         """Agent -> material of the last attack messages to it, and number of its states that have received them."""
         self._looked_at = 0
         """Number of states whose own actions have been explored."""
@@ -263,7 +263,7 @@ class _Division:
     def _go(
         self,
         state: Alone,
-        step: Step,
+        step: AgentStep,
         what: str,
         *,
         ended: tuple[int, ...] = (),

@@ -20,7 +20,7 @@ Places = tuple[int, ...]
 """The previous place of the agent at each place of a state."""
 
 
-class Ordered(NamedTuple):
+class OrderedAgents(NamedTuple):
     """Agents in their chosen order, their timers in this order, and the previous position of each agent.
 
     `blocks` has the previous ordinal of each block, from 1. It is empty if the blocks keep their ordinals.
@@ -41,7 +41,7 @@ Above it, equivalent states may count as several states.
 """
 
 
-class Order:
+class CanonicalOrder:
     """Puts agents into their canonical order. `name_of` returns the ID by which the agent at one position knows another
     agent.
     """
@@ -51,9 +51,9 @@ class Order:
         self._local = local
         self._zones = zones
         self._name_of = name_of
-        self._known: dict[tuple[tuple[int, ...], int], Ordered] = {}
+        self._known: dict[tuple[tuple[int, ...], int], OrderedAgents] = {}
 
-    def of(self, locals_: tuple[int, ...], zone: int) -> Ordered:
+    def of(self, locals_: tuple[int, ...], zone: int) -> OrderedAgents:
         key = locals_, zone
         ordered = self._known.get(key)
         if ordered is None:
@@ -62,7 +62,7 @@ class Order:
             ordered = self._known[key] = self._put_in_order(locals_, zone)
         return ordered
 
-    def _put_in_order(self, locals_: tuple[int, ...], zone: int) -> Ordered:
+    def _put_in_order(self, locals_: tuple[int, ...], zone: int) -> OrderedAgents:
         timers = self._timers(locals_)
         orders = [self._as_they_are]
         if self._local.bounds.alike:
@@ -78,11 +78,11 @@ class Order:
             agents = locals_
         blocks = self._blocks(agents)
         if blocks == tuple(range(1, len(blocks) + 1)):
-            return Ordered(agents, zone, places)
+            return OrderedAgents(agents, zone, places)
         number = {block: new for new, block in enumerate(blocks, 1)}
         about, exchanged = self._local.about, self._local.exchanged
         agents = tuple([exchanged(local, tuple([number[block] for block in about(local)])) for local in agents])
-        return Ordered(agents, zone, places, blocks)
+        return OrderedAgents(agents, zone, places, blocks)
 
     def _blocks(self, agents: Sequence[int]) -> Ordinals:
         """Return the numbers of the agents' blocks in the order in which they first occur.

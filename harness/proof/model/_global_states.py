@@ -13,9 +13,9 @@ from typing import NamedTuple
 from harness.proof.attacker._attacker import Attacker
 from harness.proof.bounds import FAULTS, MAX_COINCIDENCES, MAX_LIES, Bounds
 from harness.proof.model._block_renaming import Ordinals
-from harness.proof.model._canonical_order import Order, Ordered, Places
+from harness.proof.model._canonical_order import CanonicalOrder, OrderedAgents, Places
 from harness.proof.model._flaws import Flaw
-from harness.proof.model._instant import Action, Actions, Agents, Instants, Wave, Way
+from harness.proof.model._instant import Actions, AgentAction, AgentStates, FinalRound, InstantOutcomes, MessageRound
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
 from harness.proof.model._snapshot import Started
@@ -44,7 +44,7 @@ BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
 """The indices of the parts of a global state."""
 
 
-class Move(NamedTuple):
+class SwarmTransition(NamedTuple):
     """A transition between two states of the swarm: its actions, the new state, and the previous positions of the
     agents.
 
@@ -54,7 +54,7 @@ class Move(NamedTuple):
     actions: Actions
     state: State
     places: Places
-    wave: Wave | None
+    wave: MessageRound | None
     started: tuple[Started, ...]
     """The started timers, by the places before the transition."""
     blocks: Ordinals
@@ -70,7 +70,7 @@ class _Outcome(NamedTuple):
     agents: tuple[int, ...]
     running: tuple[int, ...]
     started: tuple[Started, ...]
-    way: Way
+    way: FinalRound
 
 
 class _Instant(NamedTuple):
@@ -85,7 +85,7 @@ class _Instant(NamedTuple):
     outcomes: tuple[_Outcome, ...]
 
 
-class Swarm:
+class ModelSwarm:
     """The states of a swarm within `bounds`, and the transitions between them.
 
     If `every_count`, all existing local states are explored: answers are received in each order although they are only
@@ -96,8 +96,10 @@ class Swarm:
         self.bounds = bounds
         self.local = LocalStates(bounds, every_count=every_count)
         self.zones = Zones()
-        self._instants = Instants(self.local, bounds, every_order=every_count)
-        self._order = Order(self.local, self.zones, self.name_of) if bounds.alike or bounds.blocks_alike else None
+        self._instants = InstantOutcomes(self.local, bounds, every_order=every_count)
+        self._order = (
+            CanonicalOrder(self.local, self.zones, self.name_of) if bounds.alike or bounds.blocks_alike else None
+        )
         self._known: dict[tuple[tuple[int, ...], Actions, int], _Instant] = {}
         self._running = lru_cache(MOST_KNOWN)(self._running_of)
         self._as_they_are = tuple(range(bounds.agents))
@@ -111,21 +113,24 @@ class Swarm:
 
     # Actions of an instant
 
-    def firsts(self, state: State) -> list[Action]:
+    def firsts(self, state: State) -> list[AgentAction]:
         """Return the next possible timer expiries, one action for each possible result."""
         return [action for actions in self._firsts(state) for action in actions]
 
-    def _firsts(self, state: State) -> list[list[Action]]:
+    def _firsts(self, state: State) -> list[list[AgentAction]]:
         """Return the next possible timer expiries: for each timer, a list of actions with the possible results."""
         running = self._running(state[AGENTS:])
         if not self.bounds.timers_any:
             running = tuple([running[first - 1] for first in self.zones.firsts(state[ZONE])])
         return [
-            [Action(place, "timer", timer, way) for way in range(len(self.local.ends(state[AGENTS + place], timer)))]
+            [
+                AgentAction(place, "timer", timer, way)
+                for way in range(len(self.local.ends(state[AGENTS + place], timer)))
+            ]
             for place, timer in running
         ]
 
-    def alternatives(self, state: State) -> Iterator[tuple[Action, frozenset[Action]]]:
+    def alternatives(self, state: State) -> Iterator[tuple[AgentAction, frozenset[AgentAction]]]:
         """Yield each timer that may expire next, with the set of all timers that must expire at the same moment.
 
         The ages of blocks are chosen for all results, because no agent can choose the older one of two blocks.
@@ -143,7 +148,7 @@ class Swarm:
 
         Without crossing, timers expire one by one.
         """
-        by_place: dict[int, list[Action]] = {}
+        by_place: dict[int, list[AgentAction]] = {}
         for action in self.firsts(state):
             by_place.setdefault(action.place, []).append(action)
         most = len(by_place) if self.bounds.crossing else 1
@@ -168,18 +173,18 @@ class Swarm:
             for count in range(1, min(left, len(idle_hands)) + 1):
                 for places in self._unlike(state, permutations(idle_hands, count)):
                     completed = (
-                        Action(place, "complete", state[BLOCKS] + 1 + index) for index, place in enumerate(places)
+                        AgentAction(place, "complete", state[BLOCKS] + 1 + index) for index, place in enumerate(places)
                     )
                     actions = (*timers, *completed)
                     if self._may_coincide(state, actions):
                         yield actions
-        singly: list[Action] = []
+        singly: list[AgentAction] = []
         if left:
             for (place,) in self._unlike(state, ((place,) for place in alive)):
-                singly.append(Action(place, "complete", state[BLOCKS] + 1))
+                singly.append(AgentAction(place, "complete", state[BLOCKS] + 1))
         for bit, fault in enumerate(FAULTS):
             if state[LEFT] >> bit & 1:
-                singly += [Action(place, fault) for place in alive]
+                singly += [AgentAction(place, fault) for place in alive]
         yield from ((action,) for action in singly if self._may_coincide(state, (action,)))
         if self.captor is not None:
             yield from self._of_the_captor(self.captor, state)
@@ -190,16 +195,16 @@ class Swarm:
         """
         assert self.bounds.captured is not None, "it has somebody's keys"
         if state[LEFT] >> ONCE.index("captured") & 1:
-            yield (Action(self.bounds.captured - 1, "captured"),)
+            yield (AgentAction(self.bounds.captured - 1, "captured"),)
         elif _lies(state):
             yield from captor.lies(state[AGENTS:])
 
-    def _may_coincide(self, state: State, actions: Sequence[Action]) -> bool:
+    def _may_coincide(self, state: State, actions: Sequence[AgentAction]) -> bool:
         if self.bounds.coincidences is None:
             return True
         return self.coincidences(state, actions) <= state[LEFT] % LOSSES // COINCIDENCES
 
-    def coincidences(self, state: State, actions: Sequence[Action]) -> int:
+    def coincidences(self, state: State, actions: Sequence[AgentAction]) -> int:
         """Return how many independent events must coincide so that these actions happen next and at the same moment."""
         if self.bounds.timers_any:
             return 0
@@ -247,7 +252,7 @@ class Swarm:
                 still = left - outcome.way.lost * LOSSES
                 yield (state[BLOCKS] + instant.completed, still, there.zone, *there.agents)
 
-    def moves(self, state: State, actions: Actions, lossy: bool) -> Iterator[Move]:
+    def moves(self, state: State, actions: Actions, lossy: bool) -> Iterator[SwarmTransition]:
         """Yield the transitions that these simultaneous actions can cause."""
         instant = self._instant(state[AGENTS:], actions, self._most_lost(state, lossy), tell=True)
         if self._can_be(state, instant):
@@ -256,7 +261,7 @@ class Swarm:
             for outcome, there in zip(instant.outcomes, ordered, strict=True):
                 still = left - outcome.way.lost * LOSSES
                 after = (state[BLOCKS] + instant.completed, still, there.zone, *there.agents)
-                yield Move(actions, after, there.places, outcome.way.wave, outcome.started, there.blocks)
+                yield SwarmTransition(actions, after, there.places, outcome.way.wave, outcome.started, there.blocks)
 
     def _most_lost(self, state: State, lossy: bool) -> int:
         """Return the maximum number of messages that may be lost at one moment."""
@@ -272,7 +277,7 @@ class Swarm:
             return True
         return self.zones.after(state[ZONE], instant.ended, ()) is not None
 
-    def _ordered(self, state: State, instant: _Instant, left: int) -> Iterator[Ordered]:
+    def _ordered(self, state: State, instant: _Instant, left: int) -> Iterator[OrderedAgents]:
         completed = state[BLOCKS] + instant.completed
         only_timers = self.bounds.reduced and completed >= self.bounds.blocks and not left % COINCIDENCES
         for outcome in instant.outcomes:
@@ -282,11 +287,11 @@ class Swarm:
                 assert after is not None, "these timers can end at once"
                 zone = self.zones.adrift(after) if only_timers else after
             if self._order is None:
-                yield Ordered(outcome.agents, zone, self._as_they_are)
+                yield OrderedAgents(outcome.agents, zone, self._as_they_are)
             else:
                 yield self._order.of(outcome.agents, zone)
 
-    def _left(self, state: State, actions: Sequence[Action], instant: _Instant) -> int:
+    def _left(self, state: State, actions: Sequence[AgentAction], instant: _Instant) -> int:
         """Return the number of faults that may still occur after these actions."""
         left = (state[LEFT] & instant.left) - instant.lies * LIES
         if self.bounds.coincidences:
@@ -310,7 +315,7 @@ class Swarm:
             ),
         )
 
-    def _running_after(self, at: dict[tuple[int, int], int], there: Agents) -> tuple[int, ...]:
+    def _running_after(self, at: dict[tuple[int, int], int], there: AgentStates) -> tuple[int, ...]:
         """Return, for each timer that runs after a step, its number before the step.
 
         For a timer that was just started, return -1 minus its duration.
@@ -327,7 +332,7 @@ class Swarm:
                     running.append(at.get((place, timer)) or -self.local.durations_us[timer] - 1)
         return tuple(running)
 
-    def _ended(self, locals_: tuple[int, ...], actions: Sequence[Action]) -> tuple[int, ...]:
+    def _ended(self, locals_: tuple[int, ...], actions: Sequence[AgentAction]) -> tuple[int, ...]:
         """Return the numbers of the expired timers in the list of the swarm's timers, counted from 1."""
         ended = [(action.place, action.number) for action in actions if action.what == "timer"]
         running = self._running(locals_)
@@ -344,7 +349,7 @@ class Swarm:
         """Return the ID by which the agent at position `place` knows the agent at position `other`."""
         return self._instants.name_of(other, place)
 
-    def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
+    def order_matters(self, local: int, place: int, wave: MessageRound, heard: Sequence[int]) -> bool:
         """Return true if the state of the agent at `place` depends on the order of the messages that it receives in
         this round.
         """

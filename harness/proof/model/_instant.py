@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 from harness.proof.bounds import Bounds
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
-from harness.proof.model._snapshot import Started, Step
+from harness.proof.model._snapshot import AgentStep, Started
 
 ReceivedMessages = tuple[tuple[int, int], ...]
 """The messages that reach an agent in one round: (ID of the sender for this agent, message), in the order of senders.
@@ -33,7 +33,7 @@ MOST_SEEN = 500
 """Maximum number of states that an agent can reach by one round of messages, unless it counts them without end."""
 
 
-class Action(NamedTuple):
+class AgentAction(NamedTuple):
     """An action of one agent: "timer" with the timer's number, "complete" with the block's number, or a fault.
 
     It can also be an action of the attacker: the agent is "captured", or receives a "lie", a message with this number.
@@ -46,37 +46,37 @@ class Action(NamedTuple):
     way: int = 0
 
 
-Actions = tuple[Action, ...]
+Actions = tuple[AgentAction, ...]
 """The simultaneous actions of an instant."""
 
 
-class Agents(NamedTuple):
+class AgentStates(NamedTuple):
     """The states of all agents, and the timers that each agent started in the present moment."""
 
     locals: tuple[int, ...]
     started: tuple[Started, ...]
 
 
-class Wave(NamedTuple):
+class MessageRound(NamedTuple):
     """A round of messages: the sent messages as (position of the sender, message), and the messages that each agent
     received.
 
     `heard` has, for each place, the indices of the received messages in `air`, in order.
     """
 
-    before: "Wave | None"
+    before: "MessageRound | None"
     air: tuple[tuple[int, int], ...]
     heard: tuple[tuple[int, ...], ...]
 
 
-class Way(NamedTuple):
+class FinalRound(NamedTuple):
     """The last round of messages that leads to a result.
 
     `lost` is the number of lost messages, counted for each receiver. It is 0 if losses are not counted.
     """
 
     lost: int
-    wave: Wave | None
+    wave: MessageRound | None
 
 
 _Said = tuple[tuple[int, int], ...]
@@ -90,11 +90,11 @@ number of lost messages.
 
 
 _Key = TypeVar("_Key")
-_Outcome = tuple[Step, tuple[int, ...]]
+_Outcome = tuple[AgentStep, tuple[int, ...]]
 """A step of an agent, and an order of received messages that leads to it, as indices of the messages that reach it."""
 
 
-class Instants:
+class InstantOutcomes:
     """Computes and caches the possible results of simultaneous actions."""
 
     def __init__(self, local: LocalStates, bounds: Bounds, *, every_order: bool = False) -> None:
@@ -116,7 +116,7 @@ class Instants:
         """Return the ID by which the agent at position `place` knows the agent at position `other`."""
         return self._names[place][other]
 
-    def order_matters(self, local: int, place: int, wave: Wave, heard: Sequence[int]) -> bool:
+    def order_matters(self, local: int, place: int, wave: MessageRound, heard: Sequence[int]) -> bool:
         """Return true if the state of the agent at `place` depends on the order of the messages that it receives in
         this round.
         """
@@ -124,8 +124,8 @@ class Instants:
         return len(self._outcomes_of(local, reached, lossy=False, answered=wave.before is not None)) > 1
 
     def outcomes(
-        self, locals_: tuple[int, ...], actions: Sequence[Action], most_lost: int, *, tell: bool
-    ) -> dict[Agents, Way]:
+        self, locals_: tuple[int, ...], actions: Sequence[AgentAction], most_lost: int, *, tell: bool
+    ) -> dict[AgentStates, FinalRound]:
         """Return the possible results of these actions. For each result, keep the rounds of messages with the fewest
         losses.
 
@@ -141,14 +141,14 @@ class Instants:
                 started[place] = ()
             started[place] = self._still(started[place], step)
             air += [(place, message) for message in step.sent]
-        waiting: dict[tuple[Agents, _Said], Way]
-        waiting = {(Agents(tuple(agents), tuple(started)), tuple(air)): Way(0, None)}
-        silent: dict[Agents, Way] = {}
+        waiting: dict[tuple[AgentStates, _Said], FinalRound]
+        waiting = {(AgentStates(tuple(agents), tuple(started)), tuple(air)): FinalRound(0, None)}
+        silent: dict[AgentStates, FinalRound] = {}
         flawed = self._local.flawed
         rounds = 0
         while waiting:
             rounds += 1
-            after: dict[tuple[Agents, _Said], Way] = {}
+            after: dict[tuple[AgentStates, _Said], FinalRound] = {}
             for (there, said), way in waiting.items():
                 if not said or not flawed.isdisjoint(there.locals):
                     _keep(silent, there, way)
@@ -156,17 +156,17 @@ class Instants:
                 for heard, answers, orders, lost in self._hear(there, said, most_lost - way.lost, rounds):
                     known = after.get((heard, answers))
                     if known is None or way.lost + lost < known.lost:
-                        wave = Wave(way.wave, said, orders) if tell else None
-                        after[heard, answers] = Way(way.lost + lost, wave)
+                        wave = MessageRound(way.wave, said, orders) if tell else None
+                        after[heard, answers] = FinalRound(way.lost + lost, wave)
             waiting = after
         if not self._bounds.settles:
             return silent
-        settled: dict[Agents, Way] = {}
+        settled: dict[AgentStates, FinalRound] = {}
         for there, way in silent.items():
-            _keep(settled, Agents(tuple(map(self._local.settled, there.locals)), there.started), way)
+            _keep(settled, AgentStates(tuple(map(self._local.settled, there.locals)), there.started), way)
         return settled
 
-    def _act(self, local: int, action: Action) -> Step:
+    def _act(self, local: int, action: AgentAction) -> AgentStep:
         if action.what == "timer":
             return self._local.end_timer(local, action.number, action.way)
         if action.what == "complete":
@@ -175,11 +175,11 @@ class Instants:
             return self._local.reboot(local)
         if action.what == "lie":
             return self._local.lie(local, action.number)
-        return Step(DEAD, (), ())
+        return AgentStep(DEAD, (), ())
 
     def _hear(
-        self, there: Agents, said: _Said, most_lost: int, rounds: int
-    ) -> Iterator[tuple[Agents, _Said, tuple[tuple[int, ...], ...], int]]:
+        self, there: AgentStates, said: _Said, most_lost: int, rounds: int
+    ) -> Iterator[tuple[AgentStates, _Said, tuple[tuple[int, ...], ...], int]]:
         answered, lossy = rounds >= ANSWERED, most_lost > 0
         if self._choices_known >= MOST_KNOWN:
             self._choices_of.clear()
@@ -191,7 +191,7 @@ class Instants:
         ]
         for chosen in _within(choices, most_lost) if lossy and self._counts_losses else product(*choices):
             locals_, started, answers, orders, lost = zip(*chosen, strict=True)
-            yield Agents(locals_, started), tuple(chain.from_iterable(answers)), orders, sum(lost)
+            yield AgentStates(locals_, started), tuple(chain.from_iterable(answers)), orders, sum(lost)
 
     def _choices(
         self, known: dict[_Agent, list[_Choice]], agent: _Agent, said: _Said, lossy: bool, answered: bool
@@ -215,7 +215,7 @@ class Instants:
         ]
         return choices
 
-    def _still(self, before: Started, step: Step) -> Started:
+    def _still(self, before: Started, step: AgentStep) -> Started:
         """Return the timers that an agent started in the present moment and that still run."""
         if not before and not step.started:
             return ()
@@ -248,7 +248,7 @@ class Instants:
                 return outcomes
             if self._bounds.reduced:
                 if answered and self._bounds.settles:
-                    settled: dict[Step, tuple[int, ...]] = {}
+                    settled: dict[AgentStep, tuple[int, ...]] = {}
                     for step, way in reversed(outcomes):
                         _keep_fullest(settled, step._replace(local=self._local.settled(step.local)), way)
                     outcomes = list(settled.items())
@@ -286,7 +286,7 @@ class Instants:
             for at, way in ways.items():
                 _keep_fullest(after, hear(at, sender, message).local, (*way, position))
             ways = after
-        return [(Step(at, (), ()), (*way, *others)) for at, way in ways.items()]
+        return [(AgentStep(at, (), ()), (*way, *others)) for at, way in ways.items()]
 
     def _in_any_order(self, local: int, heard: ReceivedMessages, lossy: bool, in_order: bool) -> Iterator[_Outcome]:
         matter = self._that_matter(local, heard)
@@ -297,8 +297,8 @@ class Instants:
             ]
             for position in matter
         }
-        begin = (Step(local, (), ()), tuple(copies if position in matter else 0 for position in range(len(heard))))
-        ways: dict[tuple[Step, tuple[int, ...]], tuple[int, ...]] = {begin: ()}
+        begin = (AgentStep(local, (), ()), tuple(copies if position in matter else 0 for position in range(len(heard))))
+        ways: dict[tuple[AgentStep, tuple[int, ...]], tuple[int, ...]] = {begin: ()}
         waiting = [begin]
         while waiting:
             node = waiting.pop()
@@ -314,13 +314,13 @@ class Instants:
                 for other in earlier[position]:
                     still[other] = 0
                 after = (
-                    Step(step.local, tuple(sorted(sent + step.sent)), self._still(started, step)),
+                    AgentStep(step.local, tuple(sorted(sent + step.sent)), self._still(started, step)),
                     tuple(still),
                 )
                 if after not in ways:
                     ways[after] = (*ways[node], position)
                     waiting.append(after)
-        outcomes: dict[Step, tuple[int, ...]] = {}
+        outcomes: dict[AgentStep, tuple[int, ...]] = {}
         for (step, left), way in ways.items():
             ends_here = lossy or step.local in self._local.flawed or all(left[position] < copies for position in matter)
             if ends_here:
@@ -351,7 +351,7 @@ class Instants:
         return sorted(matter)
 
 
-def _keep(ways: dict[Agents, Way], there: Agents, way: Way) -> None:
+def _keep(ways: dict[AgentStates, FinalRound], there: AgentStates, way: FinalRound) -> None:
     """Store this way to a result if it is the first one, or loses fewer messages than the stored one."""
     known = ways.get(there)
     if known is None or way.lost < known.lost:
@@ -378,7 +378,7 @@ def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[
     return [chosen for _, chosen in combined]
 
 
-def _is_covered(step: Step, outcomes: Sequence[_Outcome]) -> bool:
+def _is_covered(step: AgentStep, outcomes: Sequence[_Outcome]) -> bool:
     """Return true if another possible step differs only by more sent messages. The network may lose these, so the
     result is covered.
     """

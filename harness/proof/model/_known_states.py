@@ -10,7 +10,7 @@ from typing import Any
 from harness.proof.bounds import Bounds
 from harness.proof.model._block_renaming import Blocks
 from harness.proof.model._flaws import Flaw, flaw_of, is_deceived
-from harness.proof.model._snapshot import NAMES_OF_OTHERS, Parts, Snapshot, dead
+from harness.proof.model._snapshot import NAMES_OF_OTHERS, Snapshot, SnapshotParts, dead
 from ucp.state import AgentState
 
 DEAD = -1
@@ -27,7 +27,7 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownLocalState:
     """A known state of the agent with this ID.
 
     `waits` is true if the agent reconciles. `chain` has the numbers of its chain's blocks. `deceived` is true if it
@@ -61,11 +61,11 @@ class KnownStates:
         self.bounds = bounds
         self.blocks = blocks
         self.others = tuple(range(FIRST_OTHER, bounds.agents + 1))
-        self.known: list[Known] = []
+        self.known: list[KnownLocalState] = []
         self.flawed: set[int] = set()
         """The numbers of states with a flaw."""
         self._nameless = bounds.nameless
-        self._parts = Parts()
+        self._parts = SnapshotParts()
         self._numbers: dict[tuple[Any, ...], int] = {}
         self._renamed: dict[tuple[int, Names], int] = {}
 
@@ -82,7 +82,7 @@ class KnownStates:
         if number == len(self.known):
             self.blocks.learn_chain(state.chain)
             self.known.append(
-                Known(
+                KnownLocalState(
                     agent_id,
                     snapshot,
                     tuple(index for index, timer in enumerate(state.timers) if timer.deadline is not None),

@@ -12,15 +12,15 @@ from harness.proof.bounds import Bounds
 from harness.proof.model._block_renaming import Blocks, Ordinals
 from harness.proof.model._flaws import FLAWS_OF_STEPS, Flaw
 from harness.proof.model._known_states import DEAD, FIRST, FIRST_OTHER, KnownStates
-from harness.proof.model._real_agents import Agents, end_at_once, end_timer, is_heard, log
-from harness.proof.model._reference_step import Give, Reference
+from harness.proof.model._real_agents import RealAgents, end_at_once, end_timer, is_heard, log
+from harness.proof.model._reference_step import Give, ReferenceComparison
 from harness.proof.model._snapshot import (
     NOW_S,
     RUNNING_S,
-    End,
+    AgentStep,
     ReductionError,
     Snapshot,
-    Step,
+    TimerResult,
     UncoveredError,
     check_that_nothing_is_lost,
     put_back,
@@ -48,14 +48,14 @@ class LocalStates(KnownStates):
     """The known states of single agents, and the steps between them."""
 
     def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
-        self.agents = Agents(bounds)
+        self.agents = RealAgents(bounds)
         first = self.agents.by_id[FIRST].state
         super().__init__(bounds, Blocks(first.chain.inception, self.agents.made))
         self.steps = 0
         """Number of steps that the real agent has computed."""
         self._counting = {agent_id: self.agents.new(agent_id) for agent_id in self.agents.by_id}
         """Agents that repeat steps with other counts."""
-        self._reference = Reference(bounds, self.agents.new) if bounds.steps else None
+        self._reference = ReferenceComparison(bounds, self.agents.new) if bounds.steps else None
         self.timers = [timer.name for timer in first.timers]
         self.settings = settings = bounds.agent_settings()
         durations = (
@@ -73,8 +73,8 @@ class LocalStates(KnownStates):
         self._of_pattern: dict[tuple[int, Ordinals], int] = {}
         self.messages: list[Message] = []
         self._message_numbers: dict[Message, int] = {}
-        self._steps: dict[tuple[int, int, int], Step] = {}
-        self._ends: dict[tuple[int, int], list[End]] = {}
+        self._steps: dict[tuple[int, int, int], AgentStep] = {}
+        self._ends: dict[tuple[int, int], list[TimerResult]] = {}
         self._lets_be: dict[tuple[int, int, int], bool] = {}
         self._counts: dict[tuple[int, int, int], bool] = {}
         self.initial = {
@@ -83,7 +83,7 @@ class LocalStates(KnownStates):
 
     # Steps
 
-    def hear(self, local: int, sender: int, message: int) -> Step:
+    def hear(self, local: int, sender: int, message: int) -> AgentStep:
         """Return the step of an agent that receives a message. `sender` is the ID by which it knows the sender."""
         key = local, sender, message
         step = self._steps.get(key)
@@ -124,11 +124,11 @@ class LocalStates(KnownStates):
             )
         return counts
 
-    def end_timer(self, local: int, timer: int, way: int = 0) -> Step:
+    def end_timer(self, local: int, timer: int, way: int = 0) -> AgentStep:
         """Return the step of an agent whose timer expires. `way` selects one of the possible results."""
         return self.ends(local, timer)[way].step
 
-    def ends(self, local: int, timer: int) -> list[End]:
+    def ends(self, local: int, timer: int) -> list[TimerResult]:
         """Return the possible results of the expiry of a timer.
 
         There are several only if the agent compares the ages of blocks and any block may be the older one.
@@ -140,10 +140,10 @@ class LocalStates(KnownStates):
             if self.bounds.clocks_any and self.timers[timer] == "phase two":
                 candidates = self.known[local].snapshot["reconcile_response_dictionary"]
                 oldest = sorted(candidates, key=lambda candidate: candidates[candidate][1]) or oldest
-            steps: dict[Step, bytes | None] = {}
+            steps: dict[AgentStep, bytes | None] = {}
             for candidate in oldest:
                 steps.setdefault(self._computed(local, partial(end_timer, timer, candidate)), candidate)
-            ends = self._ends[key] = [End(step, candidate) for step, candidate in steps.items()]
+            ends = self._ends[key] = [TimerResult(step, candidate) for step, candidate in steps.items()]
         return ends
 
     def older(self, local: int, timer: int, way: int) -> tuple[int, frozenset[int]]:
@@ -164,7 +164,7 @@ class LocalStates(KnownStates):
         }
         return asked[oldest], frozenset(asked.values()) - {asked[oldest]}
 
-    def complete(self, local: int, ordinal: int) -> Step:
+    def complete(self, local: int, ordinal: int) -> AgentStep:
         """Return the step of an agent that completes the block with this number."""
         key = local, -2, ordinal
         step = self._steps.get(key)
@@ -172,7 +172,7 @@ class LocalStates(KnownStates):
             step = self._steps[key] = self._computed(local, lambda agent: log(agent, ordinal), completes=ordinal)
         return step
 
-    def reboot(self, local: int) -> Step:
+    def reboot(self, local: int) -> AgentStep:
         """Return the step of an agent that loses power and restarts from its disk."""
         key = local, -3, 0
         step = self._steps.get(key)
@@ -181,7 +181,7 @@ class LocalStates(KnownStates):
             step = self._steps[key] = self._computed(local, lambda agent: agent.boot(stored, NOW_S), boots=True)
         return step
 
-    def lie(self, local: int, message: int) -> Step:
+    def lie(self, local: int, message: int) -> AgentStep:
         """Return the step of an agent that receives an encrypted datagram from the attacker."""
         key = local, -4, message
         step = self._steps.get(key)
@@ -223,7 +223,7 @@ class LocalStates(KnownStates):
         """Return the agent in this state. The object is valid until the next step is computed."""
         return self._restored(local).state
 
-    def inputs(self) -> Iterator[tuple[int, Message | str | None, Step]]:
+    def inputs(self) -> Iterator[tuple[int, Message | str | None, AgentStep]]:
         """Yield each known state with each input that was tried in it, and the resulting step.
 
         The input is a received message, the name of an expired timer, or None for a completed block.
@@ -248,7 +248,7 @@ class LocalStates(KnownStates):
         completes: int | None = None,
         flaw: Flaw | None = None,
         to_reference: Give | None = None,
-    ) -> Step:
+    ) -> AgentStep:
         """Compute a step of the agent. `to_reference` gives the same input to the reference, in decrypted form."""
         self.steps += 1
         before = self.known[local]
@@ -287,13 +287,13 @@ class LocalStates(KnownStates):
             self._check_counts(before.agent_id, before.snapshot, give, after, sent)
         if flaw is None and all(after[name] is part for name, part in before.snapshot.items()):
             self.agents.leave_in(before.agent_id, after)
-            return Step(local, sent, started)
+            return AgentStep(local, sent, started)
         if self.bounds.reduced:
             if hears and any(self.timers[timer] == "voting" for timer, _ in started):
                 raise ReductionError("an agent starts a vote because of a message: try again with --whole")
             check_that_nothing_is_lost(before.snapshot, agent.state)
         local = self._intern(before.agent_id, agent, after, before.snapshot, flaw, keep=not boots)
-        return Step(local, sent, started)
+        return AgentStep(local, sent, started)
 
     def _check_counts(
         self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, sent: tuple[int, ...]

@@ -23,7 +23,7 @@ AT_ONCE_S = 0.05
 MOST_AT_ONCE = 100
 
 
-class Agents:
+class RealAgents:
     """One real agent for each ID. If a vehicle is captured, they are agents that check signatures.
 
     If agents are `nameless`, each has its own settings, and the ID of the first agent.

@@ -33,7 +33,7 @@ class _Run(NamedTuple):
     left: tuple[Any, ...]
 
 
-class Reference:
+class ReferenceComparison:
     """The reference implementation, as the counterpart of each agent within the bounds."""
 
     def __init__(self, bounds: Bounds, make: Make) -> None:

@@ -31,7 +31,7 @@ ON_TOP = "on top"
 """The chain hash of the agent's chain with the message's block on top."""
 
 
-class Held:
+class HeldBlockOrder:
     """The chain of an agent and all blocks that it holds, in order. The object is immutable."""
 
     __slots__ = ("_blocks", "_heights", "_numbers", "_ordinals", "_shape", "_top")
@@ -107,7 +107,7 @@ class Held:
         return self.between(value)
 
 
-def shape_of(state: AgentState | State, held: Held) -> Shape:
+def shape_of(state: AgentState | State, held: HeldBlockOrder) -> Shape:
     """Return the shape of a state, apart from the held blocks. Together with the shape of `held`, it identifies the
     state.
     """

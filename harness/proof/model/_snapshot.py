@@ -239,7 +239,7 @@ Started = tuple[tuple[int, int], ...]
 """The running timers that an agent has started in this instant: (number, duration in microseconds)."""
 
 
-class Step(NamedTuple):
+class AgentStep(NamedTuple):
     """The result of an input to an agent: the new state, the sent messages, and the started timers."""
 
     local: int
@@ -247,12 +247,12 @@ class Step(NamedTuple):
     started: Started
 
 
-class End(NamedTuple):
+class TimerResult(NamedTuple):
     """A possible result of the expiry of a timer. `oldest` is the phase 2 candidate that must be the oldest for this
     result.
     """
 
-    step: Step
+    step: AgentStep
     oldest: bytes | None
 
 
@@ -260,7 +260,7 @@ NAMES_OF_OTHERS = ("voters", "reconcile_responders")
 """Parts of the state that are sets of other agents."""
 
 
-class Parts:
+class SnapshotParts:
     """A store of the parts of all known states, in which equal parts exist once."""
 
     def __init__(self) -> None:

@@ -7,7 +7,7 @@ docs/explanation/proof.md.
 from collections.abc import Callable, Sequence
 
 from harness.proof.model._known_states import DEAD, KnownStates
-from harness.proof.model._snapshot import NAMES_OF_OTHERS, End, ReductionError, Snapshot, Step
+from harness.proof.model._snapshot import NAMES_OF_OTHERS, AgentStep, ReductionError, Snapshot, TimerResult
 from ucp.reconcile import most_named
 
 TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))
@@ -25,7 +25,7 @@ class Tallies:
         self,
         states: KnownStates,
         timers: Sequence[str],
-        ends: Callable[[int, int], Sequence[End]],
+        ends: Callable[[int, int], Sequence[TimerResult]],
         *,
         every_count: bool,
     ) -> None:
@@ -84,7 +84,7 @@ class Tallies:
         yes, no = next(tally for tally, as_clear in clear.items() if as_clear == ends)
         return {"reconcile_vote_count": {"yes": yes, "no": no}, "reconcile_responders": {*self._states.others}}
 
-    def _ends_with(self, local: int, yes: int, no: int) -> Sequence[End]:
+    def _ends_with(self, local: int, yes: int, no: int) -> Sequence[TimerResult]:
         """Return the possible results of phase 1 if it ends with these numbers of votes."""
         counted = self._states.with_tallies(local, {"reconcile_vote_count": {"yes": yes, "no": no}})
         return self._ends(counted, self._phase_one)
@@ -113,5 +113,5 @@ class Tallies:
         ):
             raise ReductionError("an agent uses a tally in an unknown way: try again with --whole")
 
-    def _settled_ends(self, local: int, timer: int) -> set[Step]:
+    def _settled_ends(self, local: int, timer: int) -> set[AgentStep]:
         return {end.step._replace(local=self.settled(end.step.local)) for end in self._ends(local, timer)}

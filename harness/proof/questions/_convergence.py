@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from harness.proof.graph._expansion import cycles_left_alone
-from harness.proof.graph._exploration import Graph
+from harness.proof.graph._exploration import StateGraph
 from harness.proof.graph._workers import Workers
 from harness.proof.questions._attractor import Attractor, Check
 from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
@@ -22,7 +22,7 @@ It raises GivenUpError when the limit of memory or time is reached.
 
 
 @dataclass
-class Liveness:
+class ConvergenceResult:
     """The result of the search: endless cycles, and states without a way to one common chain.
 
     - `forks`: number of idle states with several chains. `fork` is the nearest of them.
@@ -44,11 +44,11 @@ class Liveness:
 
 
 @cycles_left_alone()
-def look(graph: Graph, watch: Watch = lambda asked: None, workers: Workers | None = None) -> Liveness:
+def look(graph: StateGraph, watch: Watch = lambda asked: None, workers: Workers | None = None) -> ConvergenceResult:
     """Search a complete state graph for both problems. `workers` compute the votes that diverged idle states need."""
     idle_states = dict(_idle_states(graph, partial(watch, "idle states")))
     forks = [number for number, chains in idle_states.items() if chains > 1]
-    result = Liveness(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "cycles")))
+    result = ConvergenceResult(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "cycles")))
     safe = Attractor(graph.quiet, graph.swarm.bounds.timers_any, partial(watch, "paths to one chain"))
     safe.add(number for number, chains in idle_states.items() if chains <= 1)
     result.astray.append(safe.left)
@@ -70,7 +70,7 @@ def look(graph: Graph, watch: Watch = lambda asked: None, workers: Workers | Non
     return result
 
 
-def _idle_states(graph: Graph, check: Check) -> Iterator[tuple[int, int]]:
+def _idle_states(graph: StateGraph, check: Check) -> Iterator[tuple[int, int]]:
     """Yield each idle state with its number of different chains."""
     for number, by_timer in enumerate(graph.quiet):
         check()
@@ -79,7 +79,7 @@ def _idle_states(graph: Graph, check: Check) -> Iterator[tuple[int, int]]:
             yield number, len(graph.swarm.chains(state))
 
 
-def _needed(graph: Graph, forks: Sequence[int], watch: Watch, workers: Workers | None) -> dict[int, int | None]:
+def _needed(graph: StateGraph, forks: Sequence[int], watch: Watch, workers: Workers | None) -> dict[int, int | None]:
     """Return the number of further votes that each state needs, or None if one vote per agent is not enough."""
     needed: dict[int, int | None] = {}
 

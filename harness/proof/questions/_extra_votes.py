@@ -8,8 +8,8 @@ from collections import Counter
 from collections.abc import Iterator
 
 from harness.proof.graph._expansion import quiet
-from harness.proof.model._global_states import AGENTS, BLOCKS, State, Swarm
-from harness.proof.model._instant import Action
+from harness.proof.model._global_states import AGENTS, BLOCKS, ModelSwarm, State
+from harness.proof.model._instant import AgentAction
 from harness.proof.model._known_states import DEAD
 from harness.proof.questions._attractor import Attractor, ByTimer, Check
 
@@ -31,7 +31,7 @@ class UndecidedError(Exception):
 class ExtraVotes:
     """The number of further votes that idle states and their successors need until all chains are equal."""
 
-    def __init__(self, swarm: Swarm, check: Check = lambda: None) -> None:
+    def __init__(self, swarm: ModelSwarm, check: Check = lambda: None) -> None:
         self._swarm = swarm
         self._check = check
         self._enough: dict[State, int] = {}
@@ -66,7 +66,7 @@ class ExtraVotes:
         }
         chains = Counter(known[local].chain for local in locals_ if local != DEAD)
         for place in sorted(alike.values(), key=lambda place: chains[known[locals_[place]].chain]):
-            yield from self._swarm.after(fork, (Action(place, "complete", fork[BLOCKS] + 1),), lossy=False)
+            yield from self._swarm.after(fork, (AgentAction(place, "complete", fork[BLOCKS] + 1),), lossy=False)
 
     def _leads(self, state: State, votes: int, instants: int) -> bool:
         """Return true if the swarm can become idle with equal chains from this state, whichever timer expires next."""

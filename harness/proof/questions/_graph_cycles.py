@@ -3,17 +3,17 @@
 from array import array
 from collections.abc import Iterator
 
-from harness.proof.graph._exploration import Graph
+from harness.proof.graph._exploration import StateGraph
 from harness.proof.questions._attractor import Check
 
 
-def cycles(graph: Graph, check: Check = lambda: None) -> list[list[int]]:
+def cycles(graph: StateGraph, check: Check = lambda: None) -> list[list[int]]:
     """Return a shortest cycle of each strongly connected component. The component nearest to the start is first."""
     parts = [part for part in _parts(graph, check) if len(part) > 1 or part[0] in _after(graph, part[0])]
     return [_shortest_cycle(graph, min(part), set(part)) for part in sorted(parts, key=min)]
 
 
-def _after(graph: Graph, number: int) -> set[int]:
+def _after(graph: StateGraph, number: int) -> set[int]:
     """Return the successors of a state. If the graph is incomplete, return only the explored ones."""
     following = {state for after in graph.quiet[number] for state in after} | {*graph.crossing.get(number, ())}
     if graph.ended == "complete":
@@ -21,7 +21,7 @@ def _after(graph: Graph, number: int) -> set[int]:
     return {state for state in following if state < len(graph.quiet)}
 
 
-def _shortest_cycle(graph: Graph, start: int, part: set[int]) -> list[int]:
+def _shortest_cycle(graph: StateGraph, start: int, part: set[int]) -> list[int]:
     came_from: dict[int, int] = {}
     layer = [start]
     while layer:
@@ -40,7 +40,7 @@ def _shortest_cycle(graph: Graph, start: int, part: set[int]) -> list[int]:
     raise AssertionError("a part has a way round")
 
 
-def _after_a_cycle(graph: Graph, check: Check) -> list[int]:
+def _after_a_cycle(graph: StateGraph, check: Check) -> list[int]:
     """Return all states that lie on a cycle or can be reached from one.
 
     States without a predecessor among the remaining states are removed until none is left to remove.
@@ -60,7 +60,7 @@ def _after_a_cycle(graph: Graph, check: Check) -> list[int]:
     return [number for number, ways in enumerate(ways_in) if ways]
 
 
-def _parts(graph: Graph, check: Check) -> Iterator[list[int]]:
+def _parts(graph: StateGraph, check: Check) -> Iterator[list[int]]:
     """Yield the strongly connected components (Tarjan's algorithm, without recursion). Most components with a single
     state are left out.
     """

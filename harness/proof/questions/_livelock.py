@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from harness.archive.run_record import Cycle
-from harness.proof.examples._example import Example, Played, keep, play
-from harness.proof.examples._path_script import NO_CLOCKS, Completion, Document, Script
-from harness.proof.graph._exploration import Graph
+from harness.proof.examples._example import Example, PlayedExample, keep, play
+from harness.proof.examples._path_script import NO_CLOCKS, CompletionInterval, Document, PathScript
+from harness.proof.graph._exploration import StateGraph
 from harness.proof.model._global_states import AGENTS
 from harness.proof.model._known_states import DEAD
 
@@ -41,7 +41,7 @@ class Livelock:
 
     ways: int
     coincidences: int | None
-    completions: tuple[Completion, ...]
+    completions: tuple[CompletionInterval, ...]
     example: Example
     losses: int
     cycle: Cycle | None
@@ -77,7 +77,7 @@ class Livelock:
         return f"on this path {moments} equal by chance, to within the transit time of a message"
 
 
-def forms(graph: Graph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
+def forms(graph: StateGraph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
     """Return the cycles grouped by form. The form nearest to the initial state is first."""
     alike: dict[_Form, list[list[int]]] = defaultdict(list)
     for cycle in cycles:
@@ -85,7 +85,7 @@ def forms(graph: Graph, cycles: Sequence[list[int]]) -> list[list[list[int]]]:
     return list(alike.values())
 
 
-def _form(graph: Graph, cycle: Sequence[int]) -> _Form:
+def _form(graph: StateGraph, cycle: Sequence[int]) -> _Form:
     """Return the form of a cycle. It is the same for any choice of the cycle's first state."""
     known = graph.swarm.local.known
     looks = [
@@ -99,7 +99,7 @@ def _form(graph: Graph, cycle: Sequence[int]) -> _Form:
     return min(tuple(looks[first:] + looks[:first]) for first in range(len(looks)))
 
 
-def in_timers(graph: Graph, cycles: Sequence[list[int]]) -> list[str]:
+def in_timers(graph: StateGraph, cycles: Sequence[list[int]]) -> list[str]:
     """Return the forms of the cycles as text: for each state of the cycle, the timers of each agent."""
     names = graph.swarm.local.timers
 
@@ -117,11 +117,11 @@ class _CycleExample(NamedTuple):
 
     begin: list[int]
     cycle: list[int]
-    script: Script
+    script: PathScript
     document: Document
 
 
-def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> Iterator[Livelock]:
+def show(graph: StateGraph, cycles: Sequence[list[int]], path: Path, name: str) -> Iterator[Livelock]:
     """Write an example of each form to `path` and to files next to it, and yield the livelocks."""
     by_form = [(len(alike), _nearest(graph, alike)) for alike in forms(graph, cycles)]
     by_form.sort(key=lambda form: form[1][0].script.contradictory)
@@ -130,7 +130,7 @@ def show(graph: Graph, cycles: Sequence[list[int]], path: Path, name: str) -> It
         yield _livelock_of(graph, ways, rounds, file, name if number == 1 else f"{name} {number}")
 
 
-def _nearest(graph: Graph, alike: Sequence[list[int]]) -> list[_CycleExample]:
+def _nearest(graph: StateGraph, alike: Sequence[list[int]]) -> list[_CycleExample]:
     """Return some cycles of one form. The best example is first.
 
     Cycles that real clocks allow come first, then those with the fewest coincidences, then those with the fewest blocks
@@ -139,7 +139,7 @@ def _nearest(graph: Graph, alike: Sequence[list[int]]) -> list[_CycleExample]:
     tried: list[tuple[bool, int, int, _CycleExample]] = []
     for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MAX_PLAYED]:
         begin = graph.path(cycle[0])
-        script = Script(graph, [*begin, *cycle[1:], cycle[0]])
+        script = PathScript(graph, [*begin, *cycle[1:], cycle[0]])
         document = script.document("")
         any_time = graph.swarm.bounds.timers_any
         bound = 0 if any_time else sum(each.earliest_s == each.latest_s for each in script.completions())
@@ -147,12 +147,12 @@ def _nearest(graph: Graph, alike: Sequence[list[int]]) -> list[_CycleExample]:
     return [each for *_, each in sorted(tried, key=lambda one: one[:3])]
 
 
-def _livelock_of(graph: Graph, ways: int, rounds: Sequence[_CycleExample], path: Path, name: str) -> Livelock:
+def _livelock_of(graph: StateGraph, ways: int, rounds: Sequence[_CycleExample], path: Path, name: str) -> Livelock:
     """Return the first cycle that the simulation confirms, as a livelock. If the simulation confirms none, return the
     first one.
     """
     bounds = graph.swarm.bounds
-    chosen: tuple[_CycleExample, Played] | None = None
+    chosen: tuple[_CycleExample, PlayedExample] | None = None
     for each in rounds:
         played = play({**each.document, "name": name})
         goes_round = "liveness" in played.judged
@@ -162,7 +162,7 @@ def _livelock_of(graph: Graph, ways: int, rounds: Sequence[_CycleExample], path:
             break
     assert chosen is not None, "there is a cycle"
     (begin, cycle, script, _), played = chosen
-    several = Script(graph, [*begin, *(cycle[1:] + cycle[:1]) * ROUNDS])
+    several = PathScript(graph, [*begin, *(cycle[1:] + cycle[:1]) * ROUNDS])
     completions = () if bounds.timers_any else tuple(several.completions())
     sentence = f"The swarm can repeat a cycle for ever: {len(begin) - 1} instants after the beginning."
     said = [sentence, *([f"It does {NO_CLOCKS}."] if script.contradictory else [])]

@@ -7,7 +7,23 @@ which `_spec_states` writes in one form. `_validate` checks recorded runs agains
 `_recorded_lives` writes.
 """
 
-from harness.proof.specification._second_opinion import Opinion, second_opinion
-from harness.proof.specification._validate import Recorded, Rejected, Validation, recorded, simulated, validate
+from harness.proof.specification._second_opinion import SecondOpinion, second_opinion
+from harness.proof.specification._validate import (
+    RejectedStep,
+    RunTraces,
+    TraceValidation,
+    recorded,
+    simulated,
+    validate,
+)
 
-__all__ = ["Opinion", "Recorded", "Rejected", "Validation", "recorded", "second_opinion", "simulated", "validate"]
+__all__ = [
+    "RejectedStep",
+    "RunTraces",
+    "SecondOpinion",
+    "TraceValidation",
+    "recorded",
+    "second_opinion",
+    "simulated",
+    "validate",
+]

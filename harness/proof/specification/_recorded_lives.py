@@ -57,7 +57,7 @@ class UnreadableError(Exception):
     """An error: a trace line cannot be compared with the specification. The message is one sentence."""
 
 
-class Stamp(int):
+class EncodedTimestamp(int):
     """A timestamp. The encoder later replaces it by its position among all timestamps."""
 
 
@@ -66,7 +66,7 @@ Item = Any
 
 
 @dataclass
-class Life:
+class EncodedIncarnation:
     """The encoded steps of an agent between two restarts. `lines` contains the trace line of each step.
 
     `whole` is true if no steps are missing at the end. `unread` is the reason why later lines could not be encoded, or
@@ -82,7 +82,7 @@ class Life:
     unread: str | None = None
 
 
-class Chains:
+class ChainNumbers:
     """Numbers for chains: one for the inception block, and one for each chain that extends a numbered chain by a
     block.
     """
@@ -103,7 +103,7 @@ class Chains:
         return known[block_hash]
 
 
-def lives(trace: Trace, header: CheckedHeader, chains: Chains, *, ended: bool) -> Iterator[Life]:
+def lives(trace: Trace, header: CheckedHeader, chains: ChainNumbers, *, ended: bool) -> Iterator[EncodedIncarnation]:
     """Yield the encoded steps between any two restarts of an agent, up to the first line that cannot be encoded.
 
     `ended` is true if the agent reached the end of its mission, so that its last steps are recorded.
@@ -112,10 +112,12 @@ def lives(trace: Trace, header: CheckedHeader, chains: Chains, *, ended: bool) -
     count = len(trace.starts) + 1
     for number, runs in enumerate(trace.incarnations(), 1):
         is_last = number == count
-        life = Life(header.agent_id, number, whole=ended and is_last and not trace.cut_off and trace.problem is None)
+        life = EncodedIncarnation(
+            header.agent_id, number, whole=ended and is_last and not trace.cut_off and trace.problem is None
+        )
         if is_last:
             life.unread = trace.problem
-        writer = _Writer(header, parts, chains)
+        writer = _IncarnationEncoder(header, parts, chains)
         for line, run in runs:
             try:
                 life.steps.append(writer.step(run))
@@ -127,10 +129,10 @@ def lives(trace: Trace, header: CheckedHeader, chains: Chains, *, ended: bool) -
         yield life
 
 
-class _Writer:
+class _IncarnationEncoder:
     """Encodes the steps of one agent between two restarts."""
 
-    def __init__(self, header: CheckedHeader, parts: OptionalParts, chains: Chains) -> None:
+    def __init__(self, header: CheckedHeader, parts: OptionalParts, chains: ChainNumbers) -> None:
         self._header = header
         self._parts = parts
         self._chains = chains
@@ -275,7 +277,7 @@ class _Writer:
             return code, chain_number, int(message.contained)
         if isinstance(message, NextInSequenceResponse):
             successor = TOP_OF_CHAIN if message.block_hash is None else message.block_hash
-            return code, chain_number, successor, Stamp(message.timestamp_us)
+            return code, chain_number, successor, EncodedTimestamp(message.timestamp_us)
         return code, chain_number
 
     def _sent(self, sent: SentMessage) -> Item:
@@ -306,14 +308,14 @@ class _Writer:
                 return kind, int(tally.get("yes", 0)), int(tally.get("no", 0))
             items: list[Item] = [CANDIDATES]
             for name, (count, timestamp_us) in tally.items():
-                items += (_digest(name) if name else TOP_OF_CHAIN, count, Stamp(timestamp_us))
+                items += (_digest(name) if name else TOP_OF_CHAIN, count, EncodedTimestamp(timestamp_us))
             return tuple(items)
         except (TypeError, ValueError):
             return NO_TALLY
 
 
 def _block(block: Block) -> tuple[Item, ...]:
-    return block.block_hash, Stamp(block.timestamp_us), block.agent_id
+    return block.block_hash, EncodedTimestamp(block.timestamp_us), block.agent_id
 
 
 def _digest(text: str) -> bytes:
@@ -321,14 +323,14 @@ def _digest(text: str) -> bytes:
     return bytes.fromhex(text)
 
 
-def module(records: Sequence[Life], chains: Chains) -> str:
+def module(records: Sequence[EncodedIncarnation], chains: ChainNumbers) -> str:
     """Return the text of the TLA+ module Lives with these encoded steps."""
     items: list[Item] = [life.steps for life in records]
     hashes, stamps = set[bytes](), set[int]()
     for step in _leaves(items):
         if isinstance(step, bytes):
             hashes.add(step)
-        elif isinstance(step, Stamp):
+        elif isinstance(step, EncodedTimestamp):
             stamps.add(int(step))
     for known in chains.successors.values():
         hashes |= known.keys()
@@ -340,7 +342,7 @@ def module(records: Sequence[Life], chains: Chains) -> str:
             return f"<<{','.join(map(text, item))}>>"
         if isinstance(item, bytes):
             return str(place_of[item])
-        if isinstance(item, Stamp):
+        if isinstance(item, EncodedTimestamp):
             return str(rank_of[int(item)])
         return str(item if -LARGEST <= item <= LARGEST else IMPOSSIBLE)
 

@@ -10,7 +10,7 @@ from harness.proof._progress_bar import Ended, Progress
 from harness.proof._proof import Limits
 from harness.proof.bounds import Bounds, BoundsError
 from harness.proof.graph._exploration import explore
-from harness.proof.model._global_states import Swarm
+from harness.proof.model._global_states import ModelSwarm
 from harness.proof.questions import _convergence
 from harness.proof.specification import _spec_states as states
 from harness.proof.specification._spec_states import TIMERS, readings, unspecified
@@ -25,7 +25,7 @@ INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4":
 
 
 @dataclass(frozen=True)
-class Opinion:
+class SecondOpinion:
     """The results of both explorations. `states` and `specified` are None if one of them is incomplete.
 
     States that differ only in remaining timer durations count as one. `specified` therefore is at most the number of
@@ -125,27 +125,27 @@ def _word(kind: str | None) -> str:
 
 def second_opinion(
     bounds: Bounds, limits: Limits | None = None, *, watch: Callable[[Progress], None] = lambda progress: None
-) -> Opinion:
+) -> SecondOpinion:
     """Explore the bounds in both ways, and return the results. Raises BoundsError for bounds that the specification
     does not support, and NoCheckerError without TLC.
     """
     bounds, limits = replace(bounds, reduced=False), limits or Limits()
     config = _config(bounds)
     command()
-    graph = explore(Swarm(bounds), most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
+    graph = explore(ModelSwarm(bounds), most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
     flaw = None if graph.flaw is None else graph.flaw.kind
     if graph.ended not in ("complete", "flaw"):
-        return Opinion(bounds, graph.ended, flaw, None)
+        return SecondOpinion(bounds, graph.ended, flaw, None)
     most_s = None if limits.most_s == float("inf") else limits.most_s
     memory_mb = int(limits.most_bytes / MEGABYTE)
     try:
         with checked("Swarm", config, dump=True, memory_mb=memory_mb, most_s=most_s) as said:
             violated = said.violated and INVARIANTS[said.violated]
             if flaw or violated:
-                return Opinion(bounds, "flaw", flaw, violated)
+                return SecondOpinion(bounds, "flaw", flaw, violated)
             lossless = bounds.network == "lossless"
             real, specified = set(states.real(graph)), set(states.specified(said.states))
-            return Opinion(
+            return SecondOpinion(
                 bounds,
                 "complete",
                 None,
@@ -159,7 +159,7 @@ def second_opinion(
                 states.goes_round(said.states) if lossless else None,
             )
     except TimeoutError:
-        return Opinion(bounds, "time", flaw, None)
+        return SecondOpinion(bounds, "time", flaw, None)
 
 
 def _config(bounds: Bounds) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from harness.proof.graph._exploration import Graph
+from harness.proof.graph._exploration import StateGraph
 from harness.proof.model._global_states import AGENTS
 from harness.proof.model._local_steps import LocalStates
 from harness.proof.specification._tlc import MODULES
@@ -97,7 +97,7 @@ def _of_record(agent: dict[str, Any]) -> Plain:
     )
 
 
-def real(graph: Graph) -> Iterator[Plain]:
+def real(graph: StateGraph) -> Iterator[Plain]:
     """Yield all states that `harness.proof` found, without the remaining times of their timers."""
     translator = _Translator(graph.swarm.local)
     for state in graph.states:

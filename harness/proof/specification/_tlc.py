@@ -37,7 +37,7 @@ class CheckerError(MachineError):
 
 
 @dataclass(frozen=True)
-class Checked:
+class TlcResult:
     """The result of TLC. If `violated` names an invariant, the search is incomplete. `told` is the complete printed
     output.
 
@@ -71,7 +71,7 @@ def checked(
     dump: bool = False,
     memory_mb: int = 1024,
     most_s: float | None = None,
-) -> Iterator[Checked]:
+) -> Iterator[TlcResult]:
     """Check a module of ucp/contract/spec with TLC, and yield the result. Its files exist until the context ends.
 
     `others` contains the text of further modules by name. SIGTERM and Ctrl-C remove all files.
@@ -102,7 +102,7 @@ def checked(
         yield _read(done.stdout, folder / "all.dot")
 
 
-def _read(told: str, states: Path) -> Checked:
+def _read(told: str, states: Path) -> TlcResult:
     counts, violated = _COUNTS.findall(told), _VIOLATED.search(told)
     over = counts and counts[-1][2] == "0"
     if not counts or not (violated or over):
@@ -110,7 +110,7 @@ def _read(told: str, states: Path) -> Checked:
         why = " ".join((error[0] if error else told[-MOST_SHOWN:]).split())
         raise CheckerError(f"TLC stopped before the end: {why[:MOST_SHOWN]}")
     generated, distinct, _ = map(int, counts[-1])
-    return Checked(generated, distinct, violated and violated[1], told, states)
+    return TlcResult(generated, distinct, violated and violated[1], told, states)
 
 
 def in_tla(value: object) -> str:

@@ -13,7 +13,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.traces import Trace, read_trace, why_not_a_trace
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import INTERRUPTED, VIOLATED, WRONG_REQUEST
-from harness.proof.specification._recorded_lives import Chains, Life, lives, module
+from harness.proof.specification._recorded_lives import ChainNumbers, EncodedIncarnation, lives, module
 from harness.proof.specification._spec_states import readings, unspecified
 from harness.proof.specification._tlc import CheckerError, command, in_tla
 from harness.proof.specification._tlc import checked as looked_at
@@ -35,7 +35,7 @@ _WHAT = re.compile(r'"([^"]*)"')
 
 
 @dataclass(frozen=True)
-class Rejected:
+class RejectedStep:
     """The first step of an agent that the specification does not allow. `what` lists the parts that differ."""
 
     run: str
@@ -55,7 +55,7 @@ class Rejected:
 
 
 @dataclass
-class Validation:
+class TraceValidation:
     """The result of a validation: numbers of runs and steps, rejected steps, and reasons why records could not be
     checked.
 
@@ -65,7 +65,7 @@ class Validation:
     runs: int = 0
     lives: int = 0
     steps: int = 0
-    rejected: list[Rejected] = field(default_factory=list)
+    rejected: list[RejectedStep] = field(default_factory=list)
     unread: list[str] = field(default_factory=list)
     interrupted: bool = False
 
@@ -98,14 +98,14 @@ class Validation:
 class _Batch:
     """Encoded steps of several agents that TLC checks at once, with the name of the run of each."""
 
-    chains: Chains = field(default_factory=Chains)
-    lives: list[Life] = field(default_factory=list)
+    chains: ChainNumbers = field(default_factory=ChainNumbers)
+    lives: list[EncodedIncarnation] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
     steps: int = 0
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RunTraces:
     """A recorded run: its name, its traces, the agents that reached the end of the mission, and problems with its
     files.
     """
@@ -116,34 +116,36 @@ class Recorded:
     problems: Sequence[str] = ()
 
 
-def recorded(paths: Iterable[Path]) -> Iterator[Recorded]:
+def recorded(paths: Iterable[Path]) -> Iterator[RunTraces]:
     """Yield the run of each path, which is a run directory, a directory with agents' files, or a trace. Raises
     RunDirectoryError for other paths.
     """
     for path in paths:
         if path.is_file():
             trace = read_trace(path)
-            yield Recorded(str(path), [trace] if trace else [], problems=[] if trace else [why_not_a_trace(path)])
+            yield RunTraces(str(path), [trace] if trace else [], problems=[] if trace else [why_not_a_trace(path)])
             continue
         archive = RunArchive(path)
         traces = archive.traces
         missing = sorted(set(archive.roster) - set(traces)) if traces else []
         problems = [*archive.problems, *(f"the trace of agent {agent_id} is missing" for agent_id in missing)]
         problems += [] if traces else ["no traces found"]
-        yield Recorded(str(path), list(traces.values()), archive.exports.by_agent.keys(), problems)
+        yield RunTraces(str(path), list(traces.values()), archive.exports.by_agent.keys(), problems)
 
 
-def simulated(scenario: Scenario, seeds: Iterable[int]) -> Iterator[Recorded]:
+def simulated(scenario: Scenario, seeds: Iterable[int]) -> Iterator[RunTraces]:
     """Yield a simulated run of the scenario for each seed. Raises HarnessError."""
     for seed in seeds:
         evidence = simulate(scenario, seed, tracing=True).evidence
-        yield Recorded(f"seed {seed}", list(evidence.traces.values()), evidence.exports.keys())
+        yield RunTraces(f"seed {seed}", list(evidence.traces.values()), evidence.exports.keys())
 
 
-def validate(runs: Iterable[Recorded], *, watch: Callable[[Validation], None] = lambda validation: None) -> Validation:
+def validate(
+    runs: Iterable[RunTraces], *, watch: Callable[[TraceValidation], None] = lambda validation: None
+) -> TraceValidation:
     """Check all runs against the specification. Raises NoCheckerError without TLC."""
     command()
-    validation = Validation()
+    validation = TraceValidation()
     try:
         for constants, batch in _batches(runs, validation):
             _look(constants, batch, validation)
@@ -153,7 +155,7 @@ def validate(runs: Iterable[Recorded], *, watch: Callable[[Validation], None] = 
     return validation
 
 
-def _batches(runs: Iterable[Recorded], validation: Validation) -> Iterator[tuple[Constants, _Batch]]:
+def _batches(runs: Iterable[RunTraces], validation: TraceValidation) -> Iterator[tuple[Constants, _Batch]]:
     batches: dict[Constants, _Batch] = {}
     for run in runs:
         validation.runs += 1
@@ -201,7 +203,7 @@ def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
     )
 
 
-def _look(constants: Constants, batch: _Batch, validation: Validation) -> None:
+def _look(constants: Constants, batch: _Batch, validation: TraceValidation) -> None:
     """Let TLC check a batch. If TLC fails, divide the batch until only the agents that TLC cannot check are left
     out.
     """
@@ -223,7 +225,7 @@ def _look(constants: Constants, batch: _Batch, validation: Validation) -> None:
         step, what = rejected[number]
         validation.steps += step
         line, handler = life.lines[step - 1], life.handlers[step - 1]
-        validation.rejected.append(Rejected(name, life.agent_id, life.number, line, handler, what))
+        validation.rejected.append(RejectedStep(name, life.agent_id, life.number, line, handler, what))
 
 
 def _config(constants: Constants) -> str:

@@ -13,7 +13,7 @@ from harness.gc_pause import gc_paused
 from harness.play.backends import BACKENDS
 from harness.play.mission import RunOutcome
 from harness.play.progress import Silent
-from harness.proof.coverage import Reached, Watcher, reached_in
+from harness.proof.coverage import CoverageWatcher, ReachedStates, reached_in
 from harness.proof.coverage.reached import simulate_watched
 from harness.run.run import run
 from harness.scenario import Scenario
@@ -51,9 +51,9 @@ def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> Judged:
 
 
 @gc_paused()
-def play_with_coverage(scenario: Scenario, seed: int, reached: Reached) -> Judged:
+def play_with_coverage(scenario: Scenario, seed: int, reached: ReachedStates) -> Judged:
     """Simulate a run with traces, and add its coverage to `reached`."""
-    watcher = Watcher()
+    watcher = CoverageWatcher()
     run = simulate_watched(scenario, seed, watcher.step)
     reached.add(watcher.reached)
     return Judged(run.played, run.result, fingerprint(run.evidence.traces))
@@ -83,7 +83,7 @@ class Player:
         try:
             if in_memory and scenario.foreign and task.seed == self.matrix.seed_list[0]:
                 _same_twice(scenario, task.seed)
-            reached = Reached() if self.covers else None
+            reached = ReachedStates() if self.covers else None
             if not in_memory:
                 judged = self._play_with_processes(scenario, task, reached)
             elif reached is not None:
@@ -113,7 +113,7 @@ class Player:
         for point in points:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
-    def _play_with_processes(self, scenario: Scenario, task: Task, reached: Reached | None) -> Judged:
+    def _play_with_processes(self, scenario: Scenario, task: Task, reached: ReachedStates | None) -> Judged:
         """Play a run with real programs. Raises UnsupportedError, or RunFailedError that names the run directory."""
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # remains of an interrupted run

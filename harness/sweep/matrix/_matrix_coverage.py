@@ -6,7 +6,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from harness.proof import Bounds
-from harness.proof.coverage import Reached, existing, to_json
+from harness.proof.coverage import ReachedStates, existing, to_json
 from harness.proof.coverage.reached import BRANCHES
 from harness.sweep.matrix._cell import AtPoint
 from harness.sweep.matrix._matrix_file import Matrix, Point
@@ -36,10 +36,10 @@ class CoverageTally:
 
     def __init__(self) -> None:
         self._runs = 0
-        self._reached = Reached()
-        self._by_point: dict[Point, Reached] = defaultdict(Reached)
+        self._reached = ReachedStates()
+        self._by_point: dict[Point, ReachedStates] = defaultdict(ReachedStates)
 
-    def add(self, point: Point, reached: Reached) -> None:
+    def add(self, point: Point, reached: ReachedStates) -> None:
         self._runs += 1
         self._reached.add(reached)
         self._by_point[point].add(reached)

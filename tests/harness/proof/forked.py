@@ -3,18 +3,18 @@
 from collections.abc import Sequence
 
 from harness.proof.bounds import Bounds
-from harness.proof.model._global_states import AGENTS, Swarm
+from harness.proof.model._global_states import AGENTS, ModelSwarm
 from harness.proof.model._zones import NOTHING_RUNS
 
 
-def forked(bounds: Bounds, holders: Sequence[int]) -> Swarm:
+def forked(bounds: Bounds, holders: Sequence[int]) -> ModelSwarm:
     """Return a swarm whose initial state has diverged chains of one block each.
 
     `holders` has the number of agents that hold each chain. The other agents hold no block.
 
     The agents could not reach each other until now. The blocks of these chains are the first of `bounds.blocks`.
     """
-    swarm = Swarm(bounds)
+    swarm = ModelSwarm(bounds)
     agents = list(swarm.initial[AGENTS:])
     maker = 0
     for ordinal, count in enumerate(holders, 1):

@@ -17,14 +17,14 @@ from harness.play.process.process_preflight import refuse_virtual_time_keys
 from harness.play.rogue.lies import made_block
 from harness.proof import Bounds, BoundsError, in_words, prove
 from harness.proof.attacker._attacker import Attacker
-from harness.proof.attacker._forgeries import NOBODYS, Material, PendingQuestions, asked, forgeries
-from harness.proof.examples._path_script import Script
-from harness.proof.graph._exploration import Graph, explore
+from harness.proof.attacker._forgeries import NOBODYS, ForgeryMaterial, PendingQuestions, asked, forgeries
+from harness.proof.examples._path_script import PathScript
+from harness.proof.graph._exploration import StateGraph, explore
 from harness.proof.model._any_sender import collect
-from harness.proof.model._global_states import AGENTS, LEFT, LIES, ONCE, Swarm
+from harness.proof.model._global_states import AGENTS, LEFT, LIES, ONCE, ModelSwarm
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
-from harness.proof.model._shape import Held, shape_of
+from harness.proof.model._shape import HeldBlockOrder, shape_of
 from harness.proof.model._snapshot import NOW_S, put_back, take
 from harness.run.simulate import simulate
 from harness.scenario.load import parse
@@ -54,14 +54,14 @@ CAPTURED = 3
 
 
 @cache
-def explored(agents: int = 3, blocks: int = 1, lies: int = 1) -> Graph:
-    swarm = Swarm(Bounds(agents, blocks, "lossy", captured=agents, lies=lies))
+def explored(agents: int = 3, blocks: int = 1, lies: int = 1) -> StateGraph:
+    swarm = ModelSwarm(Bounds(agents, blocks, "lossy", captured=agents, lies=lies))
     graph = explore(swarm, most_bytes=8e9, most_s=60)
     assert graph.ended == "complete"
     return graph
 
 
-def lied_to(graph: Graph) -> Iterator[tuple[Agent, Material]]:
+def lied_to(graph: StateGraph) -> Iterator[tuple[Agent, ForgeryMaterial]]:
     """Yield each agent in each state in which the attacker can send it one more message."""
     bounds, local = graph.swarm.bounds, graph.swarm.local
     captor = Attacker(replace(bounds, lies=bounds.lies + 1), local)
@@ -77,7 +77,7 @@ def lied_to(graph: Graph) -> Iterator[tuple[Agent, Material]]:
         yield agent, material
 
 
-def random_message(lots: Random, agent: Agent, material: Material) -> Message:
+def random_message(lots: Random, agent: Agent, material: ForgeryMaterial) -> Message:
     """Return a random message of an attacker who knows these blocks and can create others."""
     made = Block(CAPTURED, lots.randrange(2_000_000), lots.randbytes(20))
     blocks = [*material.blocks, made]
@@ -113,7 +113,7 @@ def outcome(agent: Agent, message: Message, others: frozenset[PendingQuestions])
     before = take(agent)
     agent.receive_message(CAPTURED, 0, message, NOW_S)
     state = agent.state
-    shape = shape_of(state, held := Held(state))
+    shape = shape_of(state, held := HeldBlockOrder(state))
     counted = sorted(state.voters), sorted(state.reconcile_responders), sorted(state.vote_count.items())
     said = [sent for _, sent in agent.messages_to_send() if matters(sent, others)]
     put_back(agent, before)
@@ -152,7 +152,7 @@ def test_random_message_has_the_effect_of_one_of_the_forgeries() -> None:
 def test_reduced_and_whole_state_spaces_are_equal() -> None:
     reduced, whole = (
         explored(2, 2),
-        explore(Swarm(Bounds(2, 2, "lossy", captured=2, reduced=False)), most_bytes=8e9, most_s=60),
+        explore(ModelSwarm(Bounds(2, 2, "lossy", captured=2, reduced=False)), most_bytes=8e9, most_s=60),
     )
     assert len(reduced.states) < len(whole.states)
     assert all_seen(reduced) == all_seen(whole)
@@ -193,12 +193,12 @@ def by_chance(lots: Random) -> Iterator[Any]:
 
 def lie(agents: list[Agent], now: float, lots: Random) -> None:
     """Send a random forged message to some of the agents."""
-    captor = Swarm(Bounds(3, 1, captured=CAPTURED)).captor
+    captor = ModelSwarm(Bounds(3, 1, captured=CAPTURED)).captor
     assert captor is not None
     held = [frozenset((*agent.state.chain, *agent.state.reconcile_stack)) for agent in agents]
     named = [block.block_hash for agent in agents for block in agent.state.blocks_to_be_committed]
     blocks = frozenset(captor.made.values()).union(*held)
-    material = Material(
+    material = ForgeryMaterial(
         blocks,
         frozenset({*named, *(block.block_hash for block in blocks)}),
         frozenset(map(asked, [agent.state for agent in agents])),
@@ -229,7 +229,7 @@ def test_security_gate_without_a_rule_is_found(
     monkeypatch: pytest.MonkeyPatch, kind: str, owner: type, rule: str, broken: Any
 ) -> None:
     monkeypatch.setattr(owner, rule, broken)
-    graph = explore(Swarm(Bounds(2, 1, "lossy", captured=2)), most_bytes=8e9, most_s=60)
+    graph = explore(ModelSwarm(Bounds(2, 1, "lossy", captured=2)), most_bytes=8e9, most_s=60)
     assert graph.flaw is not None
     assert graph.flaw.kind == kind
 
@@ -238,7 +238,7 @@ def test_scenario_of_an_attack_plays_the_explored_path() -> None:
     graph, lots = explored(2, 1, 2), Random(20)
     lied = [number for number, state in enumerate(graph.states) if state[LEFT] // LIES == 0 and number]
     for number in lots.sample(lied, 12):
-        document = Script(graph, graph.path(number)).document("a lie")
+        document = PathScript(graph, graph.path(number)).document("a lie")
         lies = sum("lie" in entry for entry in document.get("timeline", ()))
         traces = simulate(parse(document), 1, tracing=True).evidence.traces
         forged = [
@@ -343,7 +343,7 @@ def lied_to_at_any_time(lots: Random) -> Iterator[Any]:
             receiver = agents[sender is agents[0]]
             receiver.receive_message(sender.agent_id, 0, message, now)
         agent, other = lots.sample(agents, 2)
-        material = Material(
+        material = ForgeryMaterial(
             frozenset((own,)), frozenset((own.block_hash, NOBODYS)), frozenset((asked(other.state),)), (1,)
         )
         chosen = [*forgeries(agent.state, CAPTURED, material), random_message(lots, agent, material)]

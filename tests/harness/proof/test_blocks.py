@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds, prove
-from harness.proof.examples._path_script import Script
-from harness.proof.examples._path_times import Ages
-from harness.proof.graph._exploration import Graph, explore
-from harness.proof.model._global_states import AGENTS, Swarm
+from harness.proof.examples._path_script import PathScript
+from harness.proof.examples._path_times import BlockAges
+from harness.proof.graph._exploration import StateGraph, explore
+from harness.proof.model._global_states import AGENTS, ModelSwarm
 from harness.run.simulate import simulate
 from harness.scenario.load import parse
 from tests.harness.proof.test_explore import Seen, all_seen, by_chance, explored
@@ -38,7 +38,7 @@ def renumbered(seen: Seen) -> Iterator[Seen]:
     yield from (called(order) for order in permutations(range(1, len(there) + 1)))
 
 
-def all_alike(graph: Graph) -> set[Seen]:
+def all_alike(graph: StateGraph) -> set[Seen]:
     return {alike(seen) for seen in all_seen(graph)}
 
 
@@ -75,7 +75,7 @@ def test_tie_for_the_younger_block_is_played_with_timestamps() -> None:
     at_rest = [number for number, state in enumerate(graph.states) if number and graph.swarm.is_idle(state)]
     played = 0
     for number in at_rest:
-        script = Script(graph, graph.path(number))
+        script = PathScript(graph, graph.path(number))
         document = script.document("younger")
         if "timestamp_us" in document["events"]["script"][0]:
             assert not script.contradictory
@@ -112,7 +112,7 @@ def test_contradictory_ties_are_reported(tmp_path: Path) -> None:
 
 
 def test_ages_give_timestamps_in_the_required_order() -> None:
-    ages = Ages()
+    ages = BlockAges()
     for ordinal in (1, 2, 3):
         ages.completed(ordinal)
     ages.renumber((3, 1))  # now the third is 1, the first is 2, the second is 3
@@ -126,7 +126,7 @@ def test_ages_give_timestamps_in_the_required_order() -> None:
 
 
 def test_clock_of_an_agent_does_not_go_back() -> None:
-    ages = Ages()
+    ages = BlockAges()
     ages.completed(1)
     ages.completed(2)
     ages.require_older(2, [1])
@@ -144,7 +144,7 @@ def test_livelock_needs_its_number_of_coincidences(tmp_path: Path) -> None:
     least = min(livelock.coincidences for livelock in free.livelocks if livelock.coincidences is not None)
     assert least > 0
     for most, found in ((least - 1, False), (least, True)):
-        swarm = Swarm(Bounds(2, 4, "lossless", coincidences=most))
+        swarm = ModelSwarm(Bounds(2, 4, "lossless", coincidences=most))
         assert explore(swarm, most_bytes=8e9, most_s=60).ended == "complete"
         proof = prove(swarm.bounds, out=tmp_path / f"{most}.yaml")
         assert bool(proof.livelocks) == found

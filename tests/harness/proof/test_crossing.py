@@ -8,7 +8,7 @@ import pytest
 
 from harness.proof import Bounds, BoundsError, in_words, prove
 from harness.proof.examples._example import play
-from harness.proof.examples._path_script import Script
+from harness.proof.examples._path_script import PathScript
 from tests.harness.proof.test_explore import all_seen, by_chance, explored
 
 
@@ -76,7 +76,7 @@ def test_paths_played_as_scenarios_give_equal_numbers_of_chains() -> None:
     for number, state in enumerate(graph.states):
         if number and not graph.quiet[number] and graph.swarm.is_idle(state):
             chains = len(graph.swarm.chains(state))
-            assert play(Script(graph, graph.path(number)).document("rest")).chains == chains
+            assert play(PathScript(graph, graph.path(number)).document("rest")).chains == chains
             forked += chains > 1
     assert forked > 1
 

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds
-from harness.proof.graph._exploration import Graph, explore
+from harness.proof.graph._exploration import StateGraph, explore
 from harness.proof.graph._workers import Workers
-from harness.proof.model._global_states import AGENTS, Swarm
+from harness.proof.model._global_states import AGENTS, ModelSwarm
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._snapshot import key_of, put_back, take
 from harness.proof.questions import _convergence
@@ -25,8 +25,8 @@ View = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...], bool, tuple[str,
 Seen = tuple[View, ...]
 
 
-def explored(*arguments: Any, **options: Any) -> Graph:
-    graph = explore(Swarm(Bounds(*arguments, **options)), most_bytes=8e9, most_s=60)
+def explored(*arguments: Any, **options: Any) -> StateGraph:
+    graph = explore(ModelSwarm(Bounds(*arguments, **options)), most_bytes=8e9, most_s=60)
     assert graph.ended == "complete"
     return graph
 
@@ -47,7 +47,7 @@ def seen_of(agents: Sequence[Agent]) -> Seen:
     return tuple(sorted(map(view_of, agents)))
 
 
-def by_place(graph: Graph) -> set[Seen]:
+def by_place(graph: StateGraph) -> set[Seen]:
     """Return the visible states of the living agents in each state, in the order of their positions."""
     local = graph.swarm.local
     agent = Agent(1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
@@ -60,7 +60,7 @@ def by_place(graph: Graph) -> set[Seen]:
     return {tuple([view(number) for number in state[AGENTS:] if number != DEAD]) for state in graph.states}
 
 
-def all_seen(graph: Graph) -> set[Seen]:
+def all_seen(graph: StateGraph) -> set[Seen]:
     return {tuple(sorted(seen)) for seen in by_place(graph)}
 
 
@@ -84,7 +84,7 @@ def test_reduced_and_whole_state_spaces_are_equal(
 
 @pytest.mark.parametrize("network", ["lossless", "lossy"])
 def test_reduction_of_tallies_changes_no_result(network: Any) -> None:
-    in_one, in_every = Swarm(Bounds(3, 2, network)), Swarm(Bounds(3, 2, network), every_count=True)
+    in_one, in_every = ModelSwarm(Bounds(3, 2, network)), ModelSwarm(Bounds(3, 2, network), every_count=True)
     one, every = (explore(swarm, most_bytes=8e9, most_s=60) for swarm in (in_one, in_every))
     assert in_one.local.steps < in_every.local.steps
     assert len(one.states) <= len(every.states)
@@ -102,8 +102,8 @@ def test_reduction_of_tallies_changes_no_result(network: Any) -> None:
 def test_two_cores_give_the_result_of_one(bounds: Bounds, most_told: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
     monkeypatch.setattr("harness.proof.graph._workers.MAX_REPORTED", most_told)
-    alone = explore(Swarm(bounds), most_bytes=8e9, most_s=60)
-    swarm = Swarm(bounds)
+    alone = explore(ModelSwarm(bounds), most_bytes=8e9, most_s=60)
+    swarm = ModelSwarm(bounds)
     with Workers(swarm, 2) as workers:
         shared = explore(swarm, most_bytes=8e9, most_s=60, workers=workers)
         assert _convergence.look(shared, workers=workers) == _convergence.look(alone)

@@ -6,11 +6,11 @@ import pytest
 
 from harness.archive.run_record import Cycle
 from harness.proof import Bounds, Progress, in_words, prove
-from harness.proof._progress_bar import Budget
+from harness.proof._progress_bar import ExplorationBudget
 from harness.proof.examples._example import Example
 from harness.proof.graph._exploration import explore
-from harness.proof.model._global_states import AGENTS, BLOCKS, ZONE, Swarm
-from harness.proof.model._instant import Action
+from harness.proof.model._global_states import AGENTS, BLOCKS, ZONE, ModelSwarm
+from harness.proof.model._instant import AgentAction
 from harness.proof.model._zones import NOTHING_RUNS, Zones
 from harness.proof.questions._extra_votes import ExtraVotes
 from harness.proof.questions._graph_cycles import cycles
@@ -67,7 +67,7 @@ def test_possible_forms_come_first_and_the_rest_is_counted(tmp_path: Path, monke
 def test_cycle_is_found_in_an_incomplete_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(progress: Progress) -> None:
         if progress.looked_at >= 500:
-            monkeypatch.setattr(Budget, "ended", lambda *_: "time")
+            monkeypatch.setattr(ExplorationBudget, "ended", lambda *_: "time")
 
     proof = prove(Bounds(2, 4, "lossless"), out=tmp_path / "round.yaml", watch=stop)
     assert (proof.ended, proof.liveness, proof.exit_status) == ("time", None, 1)
@@ -122,7 +122,7 @@ def test_state_that_needs_two_votes_becomes_a_scenario(tmp_path: Path) -> None:
 
 
 def test_single_path_gives_the_result_of_all_successors(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = explore(Swarm(Bounds(4, 2, "lossy")), most_bytes=8e9, most_s=60)
+    graph = explore(ModelSwarm(Bounds(4, 2, "lossy")), most_bytes=8e9, most_s=60)
     forks = [state for state in graph.states if graph.swarm.is_idle(state) and len(graph.swarm.chains(state)) > 1]
     lazy = ExtraVotes(graph.swarm)
     needed = [lazy.needed(fork) for fork in forks]
@@ -169,6 +169,6 @@ def test_fault_or_attack_between_timers_counts_as_a_coincidence() -> None:
         now = any(row[0] == 0 for row in swarm.zones.matrix(state[ZONE])[1:])
         between += now
         for place in range(len(state[AGENTS:])):
-            assert swarm.coincidences(state, (Action(place, "death"),)) == now
-            assert swarm.coincidences(state, (Action(place, "captured"),)) == 0
+            assert swarm.coincidences(state, (AgentAction(place, "death"),)) == now
+            assert swarm.coincidences(state, (AgentAction(place, "captured"),)) == 0
     assert between

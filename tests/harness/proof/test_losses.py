@@ -6,7 +6,7 @@ from random import Random
 import pytest
 
 from harness.proof import Bounds, in_words, prove
-from harness.proof.examples._path_script import Script
+from harness.proof.examples._path_script import PathScript
 from harness.proof.model._global_states import LEFT, LOSSES
 from tests.harness.proof.test_explore import all_seen, by_chance, explored
 
@@ -41,7 +41,7 @@ def test_scenario_of_a_path_has_the_counted_losses(faults: tuple[str, ...]) -> N
     graph = explored(3, 2, "lossy", faults, losses=3)
     lost_most = 0
     for number, state in enumerate(graph.states[1:], 1):
-        fates = Script(graph, graph.path(number)).document("lossy").get("fates", ())
+        fates = PathScript(graph, graph.path(number)).document("lossy").get("fates", ())
         lost = sum(1 if "receiver" in fate else graph.swarm.bounds.agents - 1 for fate in fates if fate.get("drop"))
         assert lost == 3 - state[LEFT] // LOSSES
         lost_most = max(lost_most, lost)

@@ -10,7 +10,7 @@ import yaml
 
 from harness.proof import Bounds, Proof, prove
 from harness.proof.graph._exploration import explore
-from harness.proof.model._global_states import Swarm
+from harness.proof.model._global_states import ModelSwarm
 from harness.proof.questions._convergence import look
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -149,7 +149,7 @@ CELLS = [*ways_round()]
 
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.bounds.in_words())
 def test_number_of_cycles_equals_that_of_the_page(cell: Cell) -> None:
-    graph = explore(Swarm(cell.bounds), most_bytes=4e9, most_s=60)
+    graph = explore(ModelSwarm(cell.bounds), most_bytes=4e9, most_s=60)
     assert graph.ended == "complete"
     assert f"{len(look(graph).cycles)} ({len(graph.states):,})" == cell.said
 

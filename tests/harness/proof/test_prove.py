@@ -18,7 +18,7 @@ from harness.proof._progress_bar import memory_bytes
 from harness.proof.graph._exploration import LOOK_EVERY, explore
 from harness.proof.graph._workers import Workers
 from harness.proof.model._any_sender import collect
-from harness.proof.model._global_states import Swarm
+from harness.proof.model._global_states import ModelSwarm
 from harness.scenario.agent_options import Stagger
 from tests.harness.command import COMMAND, harness, sentences
 
@@ -196,7 +196,7 @@ def test_interrupted_workers_stop(monkeypatch: pytest.MonkeyPatch) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
-    swarm = Swarm(Bounds(3, 3, "lossy"))
+    swarm = ModelSwarm(Bounds(3, 3, "lossy"))
     with Workers(swarm, 2) as workers:
         graph = explore(swarm, most_bytes=8e9, most_s=60, workers=workers, watch=interrupt)
     assert graph.ended == "interrupted"
@@ -209,7 +209,7 @@ def test_ctrl_c_during_the_start_of_workers_is_not_lost(monkeypatch: pytest.Monk
     interruptions = [signal.SIGINT]
     os.register_at_fork(before=lambda: signal.raise_signal(interruptions.pop()) if interruptions else None)
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
-    swarm = Swarm(Bounds(2, 3, "lossy"))
+    swarm = ModelSwarm(Bounds(2, 3, "lossy"))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's job in the background ignores
     try:
         with Workers(swarm, 2) as workers:
@@ -224,7 +224,7 @@ def test_limits_also_concern_questions_to_the_whole_graph(tmp_path: Path, monkey
     monkeypatch.setattr(
         import_module("harness.proof._proof"), "explore", lambda *_, **__: replace(explored, seconds=61.0)
     )
-    explored = explore(Swarm(Bounds(2, 2, "lossy")), most_bytes=8e9, most_s=60)
+    explored = explore(ModelSwarm(Bounds(2, 2, "lossy")), most_bytes=8e9, most_s=60)
     proof = prove(Bounds(2, 2, "lossy"), Limits(most_bytes=8e9, most_s=60), tmp_path / "none.yaml")
     assert (proof.ended, proof.whole_ended, proof.exit_status) == ("complete", "time", INCOMPLETE)
     assert [line[0] for line in in_words(proof) if "one chain" in line or "livelock" in line] == ["-", "-"]
@@ -254,7 +254,7 @@ def test_time_limit_ends_a_long_question_about_one_state(monkeypatch: pytest.Mon
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
     monkeypatch.setattr("harness.proof.graph._workers.WAIT_S", 0.01)
     monkeypatch.setattr("harness.proof.graph._workers.expanded", take_long)
-    swarm = Swarm(Bounds(3, 3, "lossy"))
+    swarm = ModelSwarm(Bounds(3, 3, "lossy"))
     with Workers(swarm, 2) as workers:
         graph = explore(swarm, most_bytes=8e9, most_s=0.5, workers=workers)
     assert graph.ended == "time"

@@ -7,7 +7,7 @@ import pytest
 from harness.proof import Bounds
 from harness.proof.graph._exploration import explore
 from harness.proof.questions import _convergence
-from harness.proof.questions._convergence import Liveness
+from harness.proof.questions._convergence import ConvergenceResult
 from tests.harness.proof.forked import forked
 
 THESIS: dict[str, Any] = {}
@@ -16,7 +16,7 @@ MAJORITY = {"settings": {"top_needs_majority": True}}
 STAGGER = {"stagger": {"phase1_timeout_s": 0.5}}
 
 
-def after_the_fork(agents: int, holders: list[int], keys: dict[str, Any]) -> Liveness:
+def after_the_fork(agents: int, holders: list[int], keys: dict[str, Any]) -> ConvergenceResult:
     """Return the result of exploring a swarm with diverged chains, without losses, with a block at any time."""
     bounds = Bounds(agents, len(holders) + 1, "lossless", **keys)
     graph = explore(forked(bounds, holders), most_bytes=8e9, most_s=300)

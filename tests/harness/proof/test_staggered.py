@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from harness.proof import Bounds, prove
-from harness.proof.examples._path_script import Script
-from harness.proof.graph._exploration import Graph
+from harness.proof.examples._path_script import PathScript
+from harness.proof.graph._exploration import StateGraph
 from harness.proof.model._global_states import AGENTS
 from harness.run.simulate import simulate
 from harness.scenario.agent_options import Stagger
@@ -19,7 +19,7 @@ from tests.harness.proof.test_explore import Seen, by_chance, by_place, explored
 PHASE_1: Stagger = {"phase1_timeout_s": 0.5}
 
 
-def whichever_block(graph: Graph) -> set[Seen]:
+def whichever_block(graph: StateGraph) -> set[Seen]:
     """Return a representative of all views that differ only in the identity of blocks."""
     return {min(renumbered(seen)) for seen in by_place(graph)}
 
@@ -64,7 +64,7 @@ def test_path_to_an_idle_swarm_is_played_by_the_right_agents() -> None:
     at_rest = [number for number, state in enumerate(graph.states) if number and graph.swarm.is_idle(state)]
     played = 0
     for number in at_rest:
-        script = Script(graph, graph.path(number))
+        script = PathScript(graph, graph.path(number))
         document = script.document("staggered")
         if not script.contradictory:
             chains = simulate(parse(document), 1, tracing=True).result.chains

@@ -10,7 +10,7 @@ from harness.checker.records import _headers
 from harness.errors import ScenarioError
 from harness.proof import Bounds, BoundsError
 from harness.proof.graph._exploration import explore
-from harness.proof.model._global_states import Swarm
+from harness.proof.model._global_states import ModelSwarm
 from harness.proof.questions._convergence import look
 from harness.run.simulate import simulate
 from harness.scenario._network import NetworkModel
@@ -72,7 +72,7 @@ def test_staggered_phase_1_alone_allows_a_livelock_in_resonance() -> None:
 
 @pytest.mark.parametrize("stagger", [{"vote_timeout_s": 0.5}, {"phase1_timeout_s": 0.5}, STAGGER])
 def test_stagger_leaves_no_livelock_within_bounds(stagger: Stagger) -> None:
-    graph = explore(Swarm(Bounds(2, 3, "lossy", stagger=stagger)), most_bytes=4e9, most_s=60)
+    graph = explore(ModelSwarm(Bounds(2, 3, "lossy", stagger=stagger)), most_bytes=4e9, most_s=60)
     assert graph.ended == "complete"
     assert not look(graph).cycles
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from pydantic import ValidationError
 
 from harness.errors import ScenarioError, UnsupportedError
-from harness.proof.coverage import Reached
+from harness.proof.coverage import ReachedStates
 from harness.proof.coverage.reached import MOST
 from harness.run.parallel import FailedTask, sweep
 from harness.scenario import Scenario
@@ -101,15 +101,15 @@ class Kept:
 class NewCoverage:
     """The parts of a run's coverage that are new, and the findings of the run."""
 
-    reached: Reached
+    reached: ReachedStates
     found: tuple[Identity, ...]
     divergence: Divergence | None
     timers_ended_s: tuple[float, ...]
     failed_votes: TimerPatterns
 
     @classmethod
-    def of(cls, run: Trial, known: Reached) -> "NewCoverage":
-        new = Reached(
+    def of(cls, run: Trial, known: ReachedStates) -> "NewCoverage":
+        new = ReachedStates(
             run.reached.states - known.states,
             run.reached.pairs - known.pairs,
             run.reached.branches,
@@ -125,7 +125,7 @@ class Hunt:
 
     limits: Limits
     rng: Random
-    reached: Reached = field(default_factory=Reached)
+    reached: ReachedStates = field(default_factory=ReachedStates)
     states_overflow: DigestSet = field(default_factory=DigestSet)
     pairs_overflow: DigestSet = field(default_factory=DigestSet)
     """Digests of further coverage after `reached` is full."""

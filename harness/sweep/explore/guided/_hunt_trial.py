@@ -20,7 +20,7 @@ from harness.checker.recurring_cycles import cycle_of
 from harness.checker.uniform_chain import common_prefix
 from harness.errors import AgentFailedError
 from harness.gc_pause import gc_paused
-from harness.proof.coverage import Reached, Watcher
+from harness.proof.coverage import CoverageWatcher, ReachedStates
 from harness.proof.coverage.reached import simulate_watched
 from harness.run.simulate import result_of_failure
 from harness.scenario import Scenario
@@ -93,7 +93,7 @@ Divergence = tuple[tuple[int, int], ...]
 class Trial:
     """The coverage of a run, and the findings that it shows."""
 
-    reached: Reached
+    reached: ReachedStates
     found: tuple[Identity, ...]
     divergence: Divergence | None = None
     """The difference of the chains at rest, in a run without a final reconcile."""
@@ -106,7 +106,7 @@ class Trial:
 @gc_paused()
 def play_trial(scenario: Scenario, seed: int) -> Trial:
     """Play a scenario, and return the result. Raises HarnessError if it cannot be played."""
-    watcher = Watcher()
+    watcher = CoverageWatcher()
     result, evidence = _played(scenario, seed, watcher.step)
     divergence = None if scenario.final_reconcile or result.bad else _known_divergences(result)
     found = identities(result, evidence.cached(cycle_of) if evidence else None, scenario)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from harness.errors import INTERRUPTED, VIOLATED, HarnessError
 from harness.proof import Bounds
-from harness.proof.coverage import Existing, existing
+from harness.proof.coverage import ExistingStates, existing
 from harness.proof.coverage import to_json as coverage_to_json
 from harness.run.parallel import sweep
 from harness.run.provenance import versions
@@ -100,7 +100,7 @@ class Night:
     seconds: float = 0.0
     processor_s: float = 0.0
     left_out: list[str] = field(default_factory=list)
-    existing_states: Existing | None = None
+    existing_states: ExistingStates | None = None
     report: Path | None = None
 
     def grow(self) -> None:

@@ -10,7 +10,7 @@ import pytest
 from harness.archive.archive import RunArchive
 from harness.checker import gather
 from harness.proof import Bounds
-from harness.proof.coverage import Reached, existing, in_words, reached_in, to_json
+from harness.proof.coverage import ReachedStates, existing, in_words, reached_in, to_json
 from harness.proof.coverage.reached import BRANCHES
 from harness.proof.model._shape import LEFT_OUT
 from harness.proof.model._snapshot import LEFT_OUT as OF_SNAPSHOTS
@@ -50,7 +50,7 @@ def by_chance(agents: int, blocks: int, seed: int) -> Scenario:
     return scenario(agents, script, network={"loss": round(0.6 * lots.random(), 2)})
 
 
-def reached(asked: Scenario, seed: int = 1, **options: Any) -> Reached:
+def reached(asked: Scenario, seed: int = 1, **options: Any) -> ReachedStates:
     return reached_in(simulate(asked, seed, tracing=True, deliver_all=True, **options).evidence)
 
 
@@ -68,7 +68,7 @@ def test_reductions_keep_all_local_states_and_inputs(bounds: Bounds) -> None:
 
 
 def test_states_that_a_run_reaches_exist() -> None:
-    there, both = existing(Bounds(2, 2, "any")), Reached()
+    there, both = existing(Bounds(2, 2, "any")), ReachedStates()
     for seed in range(30):
         both.add(reached(by_chance(2, 2, seed), seed))
     assert both.states <= there.states

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from harness.proof.specification import Recorded, Validation, recorded, simulated, validate
+from harness.proof.specification import RunTraces, TraceValidation, recorded, simulated, validate
 from harness.scenario.load import parse
 from tests.harness.command import harness, sentences, write_scenario
 from tests.machine import require_tlc
@@ -22,13 +22,13 @@ def _tlc() -> None:
     require_tlc()
 
 
-def of(name: str, **keys: Any) -> Recorded:
+def of(name: str, **keys: Any) -> RunTraces:
     [run] = simulated(parse({"name": name, **SHORT, **keys}), [2])
-    return Recorded(name, run.traces, run.ended)
+    return RunTraces(name, run.traces, run.ended)
 
 
 @pytest.fixture(scope="module")
-def validation() -> Validation:
+def validation() -> TraceValidation:
     """Validate the traces of correct and wrong agents together."""
     require_tlc()
     lost = [{"at_s": 30, "reboot": [2], "down_s": 5, "disk": "kept"}, {"at_s": 40, "kill": [3]}]
@@ -41,14 +41,14 @@ def validation() -> Validation:
     return validate([*right, *wrong])
 
 
-def test_right_agents_do_what_is_specified(validation: Validation) -> None:
+def test_right_agents_do_what_is_specified(validation: TraceValidation) -> None:
     assert not validation.unread
     assert validation.runs == 3 + len(WRONG)
     assert validation.steps > 1000
     assert {rejected.run for rejected in validation.rejected} == WRONG.keys()
 
 
-def test_a_wrong_agent_is_rejected_with_line_and_handler(validation: Validation) -> None:
+def test_a_wrong_agent_is_rejected_with_line_and_handler(validation: TraceValidation) -> None:
     for rejected in validation.rejected:
         assert f"line {rejected.line}, Algorithm {WRONG[rejected.run]}, " in rejected.in_words()
         assert rejected.line > 1
@@ -74,13 +74,13 @@ def test_unchecked_records_are_reported_beside_rejected_steps(tmp_path: Path) ->
 
 
 def test_incomplete_exploration_does_not_hold() -> None:
-    assert Validation(1, 1, 19, unread=["1.trace.jsonl: agent 1: line 21 is damaged"]).exit_status == 2
-    assert Validation(1).exit_status == 2
+    assert TraceValidation(1, 1, 19, unread=["1.trace.jsonl: agent 1: line 21 is damaged"]).exit_status == 2
+    assert TraceValidation(1).exit_status == 2
 
 
 def test_an_interrupt_leaves_what_came_before() -> None:
-    def runs() -> Iterator[Recorded]:
-        yield Recorded("first", [], problems=["no traces found"])
+    def runs() -> Iterator[RunTraces]:
+        yield RunTraces("first", [], problems=["no traces found"])
         raise KeyboardInterrupt
 
     validation = validate(runs())

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from harness.archive.run_record import Cycle
 from harness.checker.judgement import Judgement
 from harness.errors import RunDirectoryError
-from harness.proof.coverage import Reached
+from harness.proof.coverage import ReachedStates
 from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import find_file
@@ -107,7 +107,7 @@ def test_run_with_a_new_pattern_of_failed_votes_is_kept(monkeypatch: pytest.Monk
     patterns = iter((("voting", "phase one", "voting"),) * 2 + (("voting", "voting"),))
     monkeypatch.setattr(
         "harness.sweep.explore.guided._hunt.play_trial",
-        lambda scenario, seed: Trial(Reached(), (), failed_votes=(next(patterns),)),
+        lambda scenario, seed: Trial(ReachedStates(), (), failed_votes=(next(patterns),)),
     )
     hunt = Hunt(limits, Random(1))
     assert [kept for _, kept in hunt.begin([Candidate(document, seed)] * 3, 1)] == [True, False, True]
@@ -115,7 +115,9 @@ def test_run_with_a_new_pattern_of_failed_votes_is_kept(monkeypatch: pytest.Monk
 
 def test_documents_near_a_livelock_are_changed_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
     limits, ((document, seed), *_) = initial_documents(ordinary(), range(1))
-    monkeypatch.setattr("harness.sweep.explore.guided._hunt.play_trial", lambda scenario, seed: Trial(Reached(), ()))
+    monkeypatch.setattr(
+        "harness.sweep.explore.guided._hunt.play_trial", lambda scenario, seed: Trial(ReachedStates(), ())
+    )
     near = Kept(Candidate(document, seed), new_states=1, steps=100, failed=3, timers_ended_s=())
     others = [dataclasses.replace(near, failed=0) for _ in range(100)]
     hunt = Hunt(limits, Random(1), kept=[near, *others])

@@ -18,8 +18,8 @@ from harness.archive.traces import Trace
 from harness.archive.vocabulary import BRANCHES
 from harness.proof.bounds import Bounds
 from harness.proof.graph._exploration import explore
-from harness.proof.model._global_states import Swarm
-from harness.proof.specification import Recorded, _recorded_lives, _spec_states, _tlc, _validate
+from harness.proof.model._global_states import ModelSwarm
+from harness.proof.specification import RunTraces, _recorded_lives, _spec_states, _tlc, _validate
 from harness.proof.specification._second_opinion import _config
 from tests.harness.checker.reference import random_inputs
 from tests.harness.checker.reference.random_inputs import LIFE, ROSTER
@@ -71,7 +71,7 @@ class States:
     @functools.cached_property
     def real(self) -> set[_spec_states.Plain]:
         """Return the states of the agent."""
-        graph = explore(Swarm(self.bounds), most_bytes=8e9, most_s=float("inf"))
+        graph = explore(ModelSwarm(self.bounds), most_bytes=8e9, most_s=float("inf"))
         assert graph.ended == "complete", f"{self.name}: {graph.ended}"
         return set(_spec_states.real(graph))
 
@@ -168,7 +168,7 @@ class Inputs(abc.ABC):
     def encoded(self) -> tuple[_validate.Constants, _validate._Batch]:
         """The steps of the core, with the settings of the specification."""
         with _all_tallies():
-            [batch] = _validate._batches([Recorded(self.name, self.traces())], _validate.Validation())
+            [batch] = _validate._batches([RunTraces(self.name, self.traces())], _validate.TraceValidation())
         assert not any(life.unread for life in batch[1].lives)
         return batch
 
