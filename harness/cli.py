@@ -15,10 +15,32 @@ Exit statuses, of which `docs/reference/commands.md` has a table:
 - 130: interrupted.
 """
 
+# ruff: noqa: E402  (an interrupt during the imports must be quiet)
+
+import os
+import signal
+import sys
+
+
+def _quit(signal_number: int, frame: object) -> None:
+    os._exit(130)
+
+
+def _interrupts_are_quiet(quiet: bool) -> None:
+    """Let Ctrl-C end the process at once, as long as it only imports modules. Python would print a traceback.
+
+    A program that merely imports this module keeps its own handler.
+    """
+    handlers = (_quit, signal.default_int_handler) if quiet else (signal.default_int_handler, _quit)
+    if signal.getsignal(signal.SIGINT) is handlers[1]:
+        signal.signal(signal.SIGINT, handlers[0])
+
+
+if __name__ == "__main__" or os.path.basename(sys.argv[0]) == "ucp-harness":  # noqa: PTH119  (pathlib takes 10 ms)
+    _interrupts_are_quiet(True)
+
 import errno
 import io
-import os
-import sys
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -169,6 +191,7 @@ class LazyCommandGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] in COMMANDS:
             self.add_command(load_command(args[0]), args[0])
+            _interrupts_are_quiet(False)
         elif args and args[0] in OLD_NAMES and not ctx.resilient_parsing:
             raise OldCommandNameError(f"`{args[0]}` is now {OLD_NAMES[args[0]]}: run that")
         return super().resolve_command(ctx, args)

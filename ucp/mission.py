@@ -1,9 +1,7 @@
 """Read the mission file of an agent (schema `ucp-mission/1`, see contract/CONTRACT.md)."""
 
 import base64
-import json
 import socket
-import stat
 import sys
 from pathlib import Path
 from typing import Any, Literal, TypeGuard, get_args
@@ -12,6 +10,7 @@ from ucp._dataclass import dataclass
 from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
 from ucp.events import DEFAULT_LOG, MAX_MEAN_S, MEAN_TIME_BETWEEN_EVENTS_S, EventKind
 from ucp.features import FEATURES
+from ucp.plain_file import json_problem, read_json
 from ucp.sealed import SEAL_BYTES, sealed_to
 from ucp.settings import Settings
 from ucp.short_value import shown, shown_key
@@ -91,16 +90,11 @@ class Mission:
 def load_mission(path: Path) -> Mission:
     """Read a mission file. Raises MissionError."""
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise MissionError(f"{path}: not a file that holds a mission")
-        if status.st_size > MAX_MISSION_BYTES:
-            raise MissionError(f"{path}: larger than {MAX_MISSION_BYTES} bytes, which no mission file is")
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = read_json(path, MAX_MISSION_BYTES)
     except OSError as error:
         raise MissionError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise MissionError(f"{path}: not JSON: {error}") from None
+    except ValueError as error:
+        raise MissionError(f"{path}: {json_problem(error)}") from None
     try:
         return parse_mission(document)
     except MissionError as error:

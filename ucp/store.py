@@ -23,10 +23,12 @@ from typing import Any, BinaryIO
 from ucp._dataclass import dataclass, field
 from ucp.block import BLOCK_HEADER, Block
 from ucp.messages import decode_block
+from ucp.plain_file import open_plain_file, parse_json
 from ucp.short_value import shown
 from ucp.state import AgentState
 
 SCHEMA = "ucp-store/1"
+MAX_LINE_BYTES = 64 * 1024 * 1024
 
 Change = tuple[str, str]
 """Operation and block hash, as in a trace."""
@@ -285,14 +287,14 @@ def _sync_directory(path: Path) -> None:
 def _entries(path: Path) -> Iterator[Any]:
     """Yield the entries of a store up to the first damaged one. A missing file has no entries.
 
-    Raises OSError, or ValueError or RecursionError for an undamaged entry that is not JSON.
+    Raises OSError, or ValueError for an undamaged entry that is not JSON.
     """
     try:
-        file = path.open("rb")
+        file = open_plain_file(path)
     except FileNotFoundError:
         return
     with file:
-        for line in file:
+        while line := file.readline(MAX_LINE_BYTES):
             checksum, _, text = line.partition(b" ")
             try:
                 whole = int(checksum, 16) == zlib.crc32(text.removesuffix(b"\n"))
@@ -300,7 +302,7 @@ def _entries(path: Path) -> Iterator[Any]:
                 return
             if not whole:
                 return
-            yield json.loads(text)
+            yield parse_json(text)
 
 
 def _base64(data: bytes) -> str:

@@ -5,17 +5,17 @@ Readers in this package therefore limit the bytes they read, and report a proble
 exception.
 """
 
-import errno
 import io
 import os
-import stat
 import zlib
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
+
+from ucp.plain_file import check_weight, open_plain_file
 
 GZIP_MAGIC = b"\x1f\x8b"
 MAX_BYTES = 1024 * 1024 * 1024
@@ -49,8 +49,8 @@ class _Content(io.RawIOBase):
     def __init__(self, path: Path, most_bytes: int) -> None:
         self.problem = ""
         self._left = self._most = most_bytes
-        self._file = open(open_plain_file(path), "rb", buffering=0)  # noqa: SIM115
-        self.packed = self._file.read(2) == GZIP_MAGIC
+        self._file = open_plain_file(path).detach()
+        self.packed: bool = self._file.read(2) == GZIP_MAGIC
         self._file.seek(0)
         self._unpacker = _unpacker()
         self._input = b""
@@ -102,20 +102,6 @@ class _Content(io.RawIOBase):
         return b""
 
 
-def open_plain_file(path: Path) -> int:
-    """Open a regular file for reading and return its descriptor.
-
-    Raises OSError if the file does not exist, may not be read, or is a directory, fifo, device or socket.
-    """
-    # Without O_NONBLOCK, opening a fifo would block until a process writes to it.
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        is_directory = stat.S_ISDIR(os.fstat(descriptor).st_mode)
-        os.close(descriptor)
-        raise OSError(errno.EISDIR, "is a directory") if is_directory else OSError(errno.EINVAL, "is not a file")
-    return descriptor
-
-
 def _unpacker() -> Any:
     return zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
 
@@ -124,6 +110,8 @@ MAX_LINES = 50_000
 MAX_LINES_BYTES = 32 * 1024 * 1024
 """Maximum size of a JSON Lines file. The tracks of 50 vehicles take 1.6 MB for a mission of 20 minutes."""
 MAX_LINE_BYTES = 4 * 1024 * 1024
+MAX_LINE_WEIGHT = 200_000
+"""Maximum weight of a line. The conditions of 10,000 links weigh half of it."""
 
 Record = TypeVar("Record", bound=BaseModel)
 
@@ -140,10 +128,10 @@ class JsonLines(Generic[Record]):
         self._problem = ""
 
     def __iter__(self) -> Iterator[Record]:
-        if self._path is None or not self._path.is_file():
+        if self._path is None:
             return
         try:
-            with self._path.open("rb") as file:
+            with open_plain_file(self._path) as file:
                 for number in count(1):
                     if not (line := file.readline(MAX_LINE_BYTES)):
                         return
@@ -158,11 +146,14 @@ class JsonLines(Generic[Record]):
                         )
                         return
                     try:
+                        check_weight(line, MAX_LINE_WEIGHT)
                         read = self._model.model_validate_json(line)
-                    except ValidationError:
+                    except ValueError:
                         self.leave_out()
                     else:
                         yield read
+        except FileNotFoundError:
+            return
         except OSError as error:
             self._problem = f"cannot be read: {error.strerror}"
 

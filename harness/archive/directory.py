@@ -33,6 +33,7 @@ from harness.archive.tracks import TRACKS_FILE
 from harness.errors import MachineError, RunDirectoryError
 from netem.radio import Place
 from ucp.agent_files import write_json_atomically
+from ucp.plain_file import open_plain_file
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -102,7 +103,7 @@ class RunDirectory:
         later = directory / f"{agent_id}{TRACE_SUFFIX}"
         if not later.exists():
             return 0
-        with later.open("rb") as file:
+        with open_plain_file(later) as file:
             file.seek(copied_bytes)
             added = file.read()
         added = added[: added.rfind(b"\n") + 1]

@@ -7,7 +7,6 @@ characteristic 4, which the checker decides.
 
 import base64
 import binascii
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -21,14 +20,17 @@ from harness.archive.trace_files import trace_files
 from harness.errors import ExportError, RunDirectoryError
 from ucp.block import HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
 from ucp.export import SCHEMA
+from ucp.plain_file import json_problem, read_json
 from ucp.state import AgentState
 
 RUN_FILE = "run.json"
 SUFFIX = ".chain.json"
 BEFORE_FINAL_RECONCILE = "before_final_reconcile"
 """Directory in a run directory with the exports from before the final reconcile."""
-MAX_EXPORT_BYTES = 64 * 1024 * 1024
-"""Maximum size of an export, about 35,000 blocks."""
+MAX_EXPORT_BYTES = 32 * 1024 * 1024
+"""Maximum size of an export, about 17,000 blocks."""
+MAX_ERRORS = 20_000
+"""Maximum number of errors in a file that are described. Their description takes a kilobyte each."""
 
 MAX_SIGNATURE = 4 * (64 // 3 + 1)
 """Length of 64 bytes in base64, in characters."""
@@ -223,26 +225,17 @@ def _base64(data: bytes) -> str:
 def read_export(path: Path) -> Export:
     """Read an export. Raises ExportError. The message names the file, the error and its place."""
     try:
-        if path.stat().st_size > MAX_EXPORT_BYTES:
-            raise ExportError(f"{path}: larger than {MAX_EXPORT_BYTES} bytes, which is too large for an export")
-        text = path.read_text(encoding="utf-8")
+        document = read_json(path, MAX_EXPORT_BYTES)
     except OSError as error:
         raise ExportError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise ExportError(f"{path}: not a chain export (not UTF-8 text)") from None
-    try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise json_error(path, error) from None
     return parse_export(path, document)
 
 
-def json_error(path: Path, error: ValueError | RecursionError) -> ExportError:
-    """Return the error for an export that is not JSON."""
-    where = f"line {error.lineno}" if isinstance(error, json.JSONDecodeError) else "its nesting"
-    if isinstance(error, ValueError) and not isinstance(error, json.JSONDecodeError):
-        where = "a number of thousands of digits"
-    return ExportError(f"{path}: truncated or damaged: not JSON at {where}; export it again")
+def json_error(path: Path, error: ValueError) -> ExportError:
+    """Return the error for an export that is not JSON, or exceeds the limits of `parse_json`."""
+    return ExportError(f"{path}: truncated or damaged: {json_problem(error)}; export it again")
 
 
 def parse_export(path: Path, document: Any) -> Export:
@@ -335,6 +328,8 @@ def _holds_traces(directory: Path) -> bool:
 
 
 def _first_problem(error: ValidationError) -> str:
+    if error.error_count() > MAX_ERRORS:
+        return f"{error.error_count()} errors in it; the export was edited or damaged"
     problem: Any = error.errors()[0]
     where = ".".join(str(part) for part in problem["loc"])
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""

@@ -5,7 +5,6 @@ entry without a required key is removed as a whole. Rejecting the whole file ins
 killed run.
 """
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,8 +13,11 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from harness.archive.exports import MAX_ERRORS
 from harness.archive.run_record import SCHEMA, JudgedRecord, RunRecord
 from harness.errors import RunDirectoryError
+from ucp.plain_file import MAX_JSON_WEIGHT, json_problem, read_json
+from ucp.short_value import shown
 
 Model = TypeVar("Model", bound=BaseModel)
 Place = tuple[dict[Any, Any] | list[Any], Any]
@@ -23,7 +25,6 @@ Place = tuple[dict[Any, Any] | list[Any], Any]
 
 MAX_ROUNDS = 100
 """Maximum number of validations. Each one removes the invalid parts that it finds. Documents are not nested deeper."""
-MAX_ERRORS = 20_000
 MAX_NAME = 80
 UNKNOWN_KEY = "extra_forbidden"
 LONE_SURROGATE = "string_unicode"
@@ -122,9 +123,9 @@ def _remove(places: Sequence[Place]) -> None:
         holder[:] = [part for index, part in enumerate(holder) if index not in indices]
 
 
-MAX_BYTES = 64 * 1024 * 1024
-MAX_VALUES = 2_000_000
-"""Maximum number of values. A record of 100,000 scripted fates, which is the maximum, has 1,200,000 values."""
+MAX_BYTES = 48 * 1024 * 1024
+MAX_WEIGHT = 2_000_000
+"""Maximum weight of a record, with up to 100,000 scripted fates of a scenario."""
 
 
 class DamagedRecordError(RunDirectoryError):
@@ -171,22 +172,36 @@ def _read(path: Path) -> RecordFile:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise DamagedRecordError(
-                f"{path}: larger than {MAX_BYTES} bytes, which is too large for the record of a run"
-            )
-        text = path.read_text(encoding="utf-8")
-        if text.count(",") > MAX_VALUES:
-            raise DamagedRecordError(
-                f"{path}: more than {MAX_VALUES} values, which is too many for the record of a run"
-            )
-        document = json.loads(text)
+        document = read_json(path, MAX_BYTES, MAX_WEIGHT)
     except OSError as error:
         raise DamagedRecordError(f"{path}: cannot be read: {error.strerror}; is this a run directory?") from None
-    except (ValueError, RecursionError):
-        raise DamagedRecordError(f"{path}: truncated or damaged: not a JSON document") from None
+    except ValueError as error:
+        raise DamagedRecordError(f"{path}: truncated or damaged: {json_problem(error)}") from None
+    if _exceeds(document, MAX_JSON_WEIGHT):
+        raise DamagedRecordError(f"{path}: truncated or damaged: too many values")
     if not isinstance(document, dict) or "schema" not in document:
         raise DamagedRecordError(f"{path}: not the result of a run (it has no `schema`)")
     if document["schema"] != SCHEMA:
-        raise RunDirectoryError(f"{path}: its schema is {document['schema']!r}, and this version reads {SCHEMA!r}")
+        raise RunDirectoryError(f"{path}: its schema is {shown(document['schema'])}, and this version reads {SCHEMA!r}")
     return document
+
+
+_SCRIPTS = ("fates", "datagrams")
+
+
+def _exceeds(document: Any, most: int) -> bool:
+    """Return whether a document has more values than `most`, without the scripts of its scenario.
+
+    The validation of those ends at the first error.
+    """
+    parts: list[Any] = [document]
+    count = 0
+    while parts and count <= most:
+        part = parts.pop()
+        if isinstance(part, dict):
+            values = [value for key, value in part.items() if key not in _SCRIPTS or not isinstance(value, list)]
+        else:
+            values = part
+        count += len(values)
+        parts += [value for value in values if isinstance(value, dict | list)]
+    return count > most

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from harness.archive.bounded_file import BoundedFile
+from ucp.plain_file import open_plain_file
 
 SUFFIX = ".trace.jsonl"
 PACKED_SUFFIX = f"{SUFFIX}.gz"
@@ -71,7 +72,7 @@ def pack_traces(agents: Path, report_progress: Callable[[str], None]) -> None:
 
 def _pack(path: Path, packed: Path) -> None:
     packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, 16 + zlib.MAX_WBITS)
-    with path.open("rb") as source, packed.open("wb") as target:
+    with open_plain_file(path) as source, packed.open("wb") as target:
         while data := source.read(_CHUNK_BYTES):
             target.write(packer.compress(data))
         target.write(packer.flush())

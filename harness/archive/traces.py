@@ -18,9 +18,11 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from harness.archive.trace_files import open_trace
 from harness.errors import RunDirectoryError
+from ucp.plain_file import check_weight, parse_json
 from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
 
-MAX_LINE_BYTES = 16 * 1024 * 1024
+MAX_LINE_BYTES = 2 * 1024 * 1024
+MAX_LINE_WEIGHT = 100_000
 LARGEST = 2**64
 """Limit of integers in a header. A larger one cannot be a setting, because it does not fit into 64 bits."""
 PLACES = ("chain", "deque", "stack")
@@ -28,6 +30,9 @@ _HEADER_KEYS = ("schema", "agent_id", "roster", "initial_data", "settings", "clo
 
 
 Version = Literal["ucp-trace/1", "ucp-trace/2"]
+
+
+Record = TypeVar("Record")
 
 
 class Header(BaseModel):
@@ -100,7 +105,7 @@ def read_clock(path: Path) -> dict[str, Any]:
     """Return the clock in the header of a trace. It is empty if the header cannot be read."""
     try:
         with open_trace(path) as file:
-            return HEADER.validate_json(file.readline(MAX_LINE_BYTES)).clock
+            return _validate(HEADER, file.readline(MAX_LINE_BYTES)).clock
     except (OSError, ValueError):
         return {}
 
@@ -268,8 +273,14 @@ class HeldBlocks:
 def parse_line(line: bytes) -> Header | Entry:
     """Return the content of a trace line. Raises ValueError if the line is invalid."""
     if b'"handler"' in line:
-        return HANDLER_RUN.validate_json(line)
-    return ASIDE.validate_json(line) if b'"schema"' not in line else HEADER.validate_json(line)
+        return _validate(HANDLER_RUN, line)
+    return _validate(ASIDE, line) if b'"schema"' not in line else _validate(HEADER, line)
+
+
+def _validate(kind: TypeAdapter[Record], line: bytes) -> Record:
+    """Return the record in a line. Raises ValueError."""
+    check_weight(line, MAX_LINE_WEIGHT)
+    return kind.validate_json(line)
 
 
 def gap_line(gap: Gap) -> str:
@@ -295,10 +306,10 @@ def why_not_a_trace(path: Path) -> str:
     """Return the reason why the file does not begin like a trace."""
     try:
         with open_trace(path) as file:
-            header = json.loads(file.readline(MAX_LINE_BYTES))
+            header = parse_json(file.readline(MAX_LINE_BYTES))
     except OSError as error:
         return f"cannot be read: {error.strerror}"
-    except (ValueError, RecursionError):
+    except ValueError:
         return "not a trace"
     schema = header.get("schema") if isinstance(header, dict) else None
     if not isinstance(schema, str) or schema in get_args(Version):
@@ -327,7 +338,7 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
                 if skim and trace is not None and _ONLY_RECEIVES.fullmatch(line):
                     continue
                 try:
-                    entry = parse_line(line) if trace else HEADER.validate_json(line)
+                    entry = parse_line(line) if trace else _validate(HEADER, line)
                     if trace is None:
                         assert isinstance(entry, Header)
                         trace = Trace(entry)
@@ -348,9 +359,6 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
     except OSError:
         return None
     return trace
-
-
-Record = TypeVar("Record")
 
 
 class HandlerRunLine(NamedTuple):
@@ -396,7 +404,7 @@ def read_trace_lines(path: Path) -> Iterator[HandlerRunLine]:
 
 def _validated(kind: TypeAdapter[Record], path: Path, number: int, text: bytes) -> Record:
     try:
-        return kind.validate_json(text)
+        return _validate(kind, text)
     except ValueError:
         raise RunDirectoryError(
             f"{path}: line {number} is damaged, or of another version of traces: play the run again"

@@ -20,6 +20,8 @@ from harness.scenario import Scenario, load_scenario
 from harness.scenario.agent_options import quirks_in_words
 from harness.scenario.load import parse
 from ucp.messages import PORT
+from ucp.mission import MAX_INITIAL_DATA_BYTES
+from ucp.plain_file import read_plain_file
 from ucp.sealed import seal_to
 
 if TYPE_CHECKING:
@@ -164,7 +166,7 @@ def _initial_data(text: str | None, requested: Scenario) -> bytes:
     if not text.startswith("@"):
         return text.encode(errors="surrogateescape")
     try:
-        return Path(text[1:]).read_bytes()
+        return read_plain_file(Path(text[1:]), MAX_INITIAL_DATA_BYTES)
     except OSError as error:
         raise MissionFileError(f"{text[1:]} cannot be read: {error.strerror}; name another file for the data") from None
 

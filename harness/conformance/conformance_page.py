@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from harness.conformance.results import FURTHER_CHECKS, TITLES, AlgorithmCounts, Results
 from harness.conformance.results_table import headline
-from harness.errors import HarnessError
+from harness.errors import HarnessError, ScenarioError
 from harness.report import html
+from harness.scenario.load import parse_yaml
+from ucp.plain_file import read_text
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 _STYLE = """
@@ -39,12 +39,10 @@ def read_agents(path: Path) -> dict[str, list[str]]:
     """Return the command of each agent by name, from a YAML file. Raises AgentsFileError."""
     form = "`name: [program, argument, ...]` for each agent"
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise AgentsFileError(f"{path} is larger than {MAX_BYTES} bytes: it must be {form}")
-        document: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        document: Any = parse_yaml(read_text(path, MAX_BYTES))
     except OSError as error:
         raise AgentsFileError(f"{path} cannot be read: {error.strerror}") from None
-    except (yaml.YAMLError, ValueError, RecursionError):
+    except (ScenarioError, ValueError):
         raise AgentsFileError(f"{path} is not YAML: it must be {form}") from None
     right = isinstance(document, dict) and all(
         isinstance(name, str)

@@ -32,6 +32,7 @@ from harness.errors import HarnessError
 from ucp import agent
 from ucp.handler import EventHandler, LocalEvent
 from ucp.messages import Message
+from ucp.plain_file import read_plain_file
 
 LAST_ALGORITHM = 20
 
@@ -116,10 +117,13 @@ class Variant:
         return f"{self.name} (Algorithm{'s' * (len(numbers) > 1)} {', '.join(numbers)})"
 
 
+MAX_BYTES = 1024 * 1024
+
+
 def load_variant(path: Path) -> Variant:
     """Load a variant by executing its file, and return it. Raises VariantError."""
     try:
-        content = path.read_bytes()
+        content = read_plain_file(path, MAX_BYTES)
         module = ModuleType(path.stem)
         module.__file__ = str(path)
         exec(compile(content, path, "exec"), vars(module))  # noqa: S102  # it is the code of the user

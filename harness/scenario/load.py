@@ -1,8 +1,7 @@
 """Load a scenario from a file or from the included library, and explain validation errors in one sentence."""
 
 import re
-import stat
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any, get_args
@@ -12,7 +11,9 @@ from pydantic import BaseModel, ValidationError
 
 from harness.errors import ScenarioError
 from harness.present.text import did_you_mean
+from harness.scenario._yaml_loader import YamlLoader
 from harness.scenario.scenario import Scenario
+from ucp.plain_file import read_text
 from ucp.short_value import shown, shown_key
 
 _PACKAGE = Path(__file__).parents[1]
@@ -47,9 +48,10 @@ def first_sentence(name: str) -> str:
     return " ".join(comment).partition(". ")[0].removesuffix(".") + "."
 
 
+MAX_ERRORS = 20_000
+"""Maximum number of errors that are described. Their description takes a kilobyte each."""
 MAX_PROBLEM = 200
 """Maximum number of characters of a parser message in an error."""
-MAX_NESTING = 50
 MAX_FILES_BESIDE = 1000
 MAX_SCENARIO_BYTES = 8 * 1024 * 1024
 """Maximum size of a scenario file. The events of a flight of two hours with twenty vehicles take half of it."""
@@ -81,32 +83,10 @@ def parse(document: dict[str, Any], beside: Path | None = None) -> Scenario:
         raise ScenarioError(explain(error, Scenario)) from None
 
 
-class _Loader(yaml.SafeLoader):
-    """A safe YAML loader that rejects duplicate keys and deep nesting.
-
-    YAML forbids duplicate keys, but the safe loader of PyYAML uses the last one. Deep nesting would take its scanner
-    long.
-    """
-
-    def fetch_flow_collection_start(self, TokenClass: Any) -> None:  # noqa: N803  (its name in yaml)
-        if self.flow_level >= MAX_NESTING:
-            raise yaml.scanner.ScannerError(problem="it is nested too deeply", problem_mark=self.get_mark())
-        super().fetch_flow_collection_start(TokenClass)
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[str] = set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
-            if key.value in seen:
-                problem = f"{shown_key(key.value)} is repeated"
-                raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
 def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text. Raises ScenarioError whose message starts with "not YAML"."""
     try:
-        return yaml.load(text, _Loader)  # noqa: S506  (a safe loader)
+        return yaml.load(text, YamlLoader)  # type: ignore[arg-type]  # noqa: S506  (a safe loader)
     except RecursionError:
         where, problem = "", "it is nested too deeply"
     except yaml.YAMLError as error:
@@ -125,12 +105,7 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
     """
     path = find_file(path)
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise ScenarioError(f"{path}: not a file with a {what}")
-        if status.st_size > MAX_SCENARIO_BYTES:
-            raise ScenarioError(f"{path}: larger than {MAX_SCENARIO_BYTES} bytes, which is too large for a {what}")
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, MAX_SCENARIO_BYTES)
     except FileNotFoundError:
         names = "`ucp-harness scenarios` lists the included scenarios"
         raise ScenarioError(f"{path}: no such file or {what}; {names}{did_you_mean(path, _near(path))}") from None
@@ -138,8 +113,6 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
         raise ScenarioError(f"{str(path)[:MAX_PROBLEM]}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise ScenarioError(f"{path}: not YAML: it is not UTF-8 text") from None
-    except ValueError:  # NUL
-        raise ScenarioError(f"{shown(str(path))}: not a valid file name") from None
     try:
         document = parse_yaml(text)
     except ScenarioError as error:
@@ -158,6 +131,8 @@ def _near(path: Path) -> Iterator[str]:
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
     """Return the most specific problem that pydantic found, as one sentence."""
+    if error.error_count() > MAX_ERRORS:
+        return f"{error.error_count()} errors in it"
     problems: list[Any] = error.errors()
     problem = max(problems, key=lambda candidate: (len(candidate["loc"]), candidate["type"] == "extra_forbidden"))
     key = ".".join(shown_key(part) for part in problem["loc"])

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import FailFast, Field, field_validator, model_validator
 
 from harness.present.text import did_you_mean
 from harness.scenario._network import NetworkModel
@@ -112,9 +112,9 @@ class Scenario(Model):
     """Mistakes that all agents, or the listed agents, make on purpose. `ucp.quirks` declares them."""
     clocks: dict[VehicleKey, AgentClock] = {}
     """Clocks of agents, by agent ID. Other agents have an exact clock. In virtual time only."""
-    fates: Annotated[list[Fate], Field(max_length=100_000)] = []
+    fates: Annotated[list[Fate], Field(max_length=100_000), FailFast()] = []
     """Scripted delivery or loss of single messages. In virtual time only."""
-    datagrams: Annotated[list[ScriptedDatagram], Field(max_length=100_000)] = []
+    datagrams: Annotated[list[ScriptedDatagram], Field(max_length=100_000), FailFast()] = []
     """Datagrams that no agent sent but that agents receive. In virtual time only."""
     lateness: dict[VehicleKey, Lateness] = {}
     """Late timers, by agent ID. In "3+0.25 8+1" the timer with number 3 expires 0.25 mission seconds late, and number 8

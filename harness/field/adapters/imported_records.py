@@ -49,6 +49,7 @@ from netem.pcapng import PcapngFile, header
 from ucp.block import MAX_AGENT_ID
 from ucp.events import LoggableEvent
 from ucp.messages import PORT, MalformedDatagramError, decode
+from ucp.plain_file import open_plain_file
 
 FILE = "import.json"
 
@@ -232,7 +233,7 @@ def _copy_capture(capture: Path, directory: Path, name: str) -> str:
 def _copy_flight_log(log: Path, directory: Path, number: int) -> str:
     (directory / FLIGHT_LOGS).mkdir(exist_ok=True)
     path = f"{FLIGHT_LOGS}/{number}-{log.name}"
-    with log.open("rb") as file, (directory / path).open("wb") as copy:
+    with open_plain_file(log) as file, (directory / path).open("wb") as copy:
         shutil.copyfileobj(file, copy, _COPY_BYTES)
     return path
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE, Export, name_blocks
@@ -14,6 +14,7 @@ from harness.errors import RunDirectoryError, ScenarioError
 from harness.scenario import Scenario, load, load_scenario
 from harness.scenario.load import MAX_SCENARIO_BYTES
 from harness.scenario.verdict_names import BAD_IN_WORDS, kind_of
+from ucp.plain_file import read_json, read_plain_file
 
 MAX_OUTCOME_BYTES = 64 * 1024 * 1024
 TIMING_DEPENDENT = ("2", "5", "6", "liveness")
@@ -165,12 +166,10 @@ def _at(chain: list[str], place: int) -> str:
 def read(path: Path) -> Outcome:
     """Read a result that was saved in a file. Raises RunDirectoryError."""
     try:
-        if path.stat().st_size > MAX_OUTCOME_BYTES:
-            raise RunDirectoryError(f"{path}: larger than {MAX_OUTCOME_BYTES} bytes, which is too large for an outcome")
-        return Outcome.model_validate_json(path.read_bytes())
+        return Outcome.model_validate(read_json(path, MAX_OUTCOME_BYTES))
     except OSError as error:
         raise RunDirectoryError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValidationError, RecursionError):
+    except ValueError:
         raise RunDirectoryError(f"{path}: not an outcome; `ucp-harness bisect --once ... --out` writes one") from None
 
 
@@ -220,7 +219,10 @@ def subject_of(path: Path, seed: int | None, agent: int | None) -> Subject:
 
 
 def _is_scenario(path: Path) -> bool:
-    return path.stat().st_size <= MAX_SCENARIO_BYTES and path.read_bytes().lstrip()[:5] == b"name:"
+    try:
+        return read_plain_file(path, MAX_SCENARIO_BYTES).lstrip()[:5] == b"name:"
+    except OSError:
+        return False
 
 
 def _played(path: Path) -> tuple[Scenario, int] | None:

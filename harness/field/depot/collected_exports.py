@@ -27,6 +27,7 @@ from harness.archive.exports import (
     Export,
     ExportedBlock,
     ExportedInception,
+    json_error,
 )
 from harness.archive.record_file import validate_leniently
 from harness.archive.traces import read_trace
@@ -42,6 +43,7 @@ from harness.gc_pause import gc_paused
 from harness.report.logbook.book import logged_telemetry
 from ucp.block import Block, InceptionBlock, next_chain_hash
 from ucp.export import SCHEMA
+from ucp.plain_file import parse_json
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -301,8 +303,8 @@ class _Reader:
         data = _content(path, named_by_user)
         problems: list[str] = []
         try:
-            export = Export.model_validate_json(data)
-        except ValidationError:
+            export = Export.model_validate(parse_json(data))
+        except ValueError:
             export = _recover(path, data, problems)
         return self._with_true_hashes(path, export, problems)
 
@@ -399,9 +401,11 @@ def _recover(path: Path, data: bytes, problems: list[str]) -> Export:
         raise NotAnExportError(f"{path}: not a chain export")
     text = data.decode("utf-8", errors="replace")
     try:
-        document = json.loads(text, strict=False)
-    except (ValueError, RecursionError) as error:
-        damage = error.pos if isinstance(error, json.JSONDecodeError) else 0
+        document = parse_json(text, strict=False)
+    except ValueError as error:
+        if not isinstance(error, json.JSONDecodeError):
+            raise json_error(path, error) from None
+        damage = error.pos
         document = _parse_prefix(text[:damage])
         if isinstance(document, dict):
             after = [*_intact_blocks(text[damage:])]
@@ -449,8 +453,8 @@ def _parse_prefix(text: str) -> Any:
             case ",":
                 complete_end, after = token.start(), "".join(reversed(closing))
     try:
-        return json.loads(text[:complete_end] + after, strict=False)
-    except (ValueError, RecursionError):
+        return parse_json(text[:complete_end] + after, strict=False)
+    except ValueError:
         return None
 
 

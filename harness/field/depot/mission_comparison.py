@@ -28,6 +28,7 @@ from harness.field.depot.mission_files import SUFFIX as MISSION_SUFFIX
 from harness.report.chain_tree import ranges
 from ucp.block import InceptionBlock
 from ucp.mission import Mission, MissionError, load_mission
+from ucp.plain_file import json_problem, parse_json
 from ucp.quirks import active_quirks
 
 Kind = Literal["mission file", "manifest", "chain export", "trace"]
@@ -179,15 +180,15 @@ def _beginning(path: Path) -> dict[str, Any]:
     try:
         with open_trace(path) as file:
             first = file.readline(MAX_LINE_BYTES)
-            with contextlib.suppress(ValueError, RecursionError):
-                if isinstance(document := json.loads(first), dict):
+            with contextlib.suppress(ValueError):
+                if isinstance(document := parse_json(first), dict):
                     return document
             text = first + file.read(MAX_EXPORT_BYTES)
-        document = json.loads(text)
+        document = parse_json(text)
     except OSError as error:
         raise UnreadableFileError(f"cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError):
-        why = "damaged: not JSON" if text.strip() else "empty"
+    except ValueError as error:
+        why = f"damaged: {json_problem(error)}" if text.strip() else "empty"
         raise UnreadableFileError(f"{why}; so its values are not compared") from None
     if not isinstance(document, dict):
         raise UnreadableFileError("not a mission file, manifest, chain export or trace")

@@ -7,13 +7,14 @@ import base64
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from harness.archive.bounded_file import BoundedFile
 from harness.archive.exports import AgentId, Base64
-from harness.archive.traces import MAX_LINE_BYTES
+from harness.archive.traces import MAX_LINE_BYTES, MAX_LINE_WEIGHT
 from harness.field.ingest._ingest import Omission
 from ucp.events import LoggableEvent
+from ucp.plain_file import check_weight
 
 SCHEMA: Literal["ucp-events/1"] = "ucp-events/1"
 SUFFIX = ".events.jsonl"
@@ -55,9 +56,10 @@ def read_logged(path: Path, left_out: list[Omission]) -> list[tuple[int, Loggabl
         while len(events) < MAX_EVENTS and (text := file.readline(MAX_LINE_BYTES)):
             number += 1
             try:
+                check_weight(text, MAX_LINE_WEIGHT)
                 line = EventLine.model_validate_json(text)
                 events.append((line.agent_id, line.event))
-            except ValidationError:
+            except ValueError:
                 damaged.append(number)
         if file.problem:
             left_out.append(Omission(path, file.problem))

@@ -1,6 +1,5 @@
 """Recognise the format of each file by its content, and group the records by flight."""
 
-import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +25,7 @@ from harness.field.ingest._trace_incarnations import TraceIncarnation, read_inca
 from harness.gc_pause import gc_paused
 from ucp.events import LoggableEvent
 from ucp.export import SCHEMA as EXPORT_SCHEMA
+from ucp.plain_file import parse_json_at
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -127,7 +127,7 @@ class Sorter:
                 self.exports.append((path, parse_export(path, document)))
         except ExportError as error:
             self._omit(path, str(error).removeprefix(f"{path}: "), line, counts)
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             what = "a chain export, but " if EXPORT_SCHEMA in text else ""
             self._omit(path, what + str(json_error(path, error)).removeprefix(f"{path}: "), line, counts)
 
@@ -136,12 +136,12 @@ class Sorter:
 
 
 def _documents(text: str) -> Iterator[Any]:
-    """Yield JSON documents that follow each other in a text. Raises ValueError or RecursionError."""
-    decoder, position = json.JSONDecoder(), 0
+    """Yield JSON documents that follow each other in a text. Raises ValueError."""
+    position = 0
     for _ in range(MAX_DOCUMENTS):
         if position == len(text):
             return
-        document, position = decoder.raw_decode(text, position)
+        document, position = parse_json_at(text, position)
         while position < len(text) and text[position] in _BLANK:
             position += 1
         yield document

@@ -20,6 +20,7 @@ from harness.field._vehicle_captures import AgentCapture, read_capture
 from harness.field.ingest import Flight, IngestResult, ingest_files
 from harness.field.replay._agent_record import Record
 from harness.gc_pause import gc_paused
+from ucp.plain_file import open_plain_file
 
 AGENTS = "agents"
 """Directory of the agents' files in a run directory."""
@@ -187,7 +188,7 @@ def _belongs_to_another(path: Path, agent_id: int) -> bool:
     if path.name.endswith((".chain.json", ".mission.json", ".log", ".store")):
         return True
     try:
-        with path.open("rb") as other:
+        with open_plain_file(path) as other:
             beginning = other.readline(MAX_LINE_BYTES)
             return beginning[:4] in MAGICS or HEADER.validate_json(beginning).agent_id != agent_id
     except (OSError, ValueError):

@@ -5,6 +5,7 @@ view) for positions, SceneUpdate for links and vehicles, Log for lines of logs. 
 of `_topics`. run.json and the chain exports are attached unchanged.
 """
 
+import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +17,7 @@ from harness.report.export._exported_run import ExportedRun
 from harness.report.export._links import FIELD, vehicle_frame
 from harness.report.export._samples import LogLine, LossSample, Position, Telemetry
 from harness.report.export._topics import Topics
+from ucp.plain_file import read_plain_file
 
 with extra("export", "writing MCAP"):
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -127,8 +129,9 @@ class _Writer:
         """
         begin_ns = recording.time.at(0.0)
         for path in (recording.directory / RUN_FILE, *export_paths(recording.directory)):
-            if path.is_file() and path.stat().st_size <= MAX_EXPORT_BYTES:
-                self._writer.add_attachment(begin_ns, begin_ns, path.name, "application/json", path.read_bytes())
+            with contextlib.suppress(OSError):
+                content = read_plain_file(path, MAX_EXPORT_BYTES)
+                self._writer.add_attachment(begin_ns, begin_ns, path.name, "application/json", content)
 
     def finish(self) -> None:
         self._writer.finish()

@@ -6,12 +6,13 @@ holds all incarnations.
 """
 
 from collections import deque
-from io import FileIO
+from io import BufferedReader
 from pathlib import Path
 
-from harness.archive.bounded_file import BoundedFile, open_plain_file
+from harness.archive.bounded_file import BoundedFile
 from harness.archive.trace_files import is_packed, open_trace, trace_file
 from harness.archive.traces import MAX_LINE_BYTES
+from ucp.plain_file import open_plain_file
 
 _CHUNK_BYTES = 256 * 1024
 
@@ -25,7 +26,7 @@ class GrowingFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.trouble: str | None = None
-        self._file: BoundedFile | FileIO | None = None
+        self._file: BufferedReader | None = None
         self._lines: deque[bytes] = deque()
         self._partial_line = b""
 
@@ -47,8 +48,7 @@ class GrowingFile:
             return False
         try:
             if self._file is None:
-                packed = is_packed(self.path)
-                self._file = open_trace(self.path) if packed else FileIO(open_plain_file(self.path))
+                self._file = (open_trace if is_packed(self.path) else open_plain_file)(self.path)
             data = self._file.read(_CHUNK_BYTES)
         except FileNotFoundError:
             return False

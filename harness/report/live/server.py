@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import hmac
 import json
+import logging
 import os
 import secrets
 from collections import deque
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from harness.errors import MachineError
 from harness.report.html import PALETTE
@@ -87,7 +89,7 @@ class Server:
         application.router.add_get("/{token}/live", self._stream)
         application.router.add_get("/{token}/report.html", self._report)
         application.router.add_get("/{token}/{name:.*}", self._file)
-        runner = web.AppRunner(application, access_log=None, shutdown_timeout=1.0, handle_signals=False)
+        runner = web.AppRunner(application, access_log=None, shutdown_timeout=1.0, handle_signals=False, logger=_log())
         await runner.setup()
         try:
             site = web.TCPSite(runner, "127.0.0.1", port)
@@ -110,7 +112,7 @@ class Server:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse requests without the secret token, and requests from other web pages."""
-        token = request.path.split("/")[1]
+        token = request.path.partition("/")[2].partition("/")[0]  # the path of CONNECT is empty
         origin = request.headers.get("Origin")
         foreign = request.host not in self._hosts or origin not in (None, *(f"http://{host}" for host in self._hosts))
         if foreign or not hmac.compare_digest(token.encode(), self._token.encode()):
@@ -199,3 +201,14 @@ class Server:
                 with contextlib.suppress(ValueError, RecursionError):
                     self._on_request(page, json.loads(message.data))
         await socket.close()
+
+
+def _log() -> logging.Logger:
+    """Return a log of errors without those of malformed requests, which any program of this machine can send."""
+    log = logging.getLogger(__name__)
+    log.addFilter(_is_own_error)
+    return log
+
+
+def _is_own_error(record: logging.LogRecord) -> bool:
+    return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)

@@ -16,7 +16,6 @@ write it anew.
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from harness.errors import ScenarioError
 from harness.report.stories.sentences import StoryEntries
 from harness.scenario import Scenario
 from harness.scenario.load import parse, parse_yaml
+from ucp.plain_file import read_text
 
 MAX_BYTES = 1024 * 1024
 MAX_LINES = 20_000
@@ -80,8 +80,8 @@ class Story:
 def is_story(path: Path) -> bool:
     """Return true if the file is a story. Other tools use the same file name suffix."""
     try:
-        with path.open(encoding="utf-8") as file:
-            return any(_SENTENCE.fullmatch(line.rstrip("\n")) for line in islice(file, MAX_LINES))
+        lines = read_text(path, MAX_BYTES).splitlines()
+        return any(_SENTENCE.fullmatch(line) for line in lines[:MAX_LINES])
     except (OSError, UnicodeDecodeError):
         return False
 
@@ -89,9 +89,7 @@ def is_story(path: Path) -> bool:
 def read_story(path: Path) -> Story:
     """Read a story file. Raises ScenarioError that names the file and the line."""
     try:
-        if not path.is_file() or path.stat().st_size > MAX_BYTES:
-            raise ScenarioError(f"{path}: not a file, or too large for a story")
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, MAX_BYTES)
     except (OSError, UnicodeDecodeError) as error:
         why = "it is not UTF-8 text" if isinstance(error, UnicodeDecodeError) else error.strerror
         raise ScenarioError(f"{path}: cannot be read: {why}") from None

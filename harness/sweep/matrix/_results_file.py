@@ -18,6 +18,7 @@ from harness.errors import MachineError, RunDirectoryError
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._matrix_file import Matrix, Task
 from ucp.agent_files import write_atomically
+from ucp.plain_file import parse_json
 
 FILE = "results.jsonl"
 SCHEMA = "ucp-matrix-results/1"
@@ -81,8 +82,8 @@ def _header(matrix: Matrix) -> dict[str, Any]:
 def _start_time(line: bytes, matrix: Matrix, directory: Path) -> str:
     """Return the start time of the matrix in `directory`. Raises RunDirectoryError if it is a different matrix."""
     try:
-        header = json.loads(line)
-    except (ValueError, RecursionError):
+        header = parse_json(line)
+    except ValueError:
         header = None
     if not isinstance(header, dict) or header.get("schema") != SCHEMA:
         raise RunDirectoryError(f"{directory} is not empty: choose another --out; existing files are not overwritten")

@@ -1,6 +1,5 @@
 """Store the results of a matrix for every night, and choose the night with which a matrix is compared."""
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from harness.errors import MachineError, RunDirectoryError, ScenarioError
 from harness.sweep.matrix._matrix_file import Matrix, Point
 from harness.sweep.matrix.matrix_record import SCHEMA, MatrixRecord
 from ucp.agent_files import write_json_atomically
+from ucp.plain_file import json_problem, read_json
 from ucp.short_value import shown
 
 MAX_REASONS = 10
@@ -89,17 +89,20 @@ def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
     return record
 
 
+MAX_BYTES = 64 * 1024 * 1024
+
+
 def _load(path: Path) -> MatrixRecord:
     """Load matrix.json. Raises ScenarioError unless it contains finished results of a matrix.
 
     Raises OtherVersionError if it has the schema, but not its keys.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = read_json(path, MAX_BYTES)
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValueError, RecursionError):
-        raise ScenarioError(f"{path} is not JSON: an earlier night is its matrix.json") from None
+    except ValueError as error:
+        raise ScenarioError(f"{path}: {json_problem(error)}; an earlier night is its matrix.json") from None
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema != SCHEMA:
         claim = f"has schema {shown(schema)}" if schema is not None else "names no schema"

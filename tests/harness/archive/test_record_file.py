@@ -9,12 +9,13 @@ import pytest
 
 from harness import checker
 from harness.archive.archive import RunArchive
-from harness.archive.record_file import MAX_VALUES, DamagedRecordError, RecordFile, read_record, validate_leniently
+from harness.archive.record_file import DamagedRecordError, RecordFile, read_record, validate_leniently
 from harness.archive.run_record import RunRecord
 from harness.play.progress import Silent
 from harness.run.run import run
 from tests.harness.mission import edit
 from tests.harness.virtual import scenario
+from ucp.plain_file import MAX_JSON_WEIGHT
 
 
 @pytest.fixture(scope="module")
@@ -97,9 +98,9 @@ def test_record_with_too_many_errors_is_rejected(intact_run: Path, tmp_path: Pat
     path = tmp_path / "run.json"
     file = edited(intact_run, tmp_path, lambda record: record.update(faults=[7] * 30_000))
     assert file.problems == [f"{path}: 30000 errors in it; it was edited or damaged"]
-    path.write_text(f'{{"faults": [{"7," * MAX_VALUES}7, 7]}}')
+    path.write_text(f'{{"faults": [{"7," * MAX_JSON_WEIGHT}7, 7]}}')
     file = read_record(path)
-    assert file.problems == [f"{path}: more than 2000000 values, which is too many for the record of a run"]
+    assert file.problems == [f"{path}: truncated or damaged: too many values"]
     assert isinstance(file.error, DamagedRecordError)
     assert file.judged is None
 

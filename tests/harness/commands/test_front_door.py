@@ -188,10 +188,14 @@ def test_closed_standard_output_does_not_change_the_status(
 
 def test_run_refuses_a_scenario_that_is_no_regular_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "scenario.yaml")
-    for path in (tmp_path / "scenario.yaml", "/dev/zero", tmp_path):
+    for path, why in (
+        (tmp_path / "scenario.yaml", "not a file"),
+        ("/dev/zero", "not a file"),
+        (tmp_path, "a directory"),
+    ):
         refused = harness("run", path)
         assert refused.returncode == 2
-        assert sentences(refused.stderr) == [f"{path}: not a file with a scenario"]
+        assert sentences(refused.stderr) == [f"{path}: cannot be read: is {why}"]
 
 
 def test_mission_above_the_maximum_duration_is_refused(tmp_path: Path) -> None:

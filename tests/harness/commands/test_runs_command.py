@@ -36,7 +36,7 @@ def test_damaged_record_is_reported_and_the_others_are_listed(runs: Path) -> Non
     (runs / "older" / "run.json").write_text("{")
     listed = harness("runs", runs)
     assert "newer" in listed.stdout
-    assert sentences(listed.stderr) == [f"{runs / 'older' / 'run.json'}: truncated or damaged: not a JSON document"]
+    assert sentences(listed.stderr) == [f"{runs / 'older' / 'run.json'}: truncated or damaged: not JSON at line 1"]
 
 
 def test_runs_opens_a_report_or_names_the_command_that_writes_it(runs: Path, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from harness.field.adapters.bags._decompression import (
     RawMessage,
     decompress_file,
 )
+from ucp.plain_file import open_plain_file
 
 MAGICS = (_version_1.MAGIC, _mcap_bag.MAGIC, _sqlite.MAGIC, ZSTD_MAGIC)
 """The first bytes of bags, and of files compressed with zstd."""
@@ -67,7 +68,7 @@ def _items(path: Path, scratch: Path) -> Iterator[Item]:
     if magic == _sqlite.MAGIC:
         yield from _sqlite.items(path, scratch)
     elif magic in (_version_1.MAGIC, _mcap_bag.MAGIC):
-        with path.open("rb") as bag, mmap.mmap(bag.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        with open_plain_file(path) as bag, mmap.mmap(bag.fileno(), 0, access=mmap.ACCESS_READ) as content:
             yield from (_version_1 if magic == _version_1.MAGIC else _mcap_bag).items(content)
     else:
         yield Damage("it is no ROS bag")
@@ -76,6 +77,6 @@ def _items(path: Path, scratch: Path) -> Iterator[Item]:
 
 
 def _magic(path: Path) -> bytes | None:
-    with path.open("rb") as file:
+    with open_plain_file(path) as file:
         beginning = file.read(max(map(len, MAGICS)))
     return next((magic for magic in MAGICS if beginning.startswith(magic)), None)

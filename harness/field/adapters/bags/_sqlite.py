@@ -16,6 +16,7 @@ from harness.field.adapters.bags._decompression import (
     RawMessage,
 )
 from harness.field.adapters.bags._sqlite_pages import FILE_HEADER_BYTES, SqlitePages
+from ucp.plain_file import open_plain_file
 
 MAGIC = b"SQLite format 3\0"
 JOURNAL = "-wal"
@@ -52,7 +53,7 @@ def items(path: Path, scratch: Path) -> Iterator[Item]:
 
 def _pages_of_truncated(path: Path) -> SqlitePages | None:
     """Return the pages of a file that is shorter than its header states. Return None for any other file."""
-    with path.open("rb") as file:
+    with open_plain_file(path) as file:
         header = file.read(FILE_HEADER_BYTES)
         if len(header) < FILE_HEADER_BYTES:
             return None

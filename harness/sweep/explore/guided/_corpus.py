@@ -14,7 +14,6 @@ the program of an agent.
 import fcntl
 import json
 import re
-import stat
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -32,6 +31,7 @@ from harness.sweep.explore.guided._hunt import MOST_KEPT, Candidate
 from harness.sweep.explore.guided._hunt_trial import with_liveness_phase, without_liveness_phase
 from harness.sweep.explore.guided._mutation import Limits
 from ucp.agent_files import write_atomically, write_json_atomically
+from ucp.plain_file import open_plain_file, parse_json, read_plain_file
 
 SCHEMA = "ucp-corpus/1"
 MOST_BYTES = 256 * 1024
@@ -186,21 +186,20 @@ class Corpus:
     def _nights(self) -> Iterator[dict[str, Any]]:
         for path in sorted((self.directory / "nights").glob("*.json"))[-MOST_NIGHTS:]:
             try:
-                night = json.loads(self._read(path))
+                night = parse_json(self._read(path))
                 if type(night["local_states"]) is not int or not 0 <= night["local_states"] < MOST_STATES:
                     raise ValueError
-            except (ValueError, KeyError, TypeError, RecursionError, ScenarioError):
+            except (ValueError, KeyError, TypeError, OSError):
                 self.left_out.append(f"{path} is no night of this corpus")
                 continue
             yield night
 
     def _document(self, path: Path) -> Document | None:
         try:
-            if path.stat(follow_symlinks=False).st_size > MOST_BYTES:
-                raise ScenarioError(f"{path}: larger than {MOST_BYTES} bytes")
-            document = json.loads(text) if (text := self._read(path)).startswith(b"{") else read_yaml(path, "scenario")
+            text = read_plain_file(path, MOST_BYTES)
+            document = parse_json(text) if text.startswith(b"{") else read_yaml(path, "scenario")
             return check_fits(document, self.base, self.limits)
-        except (OSError, ValueError, RecursionError, ScenarioError) as error:
+        except (OSError, ValueError, ScenarioError) as error:
             self.left_out.append(f"{path.name} is left out: {str(error)[:200]}")
             return None
 
@@ -211,10 +210,7 @@ class Corpus:
         self._checked_write(rename, path)
 
     def _read(self, path: Path) -> bytes:
-        status = path.stat(follow_symlinks=False)
-        if not stat.S_ISREG(status.st_mode) or status.st_size > 64 * MOST_BYTES:
-            raise ScenarioError(f"{path} is no file that was written here")
-        return path.read_bytes()
+        return read_plain_file(path, 64 * MOST_BYTES)
 
     def _write(self, path: Path, text: str) -> None:
         self._checked_write(lambda path: write_atomically(path, text), path)
@@ -239,17 +235,17 @@ def opened(directory: Path, scenario: Scenario, limits: Limits) -> Corpus:
             (directory / part).mkdir(parents=True, exist_ok=True)
         if not path.exists():
             write_json_atomically(path, {"schema": SCHEMA, "scenario": base})
-        lock = path.open("rb")
+        lock = open_plain_file(path)
     except OSError as error:
         raise RunDirectoryError(f"{directory} cannot be used: {error.strerror}; choose another --corpus") from None
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        header = json.loads(lock.read(64 * MOST_BYTES))
+        header = parse_json(lock.read(64 * MOST_BYTES))
         if not isinstance(header, dict) or header.get("schema") != SCHEMA:
             raise ValueError
     except BlockingIOError:
         raise RunDirectoryError(f"another command works on the corpus in {directory}: wait for its end") from None
-    except (ValueError, RecursionError):
+    except ValueError:
         raise RunDirectoryError(f"{path} is no corpus of this version ({SCHEMA}): choose another --corpus") from None
     if header.get("scenario") != json.loads(json.dumps(base)):
         raise RunDirectoryError(f"{directory} is the corpus of another scenario: choose another --corpus")

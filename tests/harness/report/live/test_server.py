@@ -53,6 +53,25 @@ def test_only_the_address_with_the_token_opens_the_page(tmp_path: Path) -> None:
     asyncio.run(visit())
 
 
+def test_malformed_requests_are_answered_and_not_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def ask(port: int, request: bytes) -> int:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(request)
+        status = int((await reader.readline()).split()[1])
+        writer.close()
+        return status
+
+    async def visit() -> None:
+        async with served(tmp_path) as (_, address):
+            port = urlsplit(address).port or 0
+            assert await ask(port, b"CONNECT 127.0.0.1:80 HTTP/1.1\r\nHost: x\r\n\r\n") == 403
+            for request in (b"GET http://[::1 HTTP/1.1", b"GET / HTTP/9.9", b"\x16\x03\x01", b"GET / HTTP/1.1\r\nA"):
+                assert await ask(port, request + b"\r\n\r\n") == 400
+
+    asyncio.run(visit())
+    assert caplog.text == ""
+
+
 def test_no_address_leads_to_another_file(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("secret")
 

@@ -217,7 +217,7 @@ def test_kept_nights_have_no_single_runs(tmp_path: Path) -> None:
     ("content", "sentence"),
     [
         (None, "cannot be read: No such file or directory"),
-        ("", "is not JSON: an earlier night is its matrix.json"),
+        ("", "not JSON at line 1; an earlier night is its matrix.json"),
         ("[]", "names no schema: an earlier night is its matrix.json, whose schema is ucp-matrix/1"),
         ('{"schema": "ucp-run/1"}', "has schema 'ucp-run/1': an earlier night is its matrix.json"),
     ],
