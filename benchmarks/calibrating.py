@@ -20,7 +20,7 @@ from typing import Any
 from harness.errors import HarnessError
 from harness.field.calibrate._delivery_model import DeliveryModel
 from harness.field.calibrate.calibration import Calibration, calibrate, model_of
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.scenario import Scenario
 from netem.radio import LogDistance
@@ -56,7 +56,7 @@ def scenario_of(number: int, agents: int = 5, duration_s: float = 1200.0) -> tup
 def calibrated(number: int, directory: Path, **options: Any) -> tuple[Calibration, DeliveryModel]:
     """Simulate a flight and calibrate it. Return the calibration and the true parameters."""
     scenario, truth = scenario_of(number, **options)
-    record = run(Scenario.model_validate(scenario), number, directory, Silent(), "sim").directory
+    record = run(Scenario.model_validate(scenario), number, directory, SilentProgress(), "sim").directory
     return calibrate([record]), truth
 
 

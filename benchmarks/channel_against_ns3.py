@@ -75,7 +75,7 @@ from typing import Any, Literal
 
 from benchmarks.rounds import show
 from harness.errors import CANNOT_HERE
-from netem.channel import PRESETS, Channel, Contention, Fate
+from netem.channel import PRESETS, Channel, FrameFate, WifiRadio
 from netem.radio import LogDistance, Place
 
 SOURCE = Path(__file__).with_name("channel_ns3.cc")
@@ -271,10 +271,10 @@ def read_table() -> dict[Cell, Delivery]:
 # The model
 
 
-def radio(cell: Cell) -> Contention:
+def radio(cell: Cell) -> WifiRadio:
     """Return the radio model with the settings of ns-3."""
     preset = PRESETS["wifi_1" if cell.standard == "b" else "wifi_6"]
-    assert isinstance(preset, Contention)
+    assert isinstance(preset, WifiRadio)
     if cell.standard == "a":
         preset = replace(preset, slot_s=9e-6, difs_s=34e-6, eifs_s=94e-6, extension_s=0.0)
     return replace(
@@ -312,7 +312,7 @@ def beacons(cell: Cell, channel: Channel) -> Delivery:
         if first <= number < last:
             batch = BATCHES * (number - first) // cell.messages
             asked[batch] += wanted[station].bit_count()
-            if not isinstance(frame, Fate):
+            if not isinstance(frame, FrameFate):
                 frames[frame] = batch
         for sent in channel.advance(now):
             if (batch := frames.pop(sent.number, -1)) >= 0:

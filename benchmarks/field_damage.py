@@ -32,11 +32,11 @@ from harness.field.depot.collected_exports import collect_exports
 from harness.field.depot.consolidation import consolidate
 from harness.field.ingest import ingest_files
 from harness.field.reconstruct import reconstruct
-from harness.field.replay import Player, open_records
+from harness.field.replay import RecordPlayer, open_records
 from harness.field.replay.field_evidence import field_evidence
 from harness.play.backends import BACKENDS
 from harness.play.mission import play_on
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.parallel import FailedTask, sweep
 from harness.scenario import Scenario
 from ucp.quirks import QUIRKS
@@ -296,7 +296,7 @@ def scenario(number: int, backend: BackendName, quirk: str | None = None) -> Sce
 
 def bring_home(asked: Scenario, number: int, backend: BackendName, run: Path, home: Path) -> dict[int, Export]:
     """Play a flight and copy the files of its vehicles to `home`. Return the exports."""
-    opening = BACKENDS[backend].open(asked, number, RunDirectory(run), Silent(), asyncio.Event())
+    opening = BACKENDS[backend].open(asked, number, RunDirectory(run), SilentProgress(), asyncio.Event())
     asyncio.run(play_on(opening, asked))
     home.mkdir()
     for path in [*(run / "agents").glob("*.trace.jsonl"), *(run / "agents").glob("*.chain.json")]:
@@ -363,7 +363,7 @@ def run_reconstruct(home: Path, concluded: Concluded, whole: Undamaged) -> None:
 
 def run_replay(home: Path, concluded: Concluded, whole: Undamaged) -> None:
     for record in open_records(home):
-        for deviation in Player(record).to_end().deviations:
+        for deviation in RecordPlayer(record).to_end().deviations:
             sentence = deviation.sentence(lambda block: block[:8])
             concluded.accusations.append(f"replay: agent {record.agent_id}: {sentence}")
 

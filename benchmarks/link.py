@@ -27,7 +27,7 @@ from typing import Any
 
 from benchmarks.rounds import Spread, show
 from netem import _namespaces, addresses
-from netem._fabric import Fabric
+from netem._fabric import VirtualSwitch
 from netem._nft import NftablesEngine
 from netem.engine import Engine
 from netem.errors import EngineError
@@ -47,7 +47,7 @@ _fork = multiprocessing.get_context("fork")  # a socket stays in the network in 
 
 @dataclass(frozen=True)
 class Link:
-    """Vehicles 1 and 2, and a function that enters the network of each (`Fabric.inside`)."""
+    """Vehicles 1 and 2, and a function that enters the network of each (`VirtualSwitch.inside`)."""
 
     name: str
     inside: Callable[[int], AbstractContextManager[None]]
@@ -99,7 +99,7 @@ def _ip(*commands: str) -> None:
 def switch(engine: type[Engine] | None) -> Link:
     """Make a switch like `netem.init`. Raises EngineError if the engine does not work."""
     _namespaces.unshare_network()
-    fabric = Fabric([1, 2], {})
+    fabric = VirtualSwitch([1, 2], {})
     if engine is not None:
         engine(fabric)
     return Link(engine.name if engine else "switch", fabric.inside)

@@ -32,7 +32,7 @@ from harness.field.ingest import ingest_files
 from harness.field.reconstruct import reconstruct
 from harness.play.backends import BACKENDS
 from harness.play.mission import play_on
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.parallel import sweep
 from harness.scenario import Scenario
 
@@ -114,7 +114,7 @@ def fly(number: int, backend: BackendName) -> Tried:
     with TemporaryDirectory(prefix="reconstructing-") as kept:
         run, home = Path(kept) / "run", Path(kept) / "home"
         home.mkdir()
-        opening = BACKENDS[backend].open(asked, number, RunDirectory(run), Silent(), asyncio.Event())
+        opening = BACKENDS[backend].open(asked, number, RunDirectory(run), SilentProgress(), asyncio.Event())
         asyncio.run(play_on(opening, asked))
         expected = _bring_home(run, home, kind_of(number), Random(f"home {number}"))
         began = time.monotonic()

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 
 from benchmarks.judging import scenario
 from harness.archive.directory import RunDirectory
-from harness.field.replay import Player, Record, open_record
+from harness.field.replay import Record, RecordPlayer, open_record
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.simulation.run_files import DiskRecorder
@@ -55,7 +55,7 @@ def opened(directory: Path) -> None:
 
 def backs(record: Record) -> list[float]:
     """Return the seconds that single steps back take, from random positions."""
-    player, draw = Player(record), Random(1)
+    player, draw = RecordPlayer(record), Random(1)
     player.to_end()
     took = []
     for _ in range(BACKS):
@@ -77,7 +77,7 @@ def main(arguments: list[str]) -> int:
         _say("open", "s", [timed(lambda: opened(directory)) for _ in range(rounds)])
         rates = []
         for _ in range(rounds):
-            player = Player(open_record(directory, AGENT))
+            player = RecordPlayer(open_record(directory, AGENT))
             rates.append(len(record.entries) / timed(lambda player=player: player.to(len(record.entries))))  # type: ignore[misc]
         _say("steps a second", "", rates)
         _say("a step back", "ms", [1000 * took for took in backs(record)])

@@ -16,7 +16,7 @@ from benchmarks.rounds import Spread, show
 from benchmarks.simulation import scenario, seconds
 from harness.archive.archive import RunArchive
 from harness.archive.trace_files import SUFFIX
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.report import write_report
 from harness.run.run import run
 
@@ -33,7 +33,7 @@ def lines_alone(traces: list[Path]) -> int:
 
 
 def row(agents: int, rounds: int, directory: Path) -> dict[str, Any]:
-    run(scenario(agents, 0.15, 7200.0), 7, directory, Silent(), "sim")
+    run(scenario(agents, 0.15, 7200.0), 7, directory, SilentProgress(), "sim")
     traces = list((directory / "agents").glob(f"*{SUFFIX}"))
     reports, lines = [], []
     for _ in range(rounds):

@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from benchmarks.played_by import LOSS as LOSS_OF_MATRIX
 from benchmarks.played_by import scenario as scenario_of_matrix
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
@@ -157,7 +157,7 @@ def as_processes(speedup: float) -> bool:
     for name, request in (("plain", plain), ("secured", plain.secured())):
         with TemporaryDirectory() as directory:
             began = getrusage(RUSAGE_CHILDREN)
-            finished = run(request, 1, Path(directory) / "run", Silent(), "process")
+            finished = run(request, 1, Path(directory) / "run", SilentProgress(), "process")
             ended = getrusage(RUSAGE_CHILDREN)
         spent = ended.ru_utime + ended.ru_stime - began.ru_utime - began.ru_stime
         late = finished.timer_lag

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 
 import aiohttp
 
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.report.live.change_log import ChangeLog
 from harness.report.live.feed import Feed
 from harness.report.live.server import UPDATE_S, Server
@@ -32,7 +32,7 @@ Written = list[tuple[float, Path, bytes]]
 def played(directory: Path, agents: int, minutes: float) -> None:
     flight = {"radio": {"hard_range": {"range_m": 3000}}}
     keys = {"agents": agents, "duration_s": 60 * minutes, "network": {"loss": 0.1, **flight}}
-    run(Scenario.model_validate({"name": "Watched", **keys}), 1, directory, Silent(), "sim", delivers_all=True)
+    run(Scenario.model_validate({"name": "Watched", **keys}), 1, directory, SilentProgress(), "sim", delivers_all=True)
 
 
 def written(directory: Path) -> Written:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from netem._fabric import Fabric
+from netem._fabric import VirtualSwitch
 from netem._nft import NftablesEngine
 from netem.engine import Engine
 from netem.errors import EngineError
 from netem.tc import NetemEngine
 
 
-def choose(preference: str | None, fabric: Fabric, needs: Sequence[str] = ()) -> tuple[Engine, str]:
+def choose(preference: str | None, fabric: VirtualSwitch, needs: Sequence[str] = ()) -> tuple[Engine, str]:
     """Return an installed engine for this machine, and the reason for the choice.
 
     Without a preference, tc netem comes first, because it supports more. `needs` lists conditions other than loss and

@@ -30,7 +30,7 @@ _FIRST_PORT_INDEX = 3
 _CARRIER_DEADLINE_S = 5.0
 
 
-class Fabric:
+class VirtualSwitch:
     """The virtual network, built in the network namespace of the calling thread."""
 
     def __init__(self, vehicles: Sequence[int], networks: Mapping[int, int]) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from netem._lab_protocol import Receiver, WireError, encode
+from netem._lab_protocol import MessageReceiver, WireError, encode
 from netem.errors import ConditionsError, EngineError, LabError, NetemError, SpawnError
 
 Answer = tuple[dict[str, Any], socket.socket | None]
@@ -35,7 +35,7 @@ class Channel:
         self._control = control
         self._log = log
         self._loop = asyncio.get_running_loop()
-        self._receiver = Receiver()
+        self._receiver = MessageReceiver()
         self._numbers = itertools.count(1)
         self._requests: dict[int, _Request] = {}
         self._children: dict[int, asyncio.Future[int]] = {}

@@ -32,7 +32,7 @@ def encode(message: dict[str, Any]) -> bytes:
     return _LENGTH.pack(len(body)) + body
 
 
-class Receiver:
+class MessageReceiver:
     """Divides the data of a socket into messages and file descriptors."""
 
     def __init__(self) -> None:

@@ -30,9 +30,9 @@ from itertools import chain
 from typing import Any
 
 from netem import addresses
-from netem._fabric import Fabric
+from netem._fabric import VirtualSwitch
 from netem.conditions import NetworkConditions
-from netem.engine import Applied, Engine, ReceiverFigures
+from netem.engine import AppliedConditions, Engine, ReceiverFigures
 from netem.errors import EngineError
 from netem.link import LinkConditions
 
@@ -59,7 +59,7 @@ class NftablesEngine(Engine):
     name = "nftables"
     has_queues = False
 
-    def __init__(self, fabric: Fabric) -> None:
+    def __init__(self, fabric: VirtualSwitch) -> None:
         super().__init__(fabric)
         tool = shutil.which("nft", path=_PATH)
         if tool is None:
@@ -136,7 +136,7 @@ class NftablesEngine(Engine):
             receivers.append([*commands, _rule(own, {"goto": {"target": f"{own}_0"}})])
         return receivers
 
-    def read(self) -> Applied:
+    def read(self) -> AppliedConditions:
         listing = json.loads(self._run(["list", "table", "bridge", "air"]))["nftables"]
         counts: dict[str, int] = {}
         marks: dict[str, int] = {}
@@ -169,7 +169,7 @@ class NftablesEngine(Engine):
             }
             counted = (counts[f"{kind}_{port}"] for kind in _COUNTERS)
             receivers[vehicle] = ReceiverFigures.of(held, tuple(cut_from), *counted)
-        return Applied(self.name, receivers)
+        return AppliedConditions(self.name, receivers)
 
     def _run(self, arguments: list[str], commands: list[dict[str, Any]] | None = None) -> str:
         text = None if commands is None else json.dumps({"nftables": commands})

@@ -44,7 +44,7 @@ RETIRE_MS = 100
 """Age at which the kernel hands over a block that is not full."""
 
 
-class Ring:
+class CaptureRing:
     """A ring buffer of `blocks` blocks with the frames that cross the port from now on.
 
     Raises OSError if the kernel lacks AF_PACKET, the port or the memory.

@@ -70,7 +70,7 @@ _NETEM = struct.Struct("=6I")
 
 
 @dataclass(frozen=True)
-class Class:
+class TrafficClass:
     """The conditions and packet counters of one traffic class. The kernel does not report the distribution of its
     delay.
     """
@@ -163,9 +163,9 @@ class TrafficControl:
         return groups - {RELAYED}, cut
 
     @staticmethod
-    def classes(netlink: Netlink) -> dict[int, dict[int, Class]]:
+    def classes(netlink: Netlink) -> dict[int, dict[int, TrafficClass]]:
         """Return the traffic classes of all ports by interface number, from a single request."""
-        classes: dict[int, dict[int, Class]] = {}
+        classes: dict[int, dict[int, TrafficClass]] = {}
         for entry in netlink.dump("list qdiscs", RTM_GETQDISC, bytes(_TCMSG.size)):
             _, _, _, index, _, parent, _ = _TCMSG.unpack_from(entry)
             attributes = parse(entry[_TCMSG.size :])
@@ -175,7 +175,7 @@ class TrafficControl:
             (passed,) = struct.unpack_from("=8xI", statistics[1])
             waiting, _, dropped = struct.unpack_from("=3I", statistics[3])
             link = _link(attributes[_OPTIONS])
-            classes.setdefault(index, {})[parent & 0xFFFF] = Class(link, passed, dropped, waiting)
+            classes.setdefault(index, {})[parent & 0xFFFF] = TrafficClass(link, passed, dropped, waiting)
         return classes
 
     def _filter(self, kind: str, parent: int, priority: int, handle: int, *options: bytes) -> bytes:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any, ClassVar
 
-from netem._fabric import Fabric
+from netem._fabric import VirtualSwitch
 from netem.conditions import NetworkConditions
 from netem.errors import EngineError
 from netem.link import GilbertElliott, LinkConditions
@@ -80,7 +80,7 @@ class ReceiverFigures:
 
 
 @dataclass(frozen=True)
-class Applied:
+class AppliedConditions:
     """The state of the network as the kernel reports it."""
 
     engine: str
@@ -91,7 +91,7 @@ class Applied:
         return {"engine": self.engine, "receivers": figures}
 
     @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> Applied:
+    def from_json(cls, value: Mapping[str, Any]) -> AppliedConditions:
         """Return the object that is described by this JSON object, which has the format of `to_json`."""
         figures = {int(vehicle): ReceiverFigures.from_json(entry) for vehicle, entry in value["receivers"].items()}
         return cls(value["engine"], figures)
@@ -104,7 +104,7 @@ class Engine(ABC):
     has_queues: ClassVar[bool]
     """True if the engine supports all conditions. Otherwise it supports only independent loss and partitions."""
 
-    def __init__(self, fabric: Fabric) -> None:
+    def __init__(self, fabric: VirtualSwitch) -> None:
         """Install the engine with perfect conditions. Raises EngineError if the kernel does not support it."""
         self._fabric = fabric
         self._vehicles = fabric.vehicles
@@ -115,10 +115,10 @@ class Engine(ABC):
         """Request conditions from the kernel. Raises EngineError with the kernel's message if it refuses."""
 
     @abstractmethod
-    def read(self) -> Applied:
+    def read(self) -> AppliedConditions:
         """Return the conditions and counters that the kernel reports."""
 
-    def apply(self, conditions: NetworkConditions) -> Applied:
+    def apply(self, conditions: NetworkConditions) -> AppliedConditions:
         """Change the conditions, and return the state that the kernel reports afterwards.
 
         Raises ConditionsError for an unknown vehicle. Raises EngineError if the engine does not support the conditions,
@@ -147,7 +147,7 @@ class Engine(ABC):
         self._in_force = conditions
         return applied
 
-    def _apply(self, conditions: NetworkConditions) -> Applied:
+    def _apply(self, conditions: NetworkConditions) -> AppliedConditions:
         self.change(conditions)
         applied = self.read()
         for receiver, figures in applied.receivers.items():

@@ -26,8 +26,8 @@ from functools import partial
 from typing import Any
 
 from netem import _choice, _namespaces
-from netem._fabric import Fabric
-from netem._lab_protocol import Receiver, WireError, encode
+from netem._fabric import VirtualSwitch
+from netem._lab_protocol import MessageReceiver, WireError, encode
 from netem._udp_counters import read_udp_counters
 from netem.conditions import NetworkConditions
 from netem.engine import Engine
@@ -51,17 +51,17 @@ def _limit_files(most_bytes: int) -> None:
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
 
-class Server:
+class LabServer:
     """Executes requests of the harness. They are trusted, but still checked."""
 
     def __init__(self, control: socket.socket) -> None:
         control.setblocking(False)
         self._control = control
-        self._receiver = Receiver()
+        self._receiver = MessageReceiver()
         self._unsent: deque[tuple[bytes, list[socket.socket]]] = deque()
         self._children: dict[int, subprocess.Popen[bytes]] = {}
         self._connections: dict[int, _Connection] = {}
-        self._fabric: Fabric | None = None
+        self._fabric: VirtualSwitch | None = None
         self._engine: Engine | None = None
         self._open = True
         self._selector = selectors.DefaultSelector()
@@ -162,7 +162,7 @@ class Server:
         networks = {int(vehicle): descriptor for vehicle, descriptor in message["networks"].items()}
         for descriptor in networks.values():
             os.set_inheritable(descriptor, False)
-        self._fabric = Fabric(message["vehicles"], networks)
+        self._fabric = VirtualSwitch(message["vehicles"], networks)
         try:
             self._engine, reason = _choice.choose(message["engine"], self._fabric, message["needs"])
         except EngineError as error:
@@ -242,7 +242,7 @@ class Server:
                 counted[str(vehicle)] = read_udp_counters()
         return counted
 
-    def _require_fabric(self) -> Fabric:
+    def _require_fabric(self) -> VirtualSwitch:
         if self._fabric is None:
             raise NetemError("The lab is not open yet")
         return self._fabric
@@ -281,7 +281,7 @@ def _error(error: Exception) -> dict[str, Any]:
 def main() -> None:
     control = socket.socket(fileno=int(sys.argv[1]))
     control.set_inheritable(False)
-    Server(control).run()
+    LabServer(control).run()
 
 
 if __name__ == "__main__":

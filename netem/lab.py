@@ -31,7 +31,7 @@ from netem import _namespaces, addresses
 from netem._lab_channel import Channel
 from netem._udp_counters import UdpCounters
 from netem.conditions import NetworkConditions
-from netem.engine import Applied
+from netem.engine import AppliedConditions
 from netem.errors import ConditionsError, LabError, LabUnavailable, SpawnError
 
 EngineName = Literal["netem", "nftables"]
@@ -268,19 +268,19 @@ class Lab:
         connection.setblocking(True)
         return connection
 
-    async def apply(self, conditions: NetworkConditions) -> Applied:
+    async def apply(self, conditions: NetworkConditions) -> AppliedConditions:
         """Apply network conditions, and return the state that the kernel reports afterwards.
 
         Raises ConditionsError for a vehicle that does not exist, EngineError if the kernel refuses.
         """
         conditions.validate(self.vehicles)
         result, _ = await self._channel.ask("apply", conditions=conditions.to_json())
-        return Applied.from_json(result)
+        return AppliedConditions.from_json(result)
 
-    async def read(self) -> Applied:
+    async def read(self) -> AppliedConditions:
         """Return the conditions and counters that the kernel reports."""
         result, _ = await self._channel.ask("read")
-        return Applied.from_json(result)
+        return AppliedConditions.from_json(result)
 
     async def datagrams(self) -> dict[int, UdpCounters]:
         """Return the counts of UDP datagrams in the network of each vehicle."""

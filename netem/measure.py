@@ -46,7 +46,7 @@ _FIRST_FREE = 4
 
 
 @dataclass(frozen=True)
-class Question:
+class MeasuredQuantity:
     """A comparison to make: the estimate from the packets between two vehicles should equal `asked`."""
 
     sender: int
@@ -59,11 +59,11 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Study:
+class NetworkStudy:
     """A measurement: network conditions, and the comparisons to make. All senders broadcast packets."""
 
     conditions: NetworkConditions
-    questions: tuple[Question, ...]
+    questions: tuple[MeasuredQuantity, ...]
 
     @property
     def senders(self) -> tuple[int, ...]:
@@ -81,7 +81,7 @@ class Study:
         return tuple(sorted({*self.senders, *self.receivers, *named, REFERENCE}))
 
 
-Observer = Callable[[Study, int], Mapping[tuple[int, int], ReceivedStream]]
+Observer = Callable[[NetworkStudy, int], Mapping[tuple[int, int], ReceivedStream]]
 """Lets each sender broadcast a number of packets. Returns the received packets by (sender, receiver)."""
 
 
@@ -90,7 +90,7 @@ class AnswerRow:
     """A comparison and its result. `before` is the first result if it was wrong, and the measurement was repeated."""
 
     engine: str
-    question: Question
+    question: MeasuredQuantity
     answer: Estimate
     before: Estimate | None = None
 
@@ -129,7 +129,9 @@ class EngineMeasurement:
         return {"engine": self.engine, "lateness": lateness, "rows": [row.to_json() for row in self.rows]}
 
 
-def measure(engine: str, studies: Sequence[Study], observe: Observer, packets: int = PACKETS) -> EngineMeasurement:
+def measure(
+    engine: str, studies: Sequence[NetworkStudy], observe: Observer, packets: int = PACKETS
+) -> EngineMeasurement:
     """Run the measurements, and repeat those with wrong results. Raises the errors of `observe`."""
     rows: list[AnswerRow] = []
     late: list[Lateness] = []
@@ -150,14 +152,14 @@ def measure(engine: str, studies: Sequence[Study], observe: Observer, packets: i
     return EngineMeasurement(engine, tuple(rows), Lateness(ways, timers))
 
 
-def _answer(question: Question, streams: Mapping[tuple[int, int], ReceivedStream]) -> Estimate:
+def _answer(question: MeasuredQuantity, streams: Mapping[tuple[int, int], ReceivedStream]) -> Estimate:
     return question.estimate(streams[question.sender, question.receiver])
 
 
 # Studies
 
 
-def studies(engine: str) -> tuple[Study, ...]:
+def studies(engine: str) -> tuple[NetworkStudy, ...]:
     """Return the measurements for an engine: loss and partitions for "nftables", all conditions for the others.
 
     Duplicates have their own study, because some kernels do not allow them beside other conditions (see `netem.tc`).
@@ -235,19 +237,19 @@ def _duplicates() -> list[_Case]:
     return [_Case("duplicate 0.3", LinkConditions(duplicate=0.3), (("came twice", 0.3, estimates.duplicated, ""),))]
 
 
-def _receivers(cases: Sequence[_Case]) -> Study:
+def _receivers(cases: Sequence[_Case]) -> NetworkStudy:
     """Return a measurement with one sender, and a receiver for each of these conditions."""
     numbered = dict(enumerate(cases, _FIRST_FREE))
     questions = [
-        Question(_SENDER, receiver, case.condition, *figure)
+        MeasuredQuantity(_SENDER, receiver, case.condition, *figure)
         for receiver, case in numbered.items()
         for figure in case.figures
     ]
     conditions = NetworkConditions(receivers={receiver: case.link for receiver, case in numbered.items()})
-    return Study(conditions, tuple(questions))
+    return NetworkStudy(conditions, tuple(questions))
 
 
-def _pairs() -> Study:
+def _pairs() -> NetworkStudy:
     """Return a measurement with two simultaneous senders, different losses for single links, and one separated
     vehicle.
     """
@@ -262,12 +264,12 @@ def _pairs() -> Study:
     )
     bystander, cut = _FIRST_FREE, _FIRST_FREE + 1
     asked = f"loss {there:g} there, {back:g} back, else {rest:g}"
-    return Study(
+    return NetworkStudy(
         conditions.with_partition([[cut]]),
         (
-            Question(_SENDER, _OTHER_SENDER, asked, "lost there", there, estimates.lost),
-            Question(_OTHER_SENDER, _SENDER, asked, "lost back", back, estimates.lost),
-            Question(_SENDER, bystander, asked, "lost elsewhere", rest, estimates.lost),
-            Question(_SENDER, cut, "partition", "passed", 0.0, estimates.passed),
+            MeasuredQuantity(_SENDER, _OTHER_SENDER, asked, "lost there", there, estimates.lost),
+            MeasuredQuantity(_OTHER_SENDER, _SENDER, asked, "lost back", back, estimates.lost),
+            MeasuredQuantity(_SENDER, bystander, asked, "lost elsewhere", rest, estimates.lost),
+            MeasuredQuantity(_SENDER, cut, "partition", "passed", 0.0, estimates.passed),
         ),
     )

@@ -61,7 +61,9 @@ class Medium:
         """Latency of messages if the conditions have neither a delay nor a rate, from the next call of `apply` on."""
         self._vehicles = tuple(vehicles)
         self._seed = seed
-        self._words = [_Words(self._stream("loss", sender), self._stream("latency", sender)) for sender in vehicles]
+        self._words = [
+            _RandomWords(self._stream("loss", sender), self._stream("latency", sender)) for sender in vehicles
+        ]
         self._rare: dict[int, tuple[Random, ...]] = {}  # by sender, where the air was ever not plain
         self._links: list[list[_Link]] = [[] for _ in vehicles]  # of each sender, to all; none where the air is plain
         self.soonest = latency.mean_s
@@ -151,7 +153,7 @@ def _is_plain(link: LinkConditions) -> bool:
 class _PlainAir:
     """Links with independent loss and uniform latency. Each receiver needs two random numbers of 32 bits."""
 
-    def __init__(self, links: list[LinkConditions], hears: list[bool], words: _Words, latency: Delay) -> None:
+    def __init__(self, links: list[LinkConditions], hears: list[bool], words: _RandomWords, latency: Delay) -> None:
         self.receivers = len(links)
         self.ways = [_way(link, latency) if heard else _NO_WAY for link, heard in zip(links, hears, strict=True)]
         self.reached = [(receiver, *way) for receiver, way in enumerate(self.ways) if way != _NO_WAY]
@@ -198,7 +200,7 @@ class _PlainDraws:
         ]
 
 
-class _Words:
+class _RandomWords:
     """Two streams of 32-bit random numbers, which are drawn in blocks. Numbers from `next` on are unused."""
 
     def __init__(self, loss: Random, latency: Random) -> None:
@@ -240,7 +242,7 @@ class _AnyAir:
     latest = inf
     certain = False
 
-    def __init__(self, links: list[_Link], hears: list[bool], words: _Words, rare: tuple[Random, ...]) -> None:
+    def __init__(self, links: list[_Link], hears: list[bool], words: _RandomWords, rare: tuple[Random, ...]) -> None:
         self._links = links
         self._hears = hears
         self._words = words

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from netem import _probe
-from netem.engine import Applied
+from netem.engine import AppliedConditions
 from netem.errors import LabError
 from netem.estimates import Lateness, ReceivedStream
 from netem.lab import EngineName, Lab, LabProcess
-from netem.measure import DATA_BYTES, REFERENCE, Observer, Study
+from netem.measure import DATA_BYTES, REFERENCE, NetworkStudy, Observer
 from netem.medium import Medium
 
 PAUSES_S = (0.005, 0.01, 0.02)
@@ -39,7 +39,7 @@ def in_medium(seed: int) -> Observer:
     """
     streams = itertools.count()
 
-    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
+    def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         medium = Medium(study.vehicles, seed << 32 | next(streams))
         medium.apply(study.conditions)
         sent_s = [number * SPACING_S for number in range(packets)]
@@ -67,14 +67,14 @@ def in_lab(engine: EngineName) -> Observer:
     LabError if this does not help or the lab fails, and LabUnavailable if this machine cannot run the lab.
     """
 
-    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
+    def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         *quicker, slowest = PAUSES_S
         for pause_s in quicker:
             with contextlib.suppress(DisturbedError):
                 return stream(study, packets, pause_s)
         return stream(study, packets, slowest)
 
-    def stream(study: Study, packets: int, pause_s: float) -> Mapping[tuple[int, int], ReceivedStream]:
+    def stream(study: NetworkStudy, packets: int, pause_s: float) -> Mapping[tuple[int, int], ReceivedStream]:
         try:
             return asyncio.run(asyncio.wait_for(_observe(engine, study, packets, pause_s), _DEADLINE_S))
         except TimeoutError:
@@ -88,7 +88,7 @@ class DisturbedError(LabError):
 
 
 async def _observe(
-    engine: EngineName, study: Study, packets: int, pause_s: float
+    engine: EngineName, study: NetworkStudy, packets: int, pause_s: float
 ) -> dict[tuple[int, int], ReceivedStream]:
     vehicles = {*study.receivers, REFERENCE}
     numbers = {sender: range(i * packets, (i + 1) * packets) for i, sender in enumerate(study.senders)}
@@ -127,10 +127,10 @@ async def _observe(
 
 
 def check(
-    study: Study,
+    study: NetworkStudy,
     reports: Mapping[int, Mapping[str, Any]],
     received_packets: Mapping[tuple[int, int], Sequence[Arrival]],
-    counted: Applied,
+    counted: AppliedConditions,
 ) -> None:
     """Raise DisturbedError if the machine lost packets. With corruption, the cause of a loss is unknown."""
     for vehicle, report in reports.items():
@@ -156,7 +156,7 @@ def _arrivals(report: Mapping[str, Any], own: range) -> list[Arrival]:
     return [Arrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
 
 
-async def _wait_until_quiet(lab: Lab) -> Applied:
+async def _wait_until_quiet(lab: Lab) -> AppliedConditions:
     """Wait until no packet is on its way. Return the counters of the kernel."""
     before = None
     while before != (now := await lab.read()):

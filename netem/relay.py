@@ -63,7 +63,7 @@ _NOT_THE_WHOLE = 0x3FFF  # flag "more fragments", and offset of a fragment
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class ReceivedBroadcast:
     """A broadcast of a vehicle. `at_ns` is the time at which the kernel received it, on Python's monotonic clock."""
 
     vehicle: int
@@ -134,7 +134,7 @@ class Relay:
         with contextlib.closing(Netlink()) as netlink:
             netlink.send([flood_broadcasts(port, index, on) for port, index in ports])
 
-    def take(self) -> Iterator[Heard]:
+    def take(self) -> Iterator[ReceivedBroadcast]:
         """Yield the waiting broadcasts, in the order in which the kernel received them."""
         slots = self._slots
         offset_ns = time.time_ns() - time.monotonic_ns()
@@ -148,7 +148,7 @@ class Relay:
             self._next = (self._next + 1) % _SLOTS
             vehicle = self._ports.get(index)
             if vehicle is not None:
-                yield Heard(vehicle, seconds * 1_000_000_000 + ns - offset_ns, frame)
+                yield ReceivedBroadcast(vehicle, seconds * 1_000_000_000 + ns - offset_ns, frame)
 
     def deliver(self, vehicle: int, frame: bytes) -> None:
         """Deliver a frame to a vehicle. Raises OSError if its port does not accept the frame."""

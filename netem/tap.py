@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from netem import addresses
-from netem._ring import BLOCK_BYTES, RETIRE_MS, Ring
+from netem._ring import BLOCK_BYTES, RETIRE_MS, CaptureRing
 from netem.pcapng import PcapngFile
 
 _MEMORY = 256 << 20
@@ -32,12 +32,12 @@ _DRAIN_S = 10.0
 """Maximum time for the last frames. The kernel hands over each block after `RETIRE_MS`."""
 
 
-class Tap:
+class PortTap:
     """The port and the capture file of one vehicle."""
 
     def __init__(self, vehicle: int, blocks: int) -> None:
         self.vehicle = vehicle
-        self.ring = Ring(addresses.port(vehicle), blocks)
+        self.ring = CaptureRing(addresses.port(vehicle), blocks)
 
     def open(self, folder: Path) -> bool:
         """Open the file if it exists. Return true if it does. Raises OSError."""
@@ -67,7 +67,7 @@ def capture(folder: Path, vehicles: Sequence[int]) -> None:
     for number in (signal.SIGUSR1, signal.SIGTERM):
         signal.signal(number, lambda number, _: wake.send(bytes([number])))
     blocks = max(_FEWEST_BLOCKS, min(_RING_MEMORY, _MEMORY // len(vehicles)) // BLOCK_BYTES)
-    taps = [Tap(vehicle, blocks) for vehicle in vehicles]
+    taps = [PortTap(vehicle, blocks) for vehicle in vehicles]
     _print_json("ready")
     stopping = signals.recv(1)[0] == signal.SIGTERM
     taps = [tap for tap in taps if tap.open(folder)]  # without files, the mission never began

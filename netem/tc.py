@@ -32,11 +32,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from errno import ENOENT
 
-from netem._fabric import Fabric
+from netem._fabric import VirtualSwitch
 from netem._netlink import Netlink, Request
-from netem._tc_requests import MAX_KIND, Class, TrafficControl
+from netem._tc_requests import MAX_KIND, TrafficClass, TrafficControl
 from netem.conditions import NetworkConditions
-from netem.engine import Applied, Engine, ReceiverFigures
+from netem.engine import AppliedConditions, Engine, ReceiverFigures
 from netem.errors import EngineError, NetlinkError
 from netem.link import Distribution, LinkConditions
 
@@ -74,7 +74,7 @@ class NetemEngine(Engine):
     name = "netem"
     has_queues = True
 
-    def __init__(self, fabric: Fabric) -> None:
+    def __init__(self, fabric: VirtualSwitch) -> None:
         super().__init__(fabric)
         self._netlink: Netlink = fabric.netlink
         self._ports = {vehicle: TrafficControl(fabric.port_index(vehicle)) for vehicle in self._vehicles}
@@ -179,7 +179,7 @@ class NetemEngine(Engine):
         self._kinds, self._groups, self._marks = kinds, groups, {**new}
         self._accepted = {vehicle: {group[vehicle]} for vehicle in self._vehicles}
 
-    def _remove_unused(self, gone: Callable[[int, Class], bool]) -> None:
+    def _remove_unused(self, gone: Callable[[int, TrafficClass], bool]) -> None:
         """Remove the unused traffic classes for which `gone` returns true, and keep their packet counts."""
         used = set(self._kinds.values())
         unused = {v: unused for v, held in self._classes.items() if (unused := [k for k in held if k not in used])}
@@ -201,7 +201,7 @@ class NetemEngine(Engine):
                     self._removed[receiver].passed += counted.passed
                     self._removed[receiver].lost += counted.dropped
 
-    def _read_classes(self) -> dict[int, dict[int, Class]]:
+    def _read_classes(self) -> dict[int, dict[int, TrafficClass]]:
         """Return the traffic classes at each receiver's port."""
         classes = TrafficControl.classes(self._netlink)
         return {vehicle: classes.get(port.index, {}) for vehicle, port in self._ports.items()}
@@ -211,19 +211,21 @@ class NetemEngine(Engine):
         marks = {vehicle: port.read_mark(self._netlink) for vehicle, port in self._ports.items()}
         return marks, {vehicle: port.accepted_groups(self._netlink) for vehicle, port in self._ports.items()}
 
-    def read(self) -> Applied:
+    def read(self) -> AppliedConditions:
         try:
             self._remove_unused(lambda _, counted: not counted.waiting)
             classes = self._read_classes()
             marks, accepted_groups = self._filters()
         except NetlinkError as error:
             raise EngineError(f"The kernel did not report its state: {error}") from error
-        return Applied(self.name, {v: self._figures(v, classes[v], marks, *accepted_groups[v]) for v in self._vehicles})
+        return AppliedConditions(
+            self.name, {v: self._figures(v, classes[v], marks, *accepted_groups[v]) for v in self._vehicles}
+        )
 
     def _figures(
         self,
         receiver: int,
-        classes: dict[int, Class],
+        classes: dict[int, TrafficClass],
         marks: dict[int, tuple[int, int] | None],
         groups: set[int],
         cut: int,

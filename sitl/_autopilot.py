@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl._failsafes import STATION, WIND, WIND_FROM, Failsafe, Failsafes
-from sitl._kinematics import Course, Fall, Motion, Point, Rest, Segment, end_of
+from sitl._kinematics import Course, Fall, Motion, Point, RestSegment, Segment, end_of
 from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl.modes import BOOT_MODES, MODES
 from sitl.vehicle import READY_S, Home, VehicleType
@@ -68,7 +68,7 @@ class Autopilot:
         self._in_mission = False
         self._then: Callable[[], None] = self._stand
         self._goal: tuple[Point, float] | None = None  # in GUIDED: target and speed
-        self._course = Course(0.0, [Rest(Motion(yaw_rad=math.radians(home.heading_deg)))])
+        self._course = Course(0.0, [RestSegment(Motion(yaw_rad=math.radians(home.heading_deg)))])
 
     @property
     def _model(self) -> MotionModel:
@@ -303,7 +303,7 @@ class Autopilot:
             self._stand()
 
     def _stand(self) -> None:
-        self._begin([Rest(self.motion)], self._stand)
+        self._begin([RestSegment(self.motion)], self._stand)
 
     def _land(self, place: Point, before: Point | None = None) -> None:
         self._begin(self._model.land(self.motion, place, before), self._landed)

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl._by_mission import MissionFlight
 from sitl._kinematics import Point
 from sitl._mission_upload import SPEED_TYPES, on_earth
-from sitl._pilot_link import Link
+from sitl._pilot_link import PilotLink
 from sitl._route import Waypoint, is_near, landing_begins, limit_s
 from sitl._take_off import TakeOff
 from sitl.procedure import Commander, HopelessError, Step
@@ -39,7 +39,7 @@ class GuidedFlight:
 
     purpose = "fly its plan"
 
-    def __init__(self, link: Link, vehicle_type: VehicleType, waypoints: Sequence[Waypoint]) -> None:
+    def __init__(self, link: PilotLink, vehicle_type: VehicleType, waypoints: Sequence[Waypoint]) -> None:
         self._to = Commander(link, vehicle_type)
         self._waypoints = waypoints
         self._legs = [Step(waypoint.leg, limit_s(waypoints, at)) for at, waypoint in enumerate(waypoints)]

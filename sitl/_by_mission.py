@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl._mission_upload import Mission, Upload
-from sitl._pilot_link import Link
+from sitl._mission_upload import Mission, MissionUpload
+from sitl._pilot_link import PilotLink
 from sitl._route import Waypoint, limit_s
 from sitl.procedure import ARM, HEARTBEAT, READY, Commander, HopelessError, Step
 from sitl.vehicle import VehicleType
@@ -28,13 +28,13 @@ class MissionFlight:
     purpose = "fly its plan"
 
     def __init__(
-        self, link: Link, vehicle_type: VehicleType, waypoints: Sequence[Waypoint], under_way: bool = False
+        self, link: PilotLink, vehicle_type: VehicleType, waypoints: Sequence[Waypoint], under_way: bool = False
     ) -> None:
         self._to = Commander(link, vehicle_type)
         self._waypoints = waypoints
         self._legs = [Step(waypoint.leg, limit_s(waypoints, at)) for at, waypoint in enumerate(waypoints)]
         self._mission = Mission(waypoints, link.home, link.sysid, vehicle_type)
-        self._upload = Upload(link, self._mission)
+        self._upload = MissionUpload(link, self._mission)
         self._under_way = under_way
         self._done = 0  # waypoints
 
@@ -80,7 +80,7 @@ class MissionFlight:
     def ask(self, step: Step) -> None:
         if step in (AUTO, START) and self._to.refused(STARTS):
             # ArduCopter 3.5 forgets a mission that it was given before it had booted
-            self._upload = Upload(self._to.link, self._mission)
+            self._upload = MissionUpload(self._to.link, self._mission)
         elif step is UPLOAD:
             self._upload.ask()
         elif step is GUIDED:

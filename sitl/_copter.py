@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import NEAR_M, Line, Motion, Point, Rest, Segment, end_of
+from sitl._kinematics import NEAR_M, Line, Motion, Point, RestSegment, Segment, end_of
 
 CRUISE_MS = 10.0  # WPNAV_SPEED
 CLIMB_MS = 2.5  # WPNAV_SPEED_UP
@@ -33,7 +33,7 @@ class Copter:
 
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
         top = Point(start.north_m, start.east_m, max(start.up_m, altitude_m))
-        spin_up = [Rest(start, SPIN_UP_S)] if start.up_m < NEAR_M else []
+        spin_up = [RestSegment(start, SPIN_UP_S)] if start.up_m < NEAR_M else []
         return [*spin_up, Line(start, top, CLIMB_MS, VERTICAL_ACCEL_MS2)]
 
     def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
@@ -41,33 +41,33 @@ class Copter:
         climb_m = place.up_m - start.up_m
         length_m = math.hypot(level_m, climb_m)
         if not length_m:
-            return [Rest(start, 0.0)]
+            return [RestSegment(start, 0.0)]
         # along a slope the slower of the two axes sets the pace
         limits = [(level_m, speed_ms, ACCEL_MS2)] if level_m else []
         if climb_m:
             limits.append((abs(climb_m), CLIMB_MS if climb_m > 0 else DESCENT_MS, VERTICAL_ACCEL_MS2))
         speed = min(limit * length_m / part_m for part_m, limit, _ in limits)
         accel = min(limit * length_m / part_m for part_m, _, limit in limits)
-        return [Rest(start, self.turning_s), Line(start, place, speed, accel)]
+        return [RestSegment(start, self.turning_s), Line(start, place, speed, accel)]
 
     def loiter(
         self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
     ) -> Sequence[Segment]:
         there = self.go_to(start, place, speed_ms)
-        return [*there, Rest(end_of(there), seconds)]
+        return [*there, RestSegment(end_of(there), seconds)]
 
     def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
         there = self.go_to(start, place._replace(up_m=start.up_m), CRUISE_MS)
         above = end_of(there)
-        segments: list[Segment] = [*there, Rest(above, self.settling_s)]
+        segments: list[Segment] = [*there, RestSegment(above, self.settling_s)]
         if above.up_m > LAND_SLOWLY_M:
             low = place._replace(up_m=LAND_SLOWLY_M)
             segments.append(Line(above, low, DESCENT_MS, VERTICAL_ACCEL_MS2, to_ms=LANDING_MS))
         ground = place._replace(up_m=0.0)
         segments.append(Line(end_of(segments), ground, LANDING_MS, VERTICAL_ACCEL_MS2, LANDING_MS, LANDING_MS))
-        return [*segments, Rest(end_of(segments), 0.0)]
+        return [*segments, RestSegment(end_of(segments), 0.0)]
 
     def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
         """Take off, and stay above that place."""
         climb = self.take_off(start, altitude_m)
-        return [*climb, Rest(end_of(climb), math.inf)]
+        return [*climb, RestSegment(end_of(climb), math.inf)]

@@ -12,7 +12,7 @@ from itertools import islice
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl._pilot_link import Link
+from sitl._pilot_link import PilotLink
 from sitl.procedure import HEARTBEAT, Step
 
 PATIENCE = 10
@@ -24,12 +24,12 @@ _LIST = Step("its list of parameters", 180.0)
 _GIVEN = Step("the parameters that it was given")
 
 
-class Introduction:
+class VehicleIntroduction:
     """The requests for version and parameters. `given` contains parameters that the vehicle has, or must get now."""
 
     purpose = "introduce itself"
 
-    def __init__(self, link: Link, given: Mapping[str, float]) -> None:
+    def __init__(self, link: PilotLink, given: Mapping[str, float]) -> None:
         self._link = link
         self._given = given
         self._asked: Counter[Step] = Counter()

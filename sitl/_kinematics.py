@@ -61,7 +61,7 @@ class Segment(Protocol):
         """Return the motion at a time since the beginning, 0 to `duration_s`."""
 
 
-class Rest:
+class RestSegment:
     """A segment without movement."""
 
     def __init__(self, start: Motion, duration_s: float = math.inf) -> None:
@@ -191,7 +191,7 @@ class Course:
     @property
     def rests_from_s(self) -> float:
         """The time from which the position stays the same, or infinity if there is none."""
-        return self._begin_s[-1] if isinstance(self._segments[-1], Rest) else self.end_s
+        return self._begin_s[-1] if isinstance(self._segments[-1], RestSegment) else self.end_s
 
     def at(self, now_s: float) -> Motion:
         """Return the motion at the time `now_s`, or at the nearer end of the sequence if that time is outside it."""
@@ -200,7 +200,7 @@ class Course:
         return segment.at(min(max(0.0, now_s - self._begin_s[index]), segment.duration_s))
 
 
-class Part:
+class CoursePart:
     """A part of a motion, from `begin_s` to `end_s` on its clock."""
 
     def __init__(self, course: Course, begin_s: float, end_s: float) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from sitl._kinematics import Course, Motion, Part, Segment, end_of
+from sitl._kinematics import Course, CoursePart, Motion, Segment, end_of
 from sitl._models import AT_ONCE
 from sitl._route import CLIMBED, Waypoint, is_near, limit_s, to_go_m
 from sitl.vehicle import VehicleType
@@ -35,9 +35,9 @@ def leg_by_leg(
             made_s = _made_s(course, now_s, waypoint, vehicle_type, now_s + limit_s(waypoints, index))
         if math.isinf(made_s):
             break
-        flown.append(Part(course, now_s, made_s))
+        flown.append(CoursePart(course, now_s, made_s))
         motion, now_s = end_of(flown), made_s
-    return flown, Part(course, now_s, math.inf)
+    return flown, CoursePart(course, now_s, math.inf)
 
 
 def _made_s(course: Course, since_s: float, waypoint: Waypoint, vehicle_type: VehicleType, limit_s: float) -> float:

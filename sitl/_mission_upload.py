@@ -12,7 +12,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl._kinematics import Point
-from sitl._pilot_link import Link
+from sitl._pilot_link import PilotLink
 from sitl._route import Waypoint
 from sitl.vehicle import Home, VehicleType
 
@@ -87,14 +87,14 @@ class Mission:
         )
 
 
-class Upload:
+class MissionUpload:
     """The upload of a mission. The vehicle requests each item, and finally accepts or refuses the mission.
 
     `ask` begins the upload, and restarts it after RESEND_S without an answer. `refused` is the MAV_MISSION_RESULT of a
     vehicle that rejects the mission.
     """
 
-    def __init__(self, link: Link, mission: Mission) -> None:
+    def __init__(self, link: PilotLink, mission: Mission) -> None:
         self.accepted = False
         self.refused: str | None = None
         self._link = link

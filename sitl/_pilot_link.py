@@ -43,7 +43,7 @@ TELEMETRY = (
 )
 
 
-class Link(asyncio.Protocol):
+class PilotLink(asyncio.Protocol):
     """A connection to one vehicle over a connected socket. It may be used in one event loop only.
 
     The link sends two kinds of heartbeats. Those of the pilot have a system ID of their own. Those of a ground station

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from sitl._kinematics import NEAR_M, Arc, Climbing, Line, Motion, Point, Rest, Segment, end_of
+from sitl._kinematics import NEAR_M, Arc, Climbing, Line, Motion, Point, RestSegment, Segment, end_of
 
 CRUISE_MS = 22.0  # AIRSPEED_CRUISE
 OVER_GROUND = (
@@ -185,7 +185,7 @@ def _lift_off(start: Motion, altitude_m: float, straight_to_m: float) -> tuple[S
     run = Line(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
     path = _Path(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
     path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
-    return [Rest(start, SPOOL_UP_S), run], path
+    return [RestSegment(start, SPOOL_UP_S), run], path
 
 
 def _back_and_on(

@@ -11,13 +11,13 @@ import selectors
 import socket
 
 from sitl._autopilot import Autopilot
-from sitl.serial_channel import Channel
+from sitl.serial_channel import ClientChannel
 
 READ_BYTES = 65_536
 MAX_UNSENT_BYTES = 65_536
 
 
-class Port:
+class VehiclePort:
     """A TCP server on 127.0.0.1. Raises OSError if the port is not available."""
 
     def __init__(self, number: int, autopilot: Autopilot, selector: selectors.BaseSelector) -> None:
@@ -25,7 +25,7 @@ class Port:
         self._selector = selector
         self._client: socket.socket | None = None
         self._unsent = bytearray()
-        self.channel: Channel | None = None
+        self.channel: ClientChannel | None = None
         self._listener = socket.create_server(("127.0.0.1", number), backlog=16)
         self._listener.setblocking(False)
         self._await_client()
@@ -40,7 +40,7 @@ class Port:
             return
         self._client.setblocking(False)
         self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.channel = Channel(self._autopilot)
+        self.channel = ClientChannel(self._autopilot)
         self._selector.unregister(self._listener)
         self._selector.register(self._client, selectors.EVENT_READ, self._ready)
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import Line, Motion, Point, Rest, Segment, end_of
+from sitl._kinematics import Line, Motion, Point, RestSegment, Segment, end_of
 
 CRUISE_MS = 5.0  # CRUISE_SPEED
 ACCEL_MS2 = 1.0  # ATC_ACCEL_MAX
@@ -29,7 +29,7 @@ class Rover:
 
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
         """Stay, because a rover cannot take off."""
-        return [Rest(start, 0.0)]
+        return [RestSegment(start, 0.0)]
 
     def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
         end = place._replace(up_m=start.up_m)
@@ -39,18 +39,18 @@ class Rover:
             return [there]
         turn_rad = abs((there.at(0.0).yaw_rad - start.yaw_rad + math.pi) % math.tau - math.pi)
         if start == start.halted:
-            return [Rest(start, self.start_s + turn_rad / TURN_RATE_RADS), there]
-        return [Rest(start, turn_rad / self.corner_rads), there]
+            return [RestSegment(start, self.start_s + turn_rad / TURN_RATE_RADS), there]
+        return [RestSegment(start, turn_rad / self.corner_rads), there]
 
     def loiter(
         self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
     ) -> Sequence[Segment]:
         there = self.go_to(start, place, speed_ms)
-        return [*there, Rest(end_of(there), seconds)]
+        return [*there, RestSegment(end_of(there), seconds)]
 
     def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
         """Stay, because a rover is always on the ground."""
-        return [Rest(start, 0.0)]
+        return [RestSegment(start, 0.0)]
 
     def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
-        return [Rest(start, math.inf)]
+        return [RestSegment(start, math.inf)]

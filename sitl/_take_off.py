@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl._pilot_link import LOW_M, Link
+from sitl._pilot_link import LOW_M, PilotLink
 from sitl._route import CLIMBED
 from sitl.procedure import ARM, HEARTBEAT, Commander, Step
 from sitl.vehicle import VehicleType
@@ -29,7 +29,7 @@ class TakeOff:
 
     purpose = "take off"
 
-    def __init__(self, link: Link, vehicle_type: VehicleType, altitude_m: float) -> None:
+    def __init__(self, link: PilotLink, vehicle_type: VehicleType, altitude_m: float) -> None:
         self._to = Commander(link, vehicle_type)
         self._altitude_m = altitude_m
         self._climb = Step("the climb", 60.0 + altitude_m / SLOWEST_CLIMB_MS)
@@ -67,12 +67,12 @@ class TakeOff:
             link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, self._altitude_m)
 
 
-class Termination:
+class FlightTermination:
     """A forced end of a flight: disarm in the air, and fall to the ground."""
 
     purpose = "end its flight"
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: PilotLink) -> None:
         self._link = link
         self._disarmed_at: float | None = None
 

@@ -23,7 +23,7 @@ from sitl.airframes import BINARIES, Airframe, airframe
 from sitl.installed import current, install_command, sha256
 from sitl.parameters import in_lines
 from sitl.setup import USUAL as USUAL_SETUP
-from sitl.setup import Debugger, Setup
+from sitl.setup import Debugger, VehicleSetup
 from sitl.start_places import autotest
 from sitl.vehicle import (
     Home,
@@ -66,7 +66,7 @@ class ArduPilot:
     binary: Path
     defaults: tuple[Path, ...] = ()
     vehicle_type: VehicleType = "copter"
-    setup: Setup = USUAL_SETUP
+    setup: VehicleSetup = USUAL_SETUP
     missing: tuple[str, ...] = ()
     name: str = "ardupilot"
 
@@ -107,7 +107,7 @@ class ArduPilot:
         binary: Path | None,
         environ: Mapping[str, str],
         vehicle_type: VehicleType = "copter",
-        setup: Setup = USUAL_SETUP,
+        setup: VehicleSetup = USUAL_SETUP,
     ) -> ArduPilot:
         """Return `binary`, or the first suitable binary in ARDUPILOT_SITL, on PATH, or among the installed ones.
 
@@ -141,7 +141,7 @@ class ArduPilot:
         )
 
     @classmethod
-    def _checked(cls, binary: Path, source: str, vehicle_type: VehicleType, setup: Setup) -> ArduPilot:
+    def _checked(cls, binary: Path, source: str, vehicle_type: VehicleType, setup: VehicleSetup) -> ArduPilot:
         subject = f"the ArduPilot binary {binary} (from {source})"
         try:
             if binary.is_dir():

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from sitl.vehicle import VehicleError
 
 if TYPE_CHECKING:  # a scenario names circumstances, and imports no MAVLink for it
-    from sitl._pilot_link import Link
+    from sitl._pilot_link import PilotLink
 
 ANSWER_S = 3.0
 """Time limit for an answer in seconds, divided by the speedup if that is below 1. A vehicle answers in one main
@@ -80,7 +80,7 @@ def wind(speed_ms: float, from_deg: float) -> Circumstance:
     return Circumstance(f"wind of {speed_ms:g} m/s", ({"SIM_WIND_SPD": speed_ms, "SIM_WIND_DIR": from_deg},))
 
 
-async def bring_about(link: Link, circumstance: Circumstance) -> Mapping[str, float]:
+async def bring_about(link: PilotLink, circumstance: Circumstance) -> Mapping[str, float]:
     """Make the vehicle simulate an event. Return the parameters that were set. Raises NotSimulatedError."""
     ways, limit_s = circumstance.ways, ANSWER_S / min(1.0, link.speedup)
     for way in ways:
@@ -121,7 +121,7 @@ async def bring_about(link: Link, circumstance: Circumstance) -> Mapping[str, fl
 
 
 async def _heard(
-    link: Link,
+    link: PilotLink,
     answer: Callable[[], Mapping[str, float] | None],
     ask: Callable[[], None],
     limit_s: float,

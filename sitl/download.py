@@ -102,7 +102,7 @@ def megabytes(number: int) -> str:
     return f"{number / 1e6:.1f} MB"
 
 
-class StayEncrypted(urllib.request.HTTPRedirectHandler):
+class HttpsRedirectHandler(urllib.request.HTTPRedirectHandler):
     """Follows redirects, but never from https to an unencrypted address."""
 
     def redirect_request(
@@ -118,7 +118,7 @@ def _answer(url: str, headers: Mapping[str, str], stall_s: float) -> Iterator[An
     """Yield the server's answer, which is a success or 416 (Range Not Satisfiable). Raises DownloadError."""
     host = urlsplit(url).netloc
     request = urllib.request.Request(url, headers={"User-Agent": "ucp-harness", **headers})  # noqa: S310 - http(s) only
-    opener = urllib.request.build_opener(StayEncrypted)
+    opener = urllib.request.build_opener(HttpsRedirectHandler)
     try:
         answer = opener.open(request, timeout=stall_s)
     except urllib.error.HTTPError as error:

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from sitl._autopilot import Autopilot
-from sitl._port import Port
+from sitl._port import VehiclePort
 from sitl.airframes import USUAL
 from sitl.setup import USUAL as USUAL_SETUP
-from sitl.setup import Setup
+from sitl.setup import VehicleSetup
 from sitl.vehicle import (
     AGENT_PORT,
     PILOT_PORT,
@@ -47,7 +47,7 @@ class Embedded:
     """A kind of vehicle that runs the embedded model and needs no other program."""
 
     vehicle_type: VehicleType = "copter"
-    setup: Setup = USUAL_SETUP
+    setup: VehicleSetup = USUAL_SETUP
     name: str = "embedded"
     lack: str | None = None
     frame: str | None = None
@@ -123,7 +123,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     ports = []
     for number in (arguments.pilot_port, arguments.agent_port, arguments.station_port):
         try:
-            ports.append(Port(number, autopilot, selector))
+            ports.append(VehiclePort(number, autopilot, selector))
         except (OSError, OverflowError) as error:
             reason = error.strerror if isinstance(error, OSError) else "a port is 0 to 65535"
             sys.exit(_complain(arguments.sysid, number, str(reason)))
@@ -158,7 +158,9 @@ class _Clock:
         return self.now_s
 
 
-def _fly(autopilot: Autopilot, ports: Sequence[Port], selector: selectors.BaseSelector, speedup: float) -> NoReturn:
+def _fly(
+    autopilot: Autopilot, ports: Sequence[VehiclePort], selector: selectors.BaseSelector, speedup: float
+) -> NoReturn:
     clock = _Clock(speedup)
     next_batch = time.monotonic()
     while True:

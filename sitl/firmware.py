@@ -32,7 +32,7 @@ from urllib.parse import urlsplit
 
 from sitl.airframes import BINARIES, DEFAULTS, stacked
 from sitl.download import STALL_S, DownloadError, NotThereError, UnreachableError, download, fetch_text
-from sitl.installed import CURRENT, File, Installed, Manifest, cache
+from sitl.installed import CURRENT, DownloadedFile, InstalledVersion, Manifest, cache
 from sitl.vehicle import VehicleError, VehicleType
 
 FIRMWARE = "https://firmware.ardupilot.org"
@@ -56,7 +56,7 @@ _NUMBER = re.compile(r"\d+\.\d+\.\d+")
 
 
 @dataclass(frozen=True)
-class _Board:
+class _Processor:
     """A kind of processor: its directory on the server, and the beginning of an ELF file for it."""
 
     directory: str
@@ -64,8 +64,8 @@ class _Board:
     header: re.Pattern[bytes]
 
 
-_X86_64 = _Board("SITL_x86_64_linux_gnu", "x86_64", re.compile(rb"\x7fELF\x02\x01.{12}\x3e\x00", re.DOTALL))
-_ARM = _Board("SITL_arm_linux_gnueabihf", "32-bit ARM", re.compile(rb"\x7fELF\x01\x01.{12}\x28\x00", re.DOTALL))
+_X86_64 = _Processor("SITL_x86_64_linux_gnu", "x86_64", re.compile(rb"\x7fELF\x02\x01.{12}\x3e\x00", re.DOTALL))
+_ARM = _Processor("SITL_arm_linux_gnueabihf", "32-bit ARM", re.compile(rb"\x7fELF\x01\x01.{12}\x28\x00", re.DOTALL))
 _BOARDS = {"x86_64": _X86_64, "aarch64": _ARM, "armv7l": _ARM}
 """Boards by platform.machine(). Both are little endian, with 64 and 32 bits and e_machine 62 and 40."""
 _FROM_SOURCE = "build ArduPilot SITL from source and set ARDUPILOT_SITL to its directory"
@@ -79,7 +79,7 @@ class CacheError(VehicleError):
     """An error: the cache cannot be written."""
 
 
-class Watcher(Protocol):
+class InstallWatcher(Protocol):
     """An object that is informed about the progress of an installation."""
 
     def waits(self) -> None:
@@ -90,10 +90,10 @@ class Watcher(Protocol):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class InstallOutcome:
     """The installed version, and true if it was installed before."""
 
-    installed: Installed
+    installed: InstalledVersion
     already: bool
 
 
@@ -116,10 +116,10 @@ def install(
     vehicle: VehicleType,
     version: str,
     environ: Mapping[str, str],
-    watcher: Watcher,
+    watcher: InstallWatcher,
     base: str | None = None,
     stall_s: float = STALL_S,
-) -> Outcome:
+) -> InstallOutcome:
     """Install the binary and default parameters of a vehicle, unless they are in the cache. Runs then use this version.
 
     `version` is `stable`, `beta`, `latest` or a number such as 4.6.3. A number that is installed needs no server. An
@@ -141,11 +141,11 @@ def install(
     with _ways_out(home), _locked(home, watcher):
         number = version.removeprefix("stable-")
         if _NUMBER.fullmatch(number) and _intact(vehicle, home / number):
-            return _use(Installed(vehicle, home / number), already=True)
+            return _use(InstalledVersion(vehicle, home / number), already=True)
         build = server.build()
         place = home / build.name
         if _intact(vehicle, place):
-            return _use(Installed(vehicle, place), already=True)
+            return _use(InstalledVersion(vehicle, place), already=True)
         part = home / f".{build.name}.part"
         part.mkdir(exist_ok=True)
         binary = server.fetch_binary(part, watcher)
@@ -154,13 +154,13 @@ def install(
         Manifest(vehicle, build.version, build.commit, fetched_at, files).write(part)
         shutil.rmtree(place, ignore_errors=True)  # damaged
         part.rename(place)
-        return _use(Installed(vehicle, place), already=False)
+        return _use(InstalledVersion(vehicle, place), already=False)
 
 
 class _Server:
     """One release of one vehicle type on ArduPilot's server or a mirror. Raises RequestError for an invalid `base`."""
 
-    def __init__(self, vehicle: VehicleType, version: str, board: _Board, base: str | None, stall_s: float) -> None:
+    def __init__(self, vehicle: VehicleType, version: str, board: _Processor, base: str | None, stall_s: float) -> None:
         self._vehicle, self._version, self._board, self._stall_s = vehicle, version, board, stall_s
         firmware, self._source = (_checked(base),) * 2 if base else (FIRMWARE, SOURCE)
         self._releases = f"{firmware}/{vehicle.title()}/"
@@ -179,7 +179,7 @@ class _Server:
             raise DownloadError(f"{url} does not name a commit and a version: is this ArduPilot's server, or a mirror?")
         return _Build(version[1], commit[1])
 
-    def fetch_binary(self, directory: Path, watcher: Watcher) -> File:
+    def fetch_binary(self, directory: Path, watcher: InstallWatcher) -> DownloadedFile:
         """Download the binary to `directory` unless it is there, and make it executable."""
         path = directory / BINARIES[self._vehicle]
         url = self._release + path.name
@@ -199,9 +199,9 @@ class _Server:
         path.chmod(0o755)
         if platform.machine() == "aarch64":
             _refuse_what_does_not_run(path)
-        return File.of(path, url)
+        return DownloadedFile.of(path, url)
 
-    def fetch_parameters(self, directory: Path, build: _Build) -> dict[str, File]:
+    def fetch_parameters(self, directory: Path, build: _Build) -> dict[str, DownloadedFile]:
         """Download the default parameters of the vehicle and its frames at the commit of the binary."""
         own = DEFAULTS[self._vehicle]
         places = {own: _PARAMETERS[self._vehicle]}
@@ -216,7 +216,7 @@ class _Server:
     def _tree(self, build: _Build) -> str:
         return f"{self._source}/ArduPilot/ardupilot/{build.commit}/{_AUTOTEST}"
 
-    def _fetch_parameters(self, path: Path, build: _Build, places: tuple[str, ...]) -> File | None:
+    def _fetch_parameters(self, path: Path, build: _Build, places: tuple[str, ...]) -> DownloadedFile | None:
         """Download a parameter file from the first address that has it. Return None if there is none."""
         for place in places:
             url = f"{self._tree(build)}/{place}"
@@ -227,7 +227,7 @@ class _Server:
             if not re.search(r"^[A-Z][A-Z0-9_]*[\s,=]+-?[\d.]", text, re.MULTILINE):
                 raise DownloadError(f"{url} has no ArduPilot parameters in it: does a proxy answer for it?")
             path.write_text(text, encoding="utf-8")
-            return File.of(path, url)
+            return DownloadedFile.of(path, url)
         return None
 
     def _no_such_version(self) -> RequestError:
@@ -272,10 +272,10 @@ def _checked(base: str) -> str:
 
 
 def _intact(vehicle: VehicleType, directory: Path) -> bool:
-    return directory.is_dir() and Installed(vehicle, directory).damage is None
+    return directory.is_dir() and InstalledVersion(vehicle, directory).damage is None
 
 
-def _use(installed: Installed, already: bool) -> Outcome:
+def _use(installed: InstalledVersion, already: bool) -> InstallOutcome:
     """Make this version the one that runs use, and remove unfinished installations."""
     home = installed.directory.parent
     link = home / f".{CURRENT}"
@@ -284,11 +284,11 @@ def _use(installed: Installed, already: bool) -> Outcome:
     link.replace(home / CURRENT)
     for left in home.glob(".*.part"):
         shutil.rmtree(left, ignore_errors=True)
-    return Outcome(installed, already)
+    return InstallOutcome(installed, already)
 
 
 @contextlib.contextmanager
-def _locked(home: Path, watcher: Watcher) -> Iterator[None]:
+def _locked(home: Path, watcher: InstallWatcher) -> Iterator[None]:
     """Allow one installation of a vehicle at a time, by a lock that the kernel releases when a process ends
     (flock(2)).
     """

@@ -29,7 +29,7 @@ CURRENT = "current"
 
 
 @dataclass(frozen=True)
-class File:
+class DownloadedFile:
     """A downloaded file. Its size is in bytes."""
 
     url: str
@@ -37,7 +37,7 @@ class File:
     sha256: str
 
     @classmethod
-    def of(cls, path: Path, url: str) -> File:
+    def of(cls, path: Path, url: str) -> DownloadedFile:
         return cls(url, path.stat().st_size, sha256(path))
 
 
@@ -49,7 +49,7 @@ class Manifest:
     version: str
     commit: str
     fetched_at: str
-    files: dict[str, File]
+    files: dict[str, DownloadedFile]
 
     def write(self, directory: Path) -> None:
         (directory / MANIFEST).write_text(json.dumps(asdict(self), indent=1) + "\n")
@@ -62,14 +62,14 @@ class Manifest:
         """
         document = json.loads((directory / MANIFEST).read_text())
         files = {
-            name: File(str(file["url"]), int(file["size"]), str(file["sha256"]))
+            name: DownloadedFile(str(file["url"]), int(file["size"]), str(file["sha256"]))
             for name, file in document["files"].items()
         }
         return cls(**{**document, "files": files})
 
 
 @dataclass(frozen=True)
-class Installed:
+class InstalledVersion:
     """One installed version for one vehicle type."""
 
     vehicle: VehicleType
@@ -116,22 +116,22 @@ def cache(environ: Mapping[str, str]) -> Path:
     raise VehicleError("no directory for a cache: set XDG_CACHE_HOME to the absolute path of a directory")
 
 
-def all_installed(vehicle: VehicleType, environ: Mapping[str, str]) -> list[Installed]:
+def all_installed(vehicle: VehicleType, environ: Mapping[str, str]) -> list[InstalledVersion]:
     """Return all installed versions, sorted by name."""
     try:
         directories = sorted(path for path in (cache(environ) / vehicle).iterdir() if not path.name.startswith("."))
     except (OSError, VehicleError):
         return []
-    return [Installed(vehicle, path) for path in directories if path.is_dir() and not path.is_symlink()]
+    return [InstalledVersion(vehicle, path) for path in directories if path.is_dir() and not path.is_symlink()]
 
 
-def current(vehicle: VehicleType, environ: Mapping[str, str]) -> Installed | None:
+def current(vehicle: VehicleType, environ: Mapping[str, str]) -> InstalledVersion | None:
     """Return the version that was installed last, or None. Raises UnusableBinaryError if it is damaged."""
     try:
         directory = (cache(environ) / vehicle / CURRENT).resolve(strict=True)
     except (OSError, VehicleError):
         return None
-    version = Installed(vehicle, directory)
+    version = InstalledVersion(vehicle, directory)
     if version.damage:
         raise UnusableBinaryError(f"{directory} is damaged, {version.damage}: run {install_command(vehicle)}")
     return version

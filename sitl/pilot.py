@@ -18,16 +18,16 @@ from pathlib import Path
 
 from sitl._by_guided import GuidedFlight
 from sitl._by_mission import MissionFlight
-from sitl._introduction import Introduction
-from sitl._pilot_link import Link
+from sitl._introduction import VehicleIntroduction
+from sitl._pilot_link import PilotLink
 from sitl._route import route
-from sitl._take_off import TakeOff, Termination
+from sitl._take_off import FlightTermination, TakeOff
 from sitl._vehicle_state import VehicleState
 from sitl.circumstances import Circumstance, bring_about
 from sitl.modes import mode_name
 from sitl.parameters import ParameterError, unknown
 from sitl.plan import By, Plan
-from sitl.procedure import GettingReady, HopelessError, Procedure, Step
+from sitl.procedure import ArmingPreparation, HopelessError, Procedure, Step
 from sitl.vehicle import FlightError, Home, VehicleType
 
 SILENCE_S = 10.0  # of our time; a vehicle says something every simulated second
@@ -54,7 +54,7 @@ class Pilot:
         second, and `home` are those of the vehicle's launch. Errors contain `vehicle_id`, by default the system ID.
         Raises OSError if `tlog` cannot be opened.
         """
-        self.link = Link(sysid, sock, tlog, speedup, home)
+        self.link = PilotLink(sysid, sock, tlog, speedup, home)
         self.vehicle_type: VehicleType = vehicle_type
         self.vehicle_id = sysid if vehicle_id is None else vehicle_id
         self._terminated = self._handed_over = False
@@ -93,7 +93,7 @@ class Pilot:
 
         Raises FlightError, and ParameterError if the vehicle does not know some of the given parameters.
         """
-        await self._pursue(Introduction(self.link, given))
+        await self._pursue(VehicleIntroduction(self.link, given))
         if phrase := unknown(given, self.link.parameters):
             raise ParameterError(f"vehicle {self.vehicle_id} knows {phrase}")
 
@@ -103,7 +103,7 @@ class Pilot:
         ArduPilot repeats its checks, and has further ones in other modes. It may therefore report ready and then not
         ready. Raises FlightError.
         """
-        await self._pursue(GettingReady(flight, self.state))
+        await self._pursue(ArmingPreparation(flight, self.state))
 
     async def fly(self, flight: Procedure) -> None:
         """Execute the procedure until its last step is complete. Raises FlightError."""
@@ -115,7 +115,7 @@ class Pilot:
         The current procedure ends without an error.
         """
         self._terminated = True
-        await self._pursue(Termination(self.link))
+        await self._pursue(FlightTermination(self.link))
 
     async def befall(self, circumstance: Circumstance) -> Mapping[str, float]:
         """Make the vehicle simulate an event such as a GPS failure. Return the parameters that were set.
@@ -178,7 +178,7 @@ class Pilot:
         """Return true if the procedure need not continue, because the flight was ended or another pilot flies the
         vehicle.
         """
-        if isinstance(procedure, Termination):
+        if isinstance(procedure, FlightTermination):
             return False
         left = self.link.has_left_its_mode or self.link.has_disarmed
         handed_over = self._handed_over or (self._befallen and left)
@@ -224,7 +224,7 @@ class _Listening:
 class _StepClocks:
     """The time for which the pilot has waited for each step, in simulated seconds and in seconds of wall time."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: PilotLink) -> None:
         self._link = link
         self._flown_s: defaultdict[Step, float] = defaultdict(float)
         self._waited_s: defaultdict[Step, float] = defaultdict(float)

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl._pilot_link import Link
+from sitl._pilot_link import PilotLink
 from sitl._vehicle_state import VehicleState
 from sitl.modes import MODES
 from sitl.vehicle import VehicleType
@@ -53,7 +53,7 @@ class Procedure(Protocol):
         """Request a step from the vehicle. The pilot calls this once per heartbeat until the step is complete."""
 
 
-class GettingReady:
+class ArmingPreparation:
     """The steps before arming, until all of them have stayed complete for READY_FOR_S seconds."""
 
     purpose = "get ready"
@@ -82,7 +82,7 @@ class GettingReady:
 class Commander:
     """The requests that all procedures share."""
 
-    def __init__(self, link: Link, vehicle_type: VehicleType) -> None:
+    def __init__(self, link: PilotLink, vehicle_type: VehicleType) -> None:
         self.link = link
         self.state = link.state
         self.vehicle_type: VehicleType = vehicle_type

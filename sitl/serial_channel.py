@@ -1,6 +1,6 @@
 """Connect one client to the embedded vehicle, like one serial port of an ArduPilot: MAVLink without a socket.
 
-Each `Channel` has its own parser, sequence numbers, message intervals and incomplete mission.
+Each `ClientChannel` has its own parser, sequence numbers, message intervals and incomplete mission.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # of a plane; what else can be set is in _fails
 SYSTEM_ID = "SYSID_THISMAV"
 
 
-class Channel:
+class ClientChannel:
     """The connection of one client to an autopilot, from its beginning to its end."""
 
     def __init__(self, autopilot: Autopilot) -> None:

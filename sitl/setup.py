@@ -11,7 +11,7 @@ DEBUGGERS: tuple[Debugger, ...] = get_args(Debugger)
 
 
 @dataclass(frozen=True)
-class Setup:
+class VehicleSetup:
     """The settings of one vehicle.
 
     `frame` None is the default frame of its type. `log_mib` None means no limit of the log.
@@ -24,5 +24,5 @@ class Setup:
     log_mib: int | None = None
 
 
-USUAL = Setup()
+USUAL = VehicleSetup()
 """The default setup."""

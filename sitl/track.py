@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import Course, Motion, Rest, Segment, end_of
+from sitl._kinematics import Course, Motion, RestSegment, Segment, end_of
 from sitl._leg_by_leg import leg_by_leg
 from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl._route import Waypoint, landing_begins, route
@@ -66,7 +66,7 @@ def track(
 def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:
     """Return the segments for the waypoints in AUTO mode, and for the unlimited stay after the last one."""
     model, last = MODELS[vehicle_type], waypoints[-1]
-    segments: list[Segment] = [Rest(start, 0.0)]
+    segments: list[Segment] = [RestSegment(start, 0.0)]
     for before, waypoint, after in zip((None, *waypoints), waypoints, (*waypoints[1:], None), strict=False):
         segments += _manoeuvre(model, waypoint, end_of(segments), before, after)
     if last.kind != "land":

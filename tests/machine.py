@@ -17,7 +17,7 @@ from typing import NoReturn
 import pytest
 
 from harness.play.containers._container_preflight import require_root
-from harness.play.containers.docker_engine import DockerError, Engine
+from harness.play.containers.docker_engine import DockerEngine, DockerError
 from harness.proof.specification import _tlc
 from netem import uml
 from netem.errors import UmlError
@@ -59,7 +59,7 @@ def require_uml() -> None:
 def require_docker() -> None:
     """Skip or fail the test without a Docker engine that this user may use."""
     try:
-        Engine.connect().close()
+        DockerEngine.connect().close()
         require_root()
     except DockerError as error:
         do_without("docker", str(error))

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 from markupsafe import Markup
 
 from harness.present import svg
-from harness.present.svg import Area
+from harness.present.svg import ChartArea
 from harness.run.parallel import FailedTask, sweep
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
@@ -386,7 +386,7 @@ def _value(runs: Runs, cell: Cell, shown: str) -> float:
     return sum(values) / len(values)
 
 
-def _panel(runs: Runs, radio: str, shown: str, area: Area) -> Markup:
+def _panel(runs: Runs, radio: str, shown: str, area: ChartArea) -> Markup:
     numbers = MISSIONS["busy"]
     across = svg.Axis(numbers[0] * 0.9, numbers[-1] * 1.1, *area.across, numbers, log=True)
     lines = [

@@ -12,7 +12,7 @@ import tarfile
 import tempfile
 from pathlib import Path
 
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.scenario import Scenario, load_scenario
 
@@ -39,7 +39,7 @@ def broken() -> dict[str, bytes]:
 
 
 def _flown(scenario: Scenario, directory: Path) -> dict[str, bytes]:
-    run(scenario, SEED, directory, Silent(), "sim")
+    run(scenario, SEED, directory, SilentProgress(), "sim")
     files = (path for kind in ("*.trace.jsonl", "*.chain.json") for path in (directory / "agents").glob(kind))
     return {path.name: path.read_bytes() for path in files}
 

@@ -18,7 +18,7 @@ Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
 """Coordinates of more than 1000 km are invalid."""
 
 
-class Fix(NamedTuple):
+class PositionFix(NamedTuple):
     """The position of a vehicle at mission second `at_s`."""
 
     at_s: float
@@ -34,10 +34,10 @@ class Tracks:
     `problems` has a sentence for each unreadable part.
     """
 
-    by_vehicle: dict[int, list[Fix]]
+    by_vehicle: dict[int, list[PositionFix]]
     problems: list[str]
 
-    def at(self, vehicle: int, at_s: float) -> Fix:
+    def at(self, vehicle: int, at_s: float) -> PositionFix:
         """Return the position of a vehicle at any second, interpolated between two recorded positions."""
         fixes = self.by_vehicle[vehicle]
         position = bisect_right(fixes, at_s, key=attrgetter("at_s"))
@@ -45,10 +45,10 @@ class Tracks:
         return between(before, after, at_s) if before.at_s < at_s < after.at_s else before._replace(at_s=at_s)
 
 
-def between(before: Fix, after: Fix, at_s: float) -> Fix:
+def between(before: PositionFix, after: PositionFix, at_s: float) -> PositionFix:
     """Return the position of a vehicle that flies straight and at constant speed between two positions."""
     share = (at_s - before.at_s) / (after.at_s - before.at_s)
-    return Fix(
+    return PositionFix(
         at_s,
         before.north_m + share * (after.north_m - before.north_m),
         before.east_m + share * (after.east_m - before.east_m),
@@ -68,14 +68,14 @@ class TrackLine(BaseModel):
 def read_tracks(path: Path | None, vehicles: Collection[int]) -> Tracks:
     """Read the positions of `vehicles`. Lines about other vehicles are left out."""
     lines = JsonLines(path, TrackLine)
-    fixes: dict[int, list[Fix]] = {}
+    fixes: dict[int, list[PositionFix]] = {}
     known = set(vehicles)
     for line in lines:
         if not line.places.keys() <= known:
             lines.leave_out()
             continue
         for vehicle, place in line.places.items():
-            fixes.setdefault(vehicle, []).append(Fix(line.at_s, *place))
+            fixes.setdefault(vehicle, []).append(PositionFix(line.at_s, *place))
     for track in fixes.values():
         track.sort(key=attrgetter("at_s"))
     return Tracks(dict(sorted(fixes.items())), lines.problems())

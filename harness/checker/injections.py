@@ -33,7 +33,7 @@ BRANCHES_NAMED = 6
 Count = Annotated[int, Field(ge=0, le=10**9)]
 
 
-class _Line(BaseModel):
+class _RogueLine(BaseModel):
     """A line of `rogue.jsonl`, the log of injected datagrams. It describes one datagram, or only counts several."""
 
     model_config = ConfigDict(extra="ignore")
@@ -75,7 +75,7 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
         {"message", "trigger"} & unknown_names(trace.runs).keys() for trace in archive.traces.values()
     )
     copies: dict[_Key, list[tuple[float, int]]] = defaultdict(list)
-    for line in archive.injected(_Line):
+    for line in archive.injected(_RogueLine):
         if line.injection in tallies:
             _count_line(line, tallies[line.injection], copies, secured=scenario.security is not None)
     for trace in archive.traces.values():
@@ -114,7 +114,7 @@ def describe_handling(messages: InjectedMessages) -> str:
     )
 
 
-def _count_line(line: _Line, tally: _Tally, copies: dict[_Key, list[tuple[float, int]]], *, secured: bool) -> None:
+def _count_line(line: _RogueLine, tally: _Tally, copies: dict[_Key, list[tuple[float, int]]], *, secured: bool) -> None:
     tally.bytes += line.bytes
     if isinstance(line.refused, str):
         tally.refused[line.refused] += 1

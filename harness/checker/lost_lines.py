@@ -31,7 +31,7 @@ def lost_lines(trace: Trace) -> dict[int, str]:
     A position is the number of runs before it, as in `Trace.gaps`.
     """
     found: dict[int, str] = {}
-    kinds = _Kind(), _Kind(), _Kind(), _Kind()
+    kinds = _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces()
     known = {gap.position for gap in trace.gaps} | {*trace.jumps}
     bounds = [0, *trace.starts, len(trace.runs)]
     for start, end in pairwise(bounds):
@@ -43,7 +43,7 @@ def lost_lines(trace: Trace) -> dict[int, str]:
     return found
 
 
-class _Kind:
+class _ContradictionPlaces:
     """The places with one kind of contradiction. `possible` is the number of lines at which it could occur."""
 
     def __init__(self) -> None:
@@ -51,7 +51,7 @@ class _Kind:
         self.places = self.possible = 0
 
 
-def _jumps(runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _Kind) -> None:
+def _jumps(runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _ContradictionPlaces) -> None:
     expected: int | None = 0
     sent_at = start
     for position in range(start, end):
@@ -71,7 +71,9 @@ def _jumps(runs: Sequence[HandlerRun], start: int, end: int, known: set[int], ki
         expected, sent_at = run.sent[-1].seq + 1, position + 1
 
 
-def _back_in_time(runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _Kind) -> None:
+def _back_in_time(
+    runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _ContradictionPlaces
+) -> None:
     for position in range(start + 1, end):
         kind.possible += 1
         if runs[position].t < runs[position - 1].t and position not in known:
@@ -79,7 +81,9 @@ def _back_in_time(runs: Sequence[HandlerRun], start: int, end: int, known: set[i
             kind.found[position] = f"lines are in the wrong order (the time goes back to {runs[position].t:g} s)"
 
 
-def _without_trigger(runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _Kind) -> None:
+def _without_trigger(
+    runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _ContradictionPlaces
+) -> None:
     ran: set[str] = set()
     for position in range(start, end):
         run = runs[position]
@@ -94,7 +98,9 @@ def _without_trigger(runs: Sequence[HandlerRun], start: int, end: int, known: se
         ran.add(run.trigger.handler)
 
 
-def _other_states(runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _Kind) -> None:
+def _other_states(
+    runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _ContradictionPlaces
+) -> None:
     before = StateSummary(0, 0, 0, reconciling=False, idle=True, top="")
     for position in range(start, end):
         run = runs[position]

@@ -64,7 +64,7 @@ def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class _Round:
+class _CyclePart:
     """The part of one agent in an endless cycle: the handler runs of one period, its start, length and number of
     repetitions.
     """
@@ -76,7 +76,7 @@ class _Round:
 
 
 def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | None:
-    rounds: dict[int, _Round] = {}
+    rounds: dict[int, _CyclePart] = {}
     since_s, ended_at_s, connected_s = 0.0, evidence.ended_at_s, evidence.connected_since_s
     if ended_at_s is None or connected_s is None:
         return None
@@ -127,7 +127,7 @@ def _own_runs(trace: Trace) -> list[HandlerRun]:
     return [run for run in runs if run.branch != ALREADY]
 
 
-def _round(runs: Sequence[HandlerRun], times: int) -> _Round | None:
+def _round(runs: Sequence[HandlerRun], times: int) -> _CyclePart | None:
     """Return the shortest sequence that the runs repeat at least `times` times at their end, or None."""
     keys = [_key(run) for run in reversed(runs)]
     for length, matching in enumerate(_matches(keys)):
@@ -135,7 +135,7 @@ def _round(runs: Sequence[HandlerRun], times: int) -> _Round | None:
             going_round = length + matching
             period_s = runs[-1].t - runs[-1 - length].t
             if period_s > 0:
-                return _Round(list(runs[-length:]), runs[-going_round].t, period_s, going_round // length)
+                return _CyclePart(list(runs[-length:]), runs[-going_round].t, period_s, going_round // length)
     return None
 
 
@@ -160,7 +160,7 @@ def _matches(keys: Sequence[object]) -> list[int]:
     return matching
 
 
-def _waits(evidence: Evidence, rounds: dict[int, _Round], period_s: float) -> Iterator[CycleWait]:
+def _waits(evidence: Evidence, rounds: dict[int, _CyclePart], period_s: float) -> Iterator[CycleWait]:
     """Yield, for each agent, the peers whose answers did not count in the last period and the peers that rejected its
     blocks.
     """

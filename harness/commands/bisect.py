@@ -18,8 +18,8 @@ from harness.errors import HarnessError, InterruptedRunError, MachineError
 from harness.field.bisection import (
     BisectionResult,
     Outcome,
+    SubjectPlayer,
     UntestableError,
-    Workshop,
     bisect,
     differences,
     subject_of,
@@ -143,14 +143,14 @@ class _PlayRequest:
     speedup: float | None
     limit_s: float
 
-    def workshops(self, directory: Path) -> list[Workshop]:
+    def workshops(self, directory: Path) -> list[SubjectPlayer]:
         """Return an object for each agent command that plays the scenario or record. Raises HarnessError."""
         subject = subject_of(self.subject, self.seed, self.agent)
         workshops = []
         for number, command in enumerate(self.commands):
             plays = directory / f"plays-{number}"
             plays.mkdir()
-            workshops.append(Workshop(subject, plays, limit_s=self.limit_s, command=command, speedup=self.speedup))
+            workshops.append(SubjectPlayer(subject, plays, limit_s=self.limit_s, command=command, speedup=self.speedup))
         return workshops
 
 

@@ -64,10 +64,10 @@ def clean_command() -> None:
 
     Containers of active runs and of other programs stay.
     """
-    from harness.play.containers.docker_engine import Engine
+    from harness.play.containers.docker_engine import DockerEngine
     from harness.play.containers.ownership import clean
 
-    engine = Engine.connect()
+    engine = DockerEngine.connect()
     try:
         cleaned = clean(engine)
     finally:

@@ -16,7 +16,7 @@ from harness.scenario.load import parse
 
 with extra("secure", "the command keys"):
     from harness.play.keyring.inspection import in_words, inspect
-    from harness.play.keyring.key_directory import Home, KeysError, write_revocation
+    from harness.play.keyring.key_directory import KeyDirectory, KeysError, write_revocation
     from ucp.secure.bundle import DEFAULT_EPOCH_S, MAX_EPOCH_S
 
 SEVERAL_MISSIONS = 1
@@ -43,7 +43,7 @@ def new_command(
     in it are secret except public.json.
     """
     agent_ids = parse({"name": "keys", "agents": roster_of(agents)}).roster
-    made = Home.new(home, agent_ids, seals=sealed, epoch_s=epoch_s)
+    made = KeyDirectory.new(home, agent_ids, seals=sealed, epoch_s=epoch_s)
     print_lines(map(in_words, inspect(made.directory)))
 
 
@@ -58,7 +58,7 @@ def bundle_command(
 
     A bundle holds the vehicle's own key, the group secret, and all public keys. A revoked vehicle gets no bundle.
     """
-    print_lines(map(str, Home(home).write_bundles(out, agents, overwrite=overwrite)))
+    print_lines(map(str, KeyDirectory(home).write_bundles(out, agents, overwrite=overwrite)))
 
 
 @app.command("inspect")
@@ -97,7 +97,7 @@ def revoke_command(
     """
     if out is not None:
         refuse_existing([out])
-    key_directory = Home(home)
+    key_directory = KeyDirectory(home)
     revocation = key_directory.revoke(agents)
     if out is not None:
         try:

@@ -15,7 +15,7 @@ from harness.commands._shared_options import RARE, roster_of
 from harness.commands.terminal import complain, print_json, print_lines
 from harness.errors import WRONG_REQUEST, extra
 from harness.field.depot.mission_comparison import compare
-from harness.field.depot.mission_files import MissionFileError, Plan, write
+from harness.field.depot.mission_files import MissionFileError, MissionPlan, write
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.agent_options import quirks_in_words
 from harness.scenario.load import parse
@@ -25,7 +25,7 @@ from ucp.plain_file import read_plain_file
 from ucp.sealed import seal_to
 
 if TYPE_CHECKING:
-    from harness.play.keyring.key_directory import Home
+    from harness.play.keyring.key_directory import KeyDirectory
 
 DIFFERENT = 1
 
@@ -89,7 +89,7 @@ def new_command(
             f"{scenario}: its quirks ({', '.join(quirks_in_words(requested.quirks))}) are left out, because mission "
             "files have no quirks"
         )
-    plan = Plan(
+    plan = MissionPlan(
         requested,
         data,
         settings=_pairs("--setting", settings),
@@ -152,10 +152,10 @@ def _scenario(path: Path | None, agents: str | None, name: str | None) -> Scenar
     return parse({**chosen, **kept})
 
 
-def _home(directory: Path) -> "Home":
+def _home(directory: Path) -> "KeyDirectory":
     with extra("secure", "--keys"):
-        from harness.play.keyring.key_directory import Home
-    return Home(directory)
+        from harness.play.keyring.key_directory import KeyDirectory
+    return KeyDirectory(directory)
 
 
 def _initial_data(text: str | None, requested: Scenario) -> bytes:

@@ -13,9 +13,9 @@ from harness.checker.steps.core_in_use import IN_USE
 from harness.checker.steps.implementation import REFERENCE
 from harness.commands.terminal import complain, output, print_json
 from harness.errors import VIOLATED, WRONG_REQUEST, InterruptedRunError
-from harness.field.replay import Player, Record, ReplayResult, open_record, open_records
+from harness.field.replay import Record, RecordPlayer, ReplayResult, open_record, open_records
 from harness.field.replay.breakpoints import parse_breakpoint
-from harness.field.replay.prompt import Prompt
+from harness.field.replay.prompt import ReplayPrompt
 from harness.field.replay.replay_document import ReplayedRecord, document, header_text, replayed, summary
 from harness.field.replay.replay_names import ReplayNames
 from harness.play.core_version import edited_files
@@ -65,8 +65,8 @@ def _play(console: Console, records: Sequence[Record], until: float | None, as_j
     for record in records:
         _print_problems(record)
         names = ReplayNames(record)
-        result = Player(record, until).to_end()
-        in_use = Player(record, until, IN_USE).to_end()  # a debugger then stops in the handlers of `ucp`
+        result = RecordPlayer(record, until).to_end()
+        in_use = RecordPlayer(record, until, IN_USE).to_end()  # a debugger then stops in the handlers of `ucp`
         differ |= bool(result.deviations)
         judged |= bool(result.steps)
         if as_json:
@@ -84,21 +84,21 @@ def _step_through(
     """Step through a record by the user's commands. When the commands end, replay the rest."""
     _print_problems(record)
     names = ReplayNames(record)
-    player = Player(record, until, IN_USE if debug else REFERENCE)
+    player = RecordPlayer(record, until, IN_USE if debug else REFERENCE)
     if debug:
         places = [parse_breakpoint(words, names) for words in breaks]
         while not player.at_end:
             upcoming = player.entries[player.position]
             player.forward(into_debugger=any(at(upcoming) for at in places))
     else:
-        prompt = Prompt(player, names, console, breaks)
+        prompt = ReplayPrompt(player, names, console, breaks)
         _show(console, [header_text(record)])
         prompt.begin(at_start)
         prompt.cmdloop()
         if prompt.quit:
             raise typer.Exit(VIOLATED if player.result.deviations else 0)
-    result = Player(record, until).to_end()
-    _show(console, [*summary(record, result, names), *_in_use(Player(record, until, IN_USE).to_end(), result)])
+    result = RecordPlayer(record, until).to_end()
+    _show(console, [*summary(record, result, names), *_in_use(RecordPlayer(record, until, IN_USE).to_end(), result)])
     raise typer.Exit(VIOLATED if result.deviations else 0 if result.steps else WRONG_REQUEST)
 
 

@@ -41,7 +41,7 @@ Tally = Literal["voting", "phase one", "phase two", "timer"]
 
 
 @dataclass(frozen=True)
-class Input:
+class AgentInput:
     """One kind of input for the agent under test, described by its name."""
 
     name: str
@@ -55,7 +55,7 @@ class Input:
     counted it."""
 
 
-INPUTS: dict[str, Input] = {}
+INPUTS: dict[str, AgentInput] = {}
 TIMER, LOG = "the next timer ends", "an event fills a block"
 
 
@@ -64,7 +64,7 @@ def _input(
 ) -> Callable[[Callable[[ReferenceModel], Action | None]], None]:
     def declare(make: Callable[[ReferenceModel], Action | None]) -> None:
         assert name not in INPUTS
-        INPUTS[name] = Input(name, make, tally, counted_twin)
+        INPUTS[name] = AgentInput(name, make, tally, counted_twin)
 
     return declare
 
@@ -489,8 +489,8 @@ _message(
 )
 
 
-def _with_timer(given: Input) -> Input:
-    return Input(f"{given.name}, and the timer ends", given.make, "timer", given.counted_twin, given.name)
+def _with_timer(given: AgentInput) -> AgentInput:
+    return AgentInput(f"{given.name}, and the timer ends", given.make, "timer", given.counted_twin, given.name)
 
 
 INPUTS |= {

@@ -4,7 +4,7 @@ import asyncio
 from dataclasses import replace
 
 from harness.conformance._udp_lab import AgentEndedError, UdpLab
-from harness.conformance.cases import ALL_CASES, Bench, HandwrittenCase
+from harness.conformance.cases import ALL_CASES, CaseBench, HandwrittenCase
 from harness.conformance.cases._bench import CannotJudgeError, WrongBehaviourError
 from harness.conformance.results import CaseResult
 from harness.errors import UnsupportedError
@@ -39,7 +39,7 @@ async def handwritten(lab: UdpLab, only: str | None) -> list[CaseResult]:
 async def _play(lab: UdpLab, case: HandwrittenCase) -> CaseResult:
     named = CaseResult(case.name, case.algorithm, "passed", _HANDLER.get(case.algorithm, ""), section=case.section)
     try:
-        await case.play(Bench(lab))
+        await case.play(CaseBench(lab))
     except (UnsupportedError, AgentUnsupportedError, CannotJudgeError) as error:
         return replace(named, verdict="not applicable", reason=str(error))
     except WrongBehaviourError as error:

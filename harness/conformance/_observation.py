@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from harness.conformance._alphabet import Input
+from harness.conformance._alphabet import AgentInput
 from harness.conformance._reference_model import AGENT, ExpectedOutcome, ExpectedRun, ReferenceModel, TimerExpiry
 from harness.conformance._state_space import AgentState, VectorKey, key_of, next_timer_name
 from harness.report.stories.story_names import INCEPTION, in_words
@@ -110,7 +110,7 @@ class Observation:
 
 def compare(
     model: ReferenceModel,
-    given: Input,
+    given: AgentInput,
     before: AgentState,
     outcome: ExpectedOutcome,
     datagrams: Iterable[bytes],

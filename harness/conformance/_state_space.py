@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from harness.checker.reference.algorithms import IS_TOP_OF_CHAIN
-from harness.conformance._alphabet import INPUTS, LOG, TIMER, Input
+from harness.conformance._alphabet import INPUTS, LOG, TIMER, AgentInput
 from harness.conformance._reference_model import AGENT, OLD_US, YOUNG_US, ExpectedOutcome, ModelSnapshot, ReferenceModel
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.settings import ALTERNATIVES, Settings
@@ -135,7 +135,7 @@ class VectorKey(NamedTuple):
     input: str
 
 
-def key_of(state: AgentState, given: Input) -> VectorKey:
+def key_of(state: AgentState, given: AgentInput) -> VectorKey:
     matters: bool = given.tally == "timer" or given.tally == state.activity
     return VectorKey(state.activity, state.holdings, state.counted if matters else (), given.name)
 
@@ -160,7 +160,7 @@ def next_timer_name(model: ReferenceModel) -> str | None:
     return min(running, key=lambda timer: timer.deadline or 0.0).name if running else None
 
 
-def advance(model: ReferenceModel, given: Input, now: float) -> tuple[ExpectedOutcome, float] | None:
+def advance(model: ReferenceModel, given: AgentInput, now: float) -> tuple[ExpectedOutcome, float] | None:
     """Give the reference an input in virtual time, and return its handler runs and the time.
 
     Return None if the input is impossible in the current state.
@@ -258,7 +258,7 @@ agent counts and decides in the same way in all other states. These states have 
 one agent can reach them again and again."""
 
 
-def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, given: Input) -> bool:
+def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, given: AgentInput) -> bool:
     """Return true if the later expiry of the timer would show that an agent wrongly counted the input."""
     if (
         (before.activity, before.holdings) not in COUNTING_STATES
@@ -297,7 +297,7 @@ def handlers_and_messages(outcome: ExpectedOutcome) -> tuple[object, ...]:
     return tuple((run.handler, run.branch, tuple(message.NAME for message in run.sent)) for run in outcome.runs)
 
 
-def _is_redundant(model: ReferenceModel, before: AgentState, given: Input) -> bool:
+def _is_redundant(model: ReferenceModel, before: AgentState, given: AgentInput) -> bool:
     """Return true if the input leads only to states equivalent to known ones, or if its effect depends on more than the
     state.
     """

@@ -25,7 +25,7 @@ from harness.conformance._state_space import (
     handlers_and_messages,
     walk,
 )
-from harness.conformance._tours import Suspicion, Tour, VectorMap
+from harness.conformance._tours import AgentTour, SuspectedFailure, VectorMap
 from harness.conformance._udp_lab import AgentEndedError, NoAgentError
 from harness.conformance.vectors import VectorSet
 from harness.errors import UnsupportedError
@@ -79,7 +79,7 @@ class VariantResult:
 
     vectors: VectorSet
     passed: set[VectorKey] = field(default_factory=set)
-    suspicions: list[Suspicion] = field(default_factory=list)
+    suspicions: list[SuspectedFailure] = field(default_factory=list)
     failures: list[ConfirmedFailure] = field(default_factory=list)
     unsupported: str | None = None
     set_aside: int = 0
@@ -217,7 +217,7 @@ class VectorSuite:
             self._report_progress()
 
         try:
-            suspicion = await Tour(vector_map, agent, passed).run(until)
+            suspicion = await AgentTour(vector_map, agent, passed).run(until)
             if not agent.reference_follows:  # the machine is late, so fewer agents should run in parallel
                 self._max_workers = max(MIN_WORKERS, self._max_workers - 1)
             if suspicion is not None:
@@ -225,7 +225,7 @@ class VectorSuite:
         finally:
             await agent.close()
 
-    def _suspect(self, variant_result: VariantResult, vector_map: VectorMap, suspicion: Suspicion) -> None:
+    def _suspect(self, variant_result: VariantResult, vector_map: VectorMap, suspicion: SuspectedFailure) -> None:
         variant_result.suspicions.append(suspicion)
         vector_map.avoid(suspicion.observation.key)
         kind = handlers_and_messages(suspicion.observation.outcome)
@@ -239,7 +239,7 @@ class VectorSuite:
             variant_result.set_aside += sum(vector_map.take(key) for key in alike)
 
     @staticmethod
-    def _suspicions_to_retry(variant_result: VariantResult) -> Iterator[Suspicion]:
+    def _suspicions_to_retry(variant_result: VariantResult) -> Iterator[SuspectedFailure]:
         """Yield the suspected failures with the shortest inputs, at most MAX_RETRIES_OF_A_KIND with the same
         branches.
         """
@@ -266,7 +266,7 @@ class VectorSuite:
                 variant_result.passed.add(key)
                 self._report_progress()
 
-    async def _retry_suspicions(self, waiting: Iterator[tuple[VariantResult, Suspicion]]) -> None:
+    async def _retry_suspicions(self, waiting: Iterator[tuple[VariantResult, SuspectedFailure]]) -> None:
         for variant_result, suspicion in waiting:
             variant_result.passed.discard(suspicion.observation.key)
             if (
@@ -289,7 +289,7 @@ class VectorSuite:
                 variant_result.passed.add(suspicion.observation.key)  # the machine was at fault
 
     async def _retry_variants(
-        self, variant_result: VariantResult, suspicion: Suspicion
+        self, variant_result: VariantResult, suspicion: SuspectedFailure
     ) -> AsyncIterator[ReplayOutcome]:
         """Repeat a suspected failure with different sequences of inputs until it fails again. Yield each result.
 
@@ -376,7 +376,7 @@ def _kind_of_end(ended: str) -> str:
     return ended.partition(":")[0]
 
 
-def _unexplained_failure(variant: SettingsVariant, suspicion: Suspicion, ended: str) -> ConfirmedFailure:
+def _unexplained_failure(variant: SettingsVariant, suspicion: SuspectedFailure, ended: str) -> ConfirmedFailure:
     return ConfirmedFailure(
         variant.name, suspicion.path, suspicion.observation, suspicion.exchanges, unexplained_end=ended
     )

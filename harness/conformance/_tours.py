@@ -33,7 +33,7 @@ _RESTART = "another agent starts"
 
 
 @dataclass(frozen=True)
-class Suspicion:
+class SuspectedFailure:
     """A deviation of an agent that may also be the fault of a slow machine."""
 
     path: tuple[str, ...]
@@ -176,7 +176,7 @@ class VectorMap:
             yield from self._edges.get(state, ())
 
 
-class Tour:
+class AgentTour:
     """A sequence of tests played by one agent. `passed` is called for each test that passes."""
 
     def __init__(self, vector_map: VectorMap, agent: AgentUnderTest, passed: Callable[[VectorKey], None]) -> None:
@@ -188,7 +188,7 @@ class Tour:
         self._path: list[str] = []
         self._passed = passed
 
-    async def run(self, until: float) -> Suspicion | None:
+    async def run(self, until: float) -> SuspectedFailure | None:
         """Play until the agent deviates or nothing remains, at most until the second `until` of the monotonic clock.
 
         Return the deviation, or None if the agent did not deviate.
@@ -198,7 +198,7 @@ class Tour:
         finally:
             self._discard_plan()
 
-    async def _run_until(self, until: float) -> Suspicion | None:
+    async def _run_until(self, until: float) -> SuspectedFailure | None:
         while time.monotonic() < until and (name := self._next_input()) is not None:
             state = state_of(self._agent.model)
             key = key_of(state, INPUTS[name])
@@ -216,7 +216,7 @@ class Tour:
                     return None
                 continue
             if observation.wrong:
-                return Suspicion(tuple(self._path), observation, self._agent.exchanges())
+                return SuspectedFailure(tuple(self._path), observation, self._agent.exchanges())
             if taken:
                 self._passed(key)
             if self._map.leads_to(state, name) not in (None, state_of(self._agent.model)):

@@ -18,7 +18,7 @@ from itertools import product
 from typing import Any
 
 from harness.conformance._agent_under_test import AgentUnderTest, Start
-from harness.conformance._alphabet import Input
+from harness.conformance._alphabet import AgentInput
 from harness.conformance._observation import (
     COMPARED,
     MAX_EARLY_TIMERS,
@@ -56,7 +56,7 @@ from ucp.messages import MalformedDatagramError, Message, decode
 
 
 @dataclass(frozen=True)
-class Timing:
+class UdpTiming:
     """The speed of mission time, and the time limits in seconds of wall time."""
 
     speedup: float
@@ -75,10 +75,10 @@ class Timing:
     """Time without an expected message after which the agent is asked for its status."""
 
 
-TIMING_IN_PARALLEL = Timing(
+TIMING_IN_PARALLEL = UdpTiming(
     24.0, margin_s=0.08, early_s=0.15, patience_s=0.5, calm_s=0.08, linger_s=0.0, ask_again_s=0.1
 )
-TIMING_ALONE = Timing(8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3, linger_s=0.1, ask_again_s=0.25)
+TIMING_ALONE = UdpTiming(8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3, linger_s=0.1, ask_again_s=0.25)
 MIN_ANSWERS = 2
 """Number of answers of an agent after which a missing message is the agent's fault, not that of a late machine."""
 
@@ -89,7 +89,7 @@ class UdpAgent(AgentUnderTest):
     def __init__(
         self,
         variant: SettingsVariant,
-        timing: Timing,
+        timing: UdpTiming,
         process: ProcessUnderTest,
         peer_socket: PeerSocket,
         closed: Callable[[], None],
@@ -102,7 +102,7 @@ class UdpAgent(AgentUnderTest):
         self._epoch = 0.0
 
     @classmethod
-    async def start(cls, lab: UdpLab, variant: SettingsVariant, timing: Timing) -> "UdpAgent":
+    async def start(cls, lab: UdpLab, variant: SettingsVariant, timing: UdpTiming) -> "UdpAgent":
         """Start an agent and its mission, and return it. Raises NoAgentError, UnsupportedError, AgentEndedError."""
         port = lab.take_port()
         try:
@@ -156,7 +156,7 @@ class UdpAgent(AgentUnderTest):
         deadline = self.model.agent.next_timer()
         return deadline is not None and self._wall_s(deadline) - time.time() < self._timing.margin_s
 
-    async def _step(self, given: Input) -> Observation | None:
+    async def _step(self, given: AgentInput) -> Observation | None:
         model = self.model
         before, deadline, expired = state_of(model), model.agent.next_timer(), next_timer_name(model)
         action = given.make(model)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.conformance._agent_under_test import AgentUnderTest, Start
-from harness.conformance._alphabet import Input
+from harness.conformance._alphabet import AgentInput
 from harness.conformance._observation import KnownNames, Observation, RecordedDatagram, compare, datagram_text
 from harness.conformance._reference_model import ExpectedRun, ReferenceModel, TimerExpiry
 from harness.conformance._state_space import STEP_S, SettingsVariant, next_timer_name, state_of
@@ -200,7 +200,7 @@ class VirtualTimeAgent(AgentUnderTest):
         else:
             self._idle.append(self._program)
 
-    async def _step(self, given: Input) -> Observation | None:
+    async def _step(self, given: AgentInput) -> Observation | None:
         model = self.model
         before, deadline = state_of(model), model.agent.next_timer()
         action = given.make(model)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.conformance._agent_under_test import mission
-from harness.conformance._alphabet import INPUTS, TIMER, Input
+from harness.conformance._alphabet import INPUTS, TIMER, AgentInput
 from harness.conformance._observation import KnownNames, datagram_text, message_text
 from harness.conformance._reference_model import (
     EVENT_ID,
@@ -66,7 +66,7 @@ class LineWriter:
             else:
                 yield self.line(given)
 
-    def line(self, given: Input) -> VirtualLine:
+    def line(self, given: AgentInput) -> VirtualLine:
         action = given.make(self.model)
         if action is None:
             raise NotPlayableError(given.name)

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from harness.conformance.results import AlgorithmCounts, CaseResult, Results
 from harness.errors import CANNOT_HERE
-from harness.present.junit import Case as JunitCase
+from harness.present.junit import JunitCase as JunitCase
 from harness.present.junit import to_xml
 
 EXCHANGES_SHOWN = 14

@@ -15,7 +15,7 @@ NEXT_RUN = math.inf
 """Length of a step that ends with the next handler run of any agent."""
 
 
-class Pace:
+class VirtualTimePace:
     """The speed of virtual time in one run. Only the event loop of the run may use this object.
 
     Before virtual time advances, the simulation calls `allowed_until` for the time that it may reach.

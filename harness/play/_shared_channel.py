@@ -11,7 +11,7 @@ from heapq import heappop, heappush
 from random import Random
 from typing import Any, Generic, Protocol, TypeVar
 
-from netem.channel import Channel, Fate, Radio, Transmission, numbers
+from netem.channel import Channel, FrameFate, Radio, Transmission, numbers
 from netem.radio import Place
 
 Journal = Callable[[dict[str, Any]], None]
@@ -68,7 +68,7 @@ class ChannelTraffic(Generic[Message]):
         while processed and processed[0][0] <= now:
             at, _, sender, data_bytes, message = heappop(processed)
             number = self._channel.send(sender, at, data_bytes)
-            if isinstance(number, Fate):
+            if isinstance(number, FrameFate):
                 self.totals.dropped(sender, number)
                 if self._journal is not None:
                     self._journal({**self._line(at, sender, message, data_bytes), "dropped": number.value})
@@ -111,8 +111,8 @@ class ChannelTotals:
         self.airtime_s = 0.0
         self._roster = roster
         self._all = (1 << len(roster)) - 1
-        self._receivers: dict[Fate, BitCounter] = {}
-        self._drops: dict[Fate, Counter[int]] = {}
+        self._receivers: dict[FrameFate, BitCounter] = {}
+        self._drops: dict[FrameFate, Counter[int]] = {}
         self._load: list[float] = []
         self._busy_until = 0.0
 
@@ -130,7 +130,7 @@ class ChannelTotals:
             self._busy_until = ended_at
             self._occupy(began_at, ended_at)
 
-    def dropped(self, sender: int, fate: Fate) -> None:
+    def dropped(self, sender: int, fate: FrameFate) -> None:
         self._drops.setdefault(fate, Counter())[sender] += 1
 
     def _occupy(self, began_at: float, ended_at: float) -> None:

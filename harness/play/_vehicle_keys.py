@@ -17,7 +17,7 @@ from harness.scenario import Scenario
 from ucp.sealed import seal_to
 
 if TYPE_CHECKING:
-    from harness.play.keyring.key_directory import Authority
+    from harness.play.keyring.key_directory import RevocationAuthority
     from ucp.secure.bundle import Bundle, PublicKeys
 
 FRESH = "fresh"
@@ -29,7 +29,7 @@ class MissionKeys:
     """The keys of a secured mission: the secret keys of each vehicle, and the authority that can exclude vehicles."""
 
     bundles: Mapping[int, "Bundle"]
-    authority: "Authority"
+    authority: "RevocationAuthority"
     seals: bool
 
     @property
@@ -58,13 +58,13 @@ def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
         return None
     security = scenario.security
     require_key_packages(scenario)
-    from harness.play.keyring.key_directory import Authority
+    from harness.play.keyring.key_directory import RevocationAuthority
     from ucp.secure.bundle import KeySet
 
     if security.keys == FRESH:
         fresh = KeySet.derived(secret, scenario.roster, seals=security.seal)
         bundles = {agent_id: fresh.bundle(agent_id) for agent_id in scenario.roster}
-        return MissionKeys(bundles, Authority.of(fresh), security.seal)
+        return MissionKeys(bundles, RevocationAuthority.of(fresh), security.seal)
     directory = Path(security.keys)
     bundles = _bundles_in(directory, scenario.roster)
     if security.seal and any(bundle.public.depot is None for bundle in bundles.values()):
@@ -92,13 +92,13 @@ def refuse_revocations(scenario: Scenario) -> None:
 
 def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
     """Return the secret keys of the vehicles from a directory. Raises ScenarioError if files are missing or invalid."""
-    from harness.play.keyring.key_directory import VEHICLES_NAME, Home, KeysError
+    from harness.play.keyring.key_directory import VEHICLES_NAME, KeyDirectory, KeysError
     from ucp.secure.bundle import bundle_name, load_bundle
     from ucp.secure.keyfile import KeyFileError
 
     try:
         if (directory / VEHICLES_NAME).exists():
-            return Home(directory).bundles(roster, also_revoked=True)
+            return KeyDirectory(directory).bundles(roster, also_revoked=True)
         bundles = {agent_id: load_bundle(directory / bundle_name(agent_id)) for agent_id in roster}
     except (KeyFileError, KeysError) as error:
         raise ScenarioError(f"`security.keys`: {error}; make keys with `ucp-harness keys new`") from None
@@ -116,15 +116,15 @@ def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
     return bundles
 
 
-def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Scenario) -> "Authority":
+def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Scenario) -> "RevocationAuthority":
     """Return the authority whose key signs the exclusion of vehicles. Raises ScenarioError if the directory lacks
     it.
     """
-    from harness.play.keyring.key_directory import REVOCATION_NAME, Authority, Home, KeysError, listed
+    from harness.play.keyring.key_directory import REVOCATION_NAME, KeyDirectory, KeysError, RevocationAuthority, listed
 
     revoking = [fault.agents for fault in scenario.faults_in_order() if fault.needs_keys]
     try:
-        authority = Authority.in_directory(Home(directory), next(iter(bundles.values())).public)
+        authority = RevocationAuthority.in_directory(KeyDirectory(directory), next(iter(bundles.values())).public)
         authority.refuse((agent_id for agents in revoking for agent_id in agents), directory)
     except KeysError as error:
         raise ScenarioError(f"`security.keys`: {error}") from None

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
-from harness.play._pace import Pace
+from harness.play._pace import VirtualTimePace
 from harness.play.mission import Swarm
 from harness.play.progress import Progress
 from harness.scenario import Scenario
@@ -49,7 +49,7 @@ class Backend(ABC):
         *,
         interactive: bool = False,
         delivers_all: bool = False,
-        pace: Pace | None = None,
+        pace: VirtualTimePace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
         """Return a context manager that starts the agents of a scenario. They write their files to `rundir`.
 

@@ -29,7 +29,7 @@ from pydantic import ValidationError
 
 from harness.errors import ScenarioError
 from harness.play import mission
-from harness.play._pace import NEXT_RUN, Pace
+from harness.play._pace import NEXT_RUN, VirtualTimePace
 from harness.play._vehicle_keys import refuse_revocations
 from harness.play.mission import Swarm
 from harness.scenario import Scenario
@@ -110,7 +110,7 @@ class Interventions(GrowingTimeline):
         """
         super().__init__(scenario)
         self._initial_scenario = scenario
-        self.pace = Pace(factor, paused=paused) if virtual_time else None
+        self.pace = VirtualTimePace(factor, paused=paused) if virtual_time else None
         """The pace of virtual time, for the backend. None in real time."""
         self.on_entry_added: Callable[[], None] = lambda: None
         """Function to call in the thread of the run whenever an entry was added."""
@@ -206,7 +206,9 @@ class Interventions(GrowingTimeline):
         """
         return self._change_pace(lambda pace, answer: pace.step(NEXT_RUN, answer), answers=False)
 
-    def _change_pace(self, do: Callable[[Pace, Future[float]], None], *, answers: bool = True) -> Future[float]:
+    def _change_pace(
+        self, do: Callable[[VirtualTimePace, Future[float]], None], *, answers: bool = True
+    ) -> Future[float]:
         answer: Future[float] = Future()
         pace = self.pace
         if pace is None:

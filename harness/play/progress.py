@@ -20,7 +20,7 @@ LINE_EVERY_S = 10.0
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class SwarmSnapshot:
     """The state of a swarm at one moment."""
 
     stage: str
@@ -34,17 +34,17 @@ class Snapshot:
 class Progress(Protocol):
     """A display of the progress of a run."""
 
-    def show(self, snapshot: Snapshot) -> None: ...
+    def show(self, snapshot: SwarmSnapshot) -> None: ...
     def show_judging(self, step: str) -> None:
         """Show a step of the judging after the mission, such as "reading trace 3 of 50"."""
 
     def close(self) -> None: ...
 
 
-class Silent:
+class SilentProgress:
     """A display without output, for use by other programs."""
 
-    def show(self, snapshot: Snapshot) -> None:
+    def show(self, snapshot: SwarmSnapshot) -> None:
         pass
 
     def show_judging(self, step: str) -> None:
@@ -63,7 +63,7 @@ class ProgressLines:
         self._last = 0.0
         self._line = ""
 
-    def show(self, snapshot: Snapshot) -> None:
+    def show(self, snapshot: SwarmSnapshot) -> None:
         now = time.monotonic()
         if snapshot.stage == self._stage and now - self._last < LINE_EVERY_S:
             return
@@ -94,7 +94,7 @@ class ProgressTable:
         self._live = Live(console=console, transient=True, auto_refresh=False)
         self._live.start()
 
-    def show(self, snapshot: Snapshot) -> None:
+    def show(self, snapshot: SwarmSnapshot) -> None:
         self._live.update(_render(snapshot), refresh=True)
 
     def show_judging(self, step: str) -> None:
@@ -108,7 +108,7 @@ def for_console(console: Console) -> Progress:
     return ProgressTable(console) if console.is_terminal else ProgressLines(console)
 
 
-def _render(snapshot: Snapshot) -> RenderableType:
+def _render(snapshot: SwarmSnapshot) -> RenderableType:
     table = Table.grid(padding=(0, 2))
     for _ in range(6):
         table.add_column(justify="right")

@@ -24,7 +24,7 @@ Rgb = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Ink:
+class AgentColours:
     """The colours for an agent's blocks, in the form `#rrggbb`."""
 
     fill: str
@@ -33,15 +33,15 @@ class Ink:
     dashed: bool = False
 
 
-def inks(agent_ids: Iterable[int]) -> dict[int, Ink]:
+def inks(agent_ids: Iterable[int]) -> dict[int, AgentColours]:
     """Return the colours of each agent. The same set of agents always gets the same colours."""
     return {agent_id: _ink(position) for position, agent_id in enumerate(sorted(set(agent_ids)))}
 
 
-def ramp(first: Rgb, last: Rgb, steps: int) -> list[Ink]:
+def ramp(first: Rgb, last: Rgb, steps: int) -> list[AgentColours]:
     """Return a row of colours from `first` to `last` for growing values. Both should differ in lightness."""
     fills = [_mixed(first, last, step / (steps - 1)) for step in range(steps)]
-    return [Ink(fill, fill, _text_on(fill)) for fill in fills]
+    return [AgentColours(fill, fill, _text_on(fill)) for fill in fills]
 
 
 def contrast(first: str, second: str) -> float:
@@ -50,7 +50,7 @@ def contrast(first: str, second: str) -> float:
     return (light + 0.05) / (dark + 0.05)
 
 
-def _ink(position: int) -> Ink:
+def _ink(position: int) -> AgentColours:
     hue = _OKABE_ITO[position % len(_OKABE_ITO)]
     variant = position // len(_OKABE_ITO) % 4
     if variant == 2:
@@ -59,7 +59,7 @@ def _ink(position: int) -> Ink:
         fill, stroke = _hex(hue), _mixed(hue, _BLACK, 0.35)
     else:
         fill, stroke = _mixed(hue, _WHITE, 0.72), _mixed(hue, _BLACK, 0.35)
-    return Ink(fill, stroke, _text_on(fill), dashed=variant == 3)
+    return AgentColours(fill, stroke, _text_on(fill), dashed=variant == 3)
 
 
 def _text_on(fill: str) -> str:

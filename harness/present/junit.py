@@ -12,7 +12,7 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class JunitCase:
     """A test case. It passed if `skipped` is None and `wrong` is empty.
 
     The first line of `wrong` is a complete message. `skipped` is a reason. `note` is the output of a passed case.
@@ -24,7 +24,7 @@ class Case:
     note: str = ""
 
 
-def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, cases: Iterable[Case]) -> str:
+def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, cases: Iterable[JunitCase]) -> str:
     """Return a JUnit XML file with one suite. Characters that XML does not allow become question marks."""
     all_cases = list(cases)
     failures, skipped = sum(bool(case.wrong) for case in all_cases), sum(case.skipped is not None for case in all_cases)

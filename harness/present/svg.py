@@ -43,7 +43,7 @@ class Axis:
 
 
 @dataclass(frozen=True, slots=True)
-class Area:
+class ChartArea:
     """The rectangle of a chart in a picture."""
 
     x: float
@@ -62,10 +62,12 @@ class Area:
         return self.y + self.height - _BOTTOM, self.y + _TOP
 
 
-def grid(count: int, columns: int, top: float, height: float) -> list[Area]:
+def grid(count: int, columns: int, top: float, height: float) -> list[ChartArea]:
     """Return the rectangles for `count` charts below `top`, row by row."""
     width = (WIDTH - 2 * MARGIN) / columns
-    return [Area(MARGIN + at % columns * width, top + at // columns * height, width, height) for at in range(count)]
+    return [
+        ChartArea(MARGIN + at % columns * width, top + at // columns * height, width, height) for at in range(count)
+    ]
 
 
 def linear_axis(first: float, last: float, place: tuple[float, float]) -> Axis:

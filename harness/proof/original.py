@@ -23,7 +23,7 @@ from harness.play.core_version import CORE, edited_files
 from harness.proof._proof import Limits, Proof, prove
 from harness.proof._proof_text import in_words
 from harness.proof.bounds import Bounds
-from harness.run.code_state import ROOT, History, run_python
+from harness.run.code_state import ROOT, GitBisection, run_python
 
 MODULE = "harness.proof.original"
 INSTALLED = "installed"
@@ -114,7 +114,7 @@ def code_of(original: str) -> Iterator[Path]:
     if not (ROOT / ".git").exists():
         raise OriginalError(f"--against {original}: no such directory, and the harness does not run from a git clone")
     with TemporaryDirectory(prefix="ucp-original-") as name:
-        history = History.clone(ROOT, Path(name) / "code")
+        history = GitBisection.clone(ROOT, Path(name) / "code")
         history.check_out(history.resolve(original))
         yield history.tree
 

@@ -8,7 +8,7 @@ import pytest
 
 from harness.backend_names import BACKEND_NAMES, BackendName
 from harness.errors import ScenarioError
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.pytest_plugin._judged_run import Trial, discard, new_directory, one_sentence
 from harness.pytest_plugin._options import Options
 from harness.pytest_plugin._stash import TRIAL
@@ -60,7 +60,7 @@ def scenario_for(node: pytest.Item) -> Iterator[Findings]:
 
 def play(scenario: Scenario, seed: int, backend: BackendName, directory: Path, *, delivers_all: bool = False) -> Run:
     """Play and judge a scenario. Raises HarnessError, and KeyboardInterrupt if the run was interrupted."""
-    finished = run(scenario, seed, directory, Silent(), backend, delivers_all=delivers_all)
+    finished = run(scenario, seed, directory, SilentProgress(), backend, delivers_all=delivers_all)
     if finished.played.outcome == "interrupted":
         raise KeyboardInterrupt(f"{finished.played.outcome_detail}; report: {finished.report}")
     return finished

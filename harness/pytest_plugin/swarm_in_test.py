@@ -19,7 +19,7 @@ from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS
 from harness.play.mission import RunOutcome, SoughtRun
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.pytest_plugin._live_timeline import Action, LiveTimeline
 from harness.pytest_plugin.findings import Findings, JudgementInTest
 from harness.run.run import Run, RunRecording
@@ -84,7 +84,7 @@ class Swarm:
         scenario, directory = self._timeline.scenario, self._recording.directory
         with self._runner:
             try:
-                opening = backend.open(scenario, seed, directory, Silent(), self._interrupted, interactive=True)
+                opening = backend.open(scenario, seed, directory, SilentProgress(), self._interrupted, interactive=True)
                 return self._runner.run(mission.play_on(opening, scenario, self._timeline.play))
             except HarnessError as error:
                 self._recording.fail(error)

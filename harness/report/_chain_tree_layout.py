@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from harness.report.chain_tree import Mark
+from harness.report.chain_tree import ChainTreeMark
 
 FONT_SIZE = 13
 CHARACTER_WIDTH = 0.66 * FONT_SIZE
@@ -31,7 +31,7 @@ MARGIN = 8
 class PlacedMark:
     """A mark of the picture with its position: centre `x` and top `y` in CSS pixels. y grows downwards."""
 
-    mark: Mark
+    mark: ChainTreeMark
     width: float
     height: float
     row: int
@@ -95,7 +95,7 @@ class _Outline:
         return large
 
 
-def lay_out(root: Mark) -> Layout:
+def lay_out(root: ChainTreeMark) -> Layout:
     placed = _sized(root)
     placed_marks = list(placed.walk())
     offsets = _offsets(placed_marks)
@@ -113,7 +113,7 @@ def lay_out(root: Mark) -> Layout:
     return Layout(placed, right - left, floor + MARGIN)
 
 
-def _sized(root: Mark) -> PlacedMark:
+def _sized(root: ChainTreeMark) -> PlacedMark:
     """Return all marks with their sizes and rows, but without positions.
 
     All boxes are as wide as the longest label, except the inception block's.
@@ -126,7 +126,7 @@ def _sized(root: Mark) -> PlacedMark:
         to_measure.extend(mark.children)
     box_width = _width(max(names))
 
-    def sized(mark: Mark, row: int) -> PlacedMark:
+    def sized(mark: ChainTreeMark, row: int) -> PlacedMark:
         if mark.kind == "ellipsis":
             longest = max(len(line) for line in mark.lines)
             return PlacedMark(mark, longest * CHARACTER_WIDTH * SMALL_FONT_SIZE / FONT_SIZE, BOX_HEIGHT, row)

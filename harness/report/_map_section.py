@@ -8,14 +8,14 @@ from markupsafe import Markup
 from harness.archive.connectivity import Connectivity, quality
 from harness.archive.tracks import Tracks
 from harness.present import text
-from harness.present.colours import Ink
+from harness.present.colours import AgentColours
 from harness.report import map_svg
 from harness.report.facts import link_qualities
 from harness.report.map_parts import (
     MAX_SEGMENTS,
-    Division,
     Extent,
     Flight,
+    NetworkDivision,
     divisions,
     extent,
     flights,
@@ -31,7 +31,7 @@ MOMENTS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class MapMoment:
     """A small map of the swarm at one moment.
 
     `at` is the time, `what` the event at this time or "", and `network` the network's state.
@@ -50,12 +50,12 @@ class MapSection:
     tracks: Markup | None
     legend: list[tuple[Markup, str]]
     """Pairs of a sample and its meaning."""
-    moments: list[Moment]
+    moments: list[MapMoment]
     notes: list[str]
 
 
 def section(
-    tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink], types: Mapping[int, VehicleType]
+    tracks: Tracks, network: Connectivity, ink: Mapping[int, AgentColours], types: Mapping[int, VehicleType]
 ) -> MapSection | None:
     """Return the map section, or None if no vehicle moved and no file is damaged. `types` contains the known vehicle
     types.
@@ -74,7 +74,7 @@ def _moved(tracks: Tracks, vehicle: int) -> bool:
 
 
 def _drawn(
-    tracks: Tracks, network: Connectivity, ink: Mapping[int, Ink], types: Mapping[int, VehicleType]
+    tracks: Tracks, network: Connectivity, ink: Mapping[int, AgentColours], types: Mapping[int, VehicleType]
 ) -> MapSection:
     end_s = max(fixes[-1].at_s for fixes in tracks.by_vehicle.values())
     known = [division for division in divisions(network.states) if division.at_s <= end_s]
@@ -100,8 +100,8 @@ def _drawn(
 
 
 def _notable_moments(
-    known: Sequence[Division], network: Connectivity, tracks: Tracks, end_s: float
-) -> list[tuple[float, Division | None]]:
+    known: Sequence[NetworkDivision], network: Connectivity, tracks: Tracks, end_s: float
+) -> list[tuple[float, NetworkDivision | None]]:
     """Return up to `MOMENTS` + 1 moments to show, each with the partition of the network at that moment.
 
     The moments are the start, the end, the most important network changes and the time of the worst losses. The
@@ -122,14 +122,14 @@ def _notable_moments(
 
 def _moment(
     at_s: float,
-    division: Division | None,
+    division: NetworkDivision | None,
     tracks: Tracks,
     network: Connectivity,
     flown: Sequence[Flight],
     area_extent: Extent,
-    ink: Mapping[int, Ink],
+    ink: Mapping[int, AgentColours],
     types: Mapping[int, VehicleType],
-) -> Moment:
+) -> MapMoment:
     living = set(ink) if division is None else division.living
     seen = {vehicle: tracks.at(vehicle, at_s) for vehicle in sorted(living) if vehicle in tracks.by_vehicle}
     links = network.links(at_s) if division else []
@@ -150,7 +150,7 @@ def _moment(
         types,
         f"The swarm at {at}: {state}",
     )
-    return Moment(at, what, state, picture)
+    return MapMoment(at, what, state, picture)
 
 
 def _legend(flown: Sequence[Flight], *, rebooted: bool) -> list[tuple[Markup, str]]:
@@ -187,7 +187,7 @@ def _in_words(losses: Collection[float]) -> str:
     return f"links lose {high}" if low == high else f"links lose {low} to {high}"
 
 
-def _legend_of_moments(moments: Sequence[Moment], types: set[VehicleType]) -> list[tuple[Markup, str]]:
+def _legend_of_moments(moments: Sequence[MapMoment], types: set[VehicleType]) -> list[tuple[Markup, str]]:
     """Return legend entries for links with losses, and for vehicle types if there are several."""
     drawn = "".join(moment.picture for moment in moments)
     entries = [
@@ -199,7 +199,7 @@ def _legend_of_moments(moments: Sequence[Moment], types: set[VehicleType]) -> li
     return entries + [(map_svg.sample(vehicle_type), vehicle_type) for vehicle_type in shapes]
 
 
-def _description(tracks: Tracks, area_extent: Extent, moments: Sequence[Moment]) -> str:
+def _description(tracks: Tracks, area_extent: Extent, moments: Sequence[MapMoment]) -> str:
     """Return a text that describes the map for readers who cannot see it."""
     count = len(tracks.by_vehicle)
     states = "; ".join(

@@ -57,7 +57,7 @@ def strip(
     return NetworkStrip([name for name, _ in lanes], _network_strip.draw(lanes, ticks, end_s))
 
 
-def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.Span]:
+def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.ConditionSpan]:
     """Return the load of the shared channel over time. Neighbouring intervals with the same load in percent are
     joined.
     """
@@ -95,7 +95,7 @@ def _played_by(channel: ChannelRecord) -> str:
     return "computed in virtual time" if channel.lateness is None else "played in real time between the vehicles"
 
 
-def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[_network_strip.Span]]]:
+def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[_network_strip.ConditionSpan]]]:
     """Return a row for each group of vehicle pairs with equal losses over time. The largest losses come first.
 
     Return no lanes if all pairs have equal losses.

@@ -16,7 +16,7 @@ _LANE = 24
 
 
 @dataclass(frozen=True, slots=True)
-class Span:
+class ConditionSpan:
     """An interval of mission seconds in which the network condition was the same."""
 
     from_s: float
@@ -26,18 +26,18 @@ class Span:
     """The filled share of the lane's height, 0 to 1."""
 
 
-def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[Span]:
+def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[ConditionSpan]:
     """Convert changes (at_s, text, level) to intervals. Each lasts until the next change. Level 0 gives no interval."""
-    spans: list[Span] = []
+    spans: list[ConditionSpan] = []
     in_time = sorted(changes, key=lambda change: change[0])
     for number, (at_s, text, level) in enumerate(in_time):
         until = in_time[number + 1][0] if number + 1 < len(in_time) else end_s
         if level > 0 and 0 <= at_s < min(until, end_s):
-            spans.append(Span(at_s, min(until, end_s), text, min(level, 1.0)))
+            spans.append(ConditionSpan(at_s, min(until, end_s), text, min(level, 1.0)))
     return spans
 
 
-def draw(lanes: Sequence[tuple[str, list[Span]]], ticks: Sequence[tuple[float, str]], end_s: float) -> Markup:
+def draw(lanes: Sequence[tuple[str, list[ConditionSpan]]], ticks: Sequence[tuple[float, str]], end_s: float) -> Markup:
     """Draw the rows from top to bottom. `ticks` are pairs (at_s, text)."""
     parts: list[Markup] = []
     for number, (name, spans) in enumerate(lanes):
@@ -68,7 +68,7 @@ def draw(lanes: Sequence[tuple[str, list[Span]]], ticks: Sequence[tuple[float, s
     ).format(height + 20, Markup("").join(parts))
 
 
-def _span(lane: str, span: Span, y: float, end_s: float) -> Markup:
+def _span(lane: str, span: ConditionSpan, y: float, end_s: float) -> Markup:
     """Draw an interval as a nested <svg>, which cuts off a text that is too long."""
     filled = max(2.0, _LANE * span.level)
     return Markup(

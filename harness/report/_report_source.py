@@ -13,7 +13,7 @@ from harness.archive.record_file import DamagedRecordError
 from harness.archive.run_record import RunRecord
 from harness.archive.traces import Trace
 from harness.errors import RunDirectoryError
-from harness.present.colours import Ink
+from harness.present.colours import AgentColours
 from harness.report import _swarm_section, facts
 
 
@@ -23,7 +23,7 @@ class ReportSource:
 
     archive: RunArchive
     run_dir: Path
-    ink: dict[int, Ink]
+    ink: dict[int, AgentColours]
 
     @property
     def record(self) -> RunRecord:

@@ -12,7 +12,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.exports import Export, name_blocks
 from harness.errors import RunDirectoryError
 from harness.gc_pause import gc_paused
-from harness.present.colours import Ink
+from harness.present.colours import AgentColours
 from harness.report import (
     _map_section,
     _network_section,
@@ -94,7 +94,7 @@ def _again(left: ReportSource, scenario: str) -> str:
 
 
 def _pictures(
-    exports: Mapping[int, Export], before: Mapping[int, Export], ink: Mapping[int, Ink]
+    exports: Mapping[int, Export], before: Mapping[int, Export], ink: Mapping[int, AgentColours]
 ) -> list[dict[str, Any]]:
     """Return a picture of the chains at the end of the mission and one after the final reconcile. If both are equal,
     return one.
@@ -115,7 +115,7 @@ def _pictures(
     ]
 
 
-def _picture(heading: str, exports: Mapping[int, Export], ink: Mapping[int, Ink], key: str) -> dict[str, Any]:
+def _picture(heading: str, exports: Mapping[int, Export], ink: Mapping[int, AgentColours], key: str) -> dict[str, Any]:
     tree = ChainTreePicture(exports, ink, key)
     return {
         "heading": heading,

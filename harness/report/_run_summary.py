@@ -6,7 +6,7 @@ from typing import Any
 from harness.archive.run_record import RunRecord
 from harness.present import text
 from harness.present import text as words
-from harness.present.junit import Case, to_xml
+from harness.present.junit import JunitCase, to_xml
 from harness.present.text import escaped, row
 from harness.report import _network_section, _rogue_section, _survival_section, facts
 from harness.report._report_source import ReportSource
@@ -95,16 +95,16 @@ def to_junit(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> str:
     return to_xml(facts.title(record), "ucp-run", record.started_at or "", record.wall_s, _cases(record, chains))
 
 
-def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[Case]:
+def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[JunitCase]:
     judged, expect = verdicts(record), record.expect
     if record.outcome == "not supported":
-        yield Case("run", skipped=record.outcome_detail or record.outcome)
+        yield JunitCase("run", skipped=record.outcome_detail or record.outcome)
         return
     if wrong := [*_wrong_with_run(record), *([] if judged else ["No verdict."])]:
-        yield Case("run", wrong)
+        yield JunitCase("run", wrong)
     for verdict in judged:
         yield _characteristic(verdict, expect)
-    yield from (Case(name, wrong) for name, wrong in record.unmet_expectations(chains))
+    yield from (JunitCase(name, wrong) for name, wrong in record.unmet_expectations(chains))
 
 
 def _wrong_with_run(record: RunRecord) -> Iterator[str]:
@@ -114,16 +114,16 @@ def _wrong_with_run(record: RunRecord) -> Iterator[str]:
         yield f"{fate}, so this run differs from its script"
 
 
-def _characteristic(verdict: Verdict, expect: Expect) -> Case:
+def _characteristic(verdict: Verdict, expect: Expect) -> JunitCase:
     name, expected = verdict.title, expect.verdict(verdict.key)
     message = f"{verdict.verdict}: {verdict.reason}" if verdict.reason else verdict.verdict
     if verdict.remark == AS_EXPECTED:
-        return Case(name, note=f"{AS_EXPECTED}: {message}")
+        return JunitCase(name, note=f"{AS_EXPECTED}: {message}")
     if verdict.verdict == expected or (expected is None and verdict.kind == "holds"):
-        return Case(name)
+        return JunitCase(name)
     if expected is None and not verdict.is_bad:
-        return Case(name, skipped=message)
-    return Case(
+        return JunitCase(name, skipped=message)
+    return JunitCase(
         name, [message, *map(_run_junit_evidence, verdict.evidence), *([f"expected: {expected}"] if expected else [])]
     )
 

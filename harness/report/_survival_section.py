@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from harness.archive.run_record import Loss, Survival
 from harness.checker.survival import in_words
 from harness.present import text
-from harness.present.colours import Ink
+from harness.present.colours import AgentColours
 from harness.report.chain_tree import ranges
 
 
@@ -15,7 +15,7 @@ class LostBlockRow:
     """A table row about a block that a lost vehicle completed, or that no vehicle holds any more."""
 
     name: str
-    ink: Ink | None
+    ink: AgentColours | None
     holders: str
     holders_at_end: str
 
@@ -36,14 +36,14 @@ class SurvivalSection:
     losses: list[LossRow]
 
 
-def section(survived: Survival | None, ink: Mapping[int, Ink]) -> SurvivalSection | None:
+def section(survived: Survival | None, ink: Mapping[int, AgentColours]) -> SurvivalSection | None:
     """Return the section about lost blocks, or None if the record does not contain it."""
     if survived is None:
         return None
     return SurvivalSection(in_words(survived), [_row(loss, ink) for loss in survived.losses])
 
 
-def _row(loss: Loss, ink: Mapping[int, Ink]) -> LossRow:
+def _row(loss: Loss, ink: Mapping[int, AgentColours]) -> LossRow:
     counts = (loss.completed, loss.survived, loss.gone, loss.gone_at_end)
     blocks = [
         LostBlockRow(block.block, ink.get(block.agent_id), _listed(block.holders), _listed(block.holders_at_end))

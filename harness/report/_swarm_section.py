@@ -9,7 +9,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.exports import Export, name_blocks
 from harness.archive.run_record import AgentRecord, RunRecord
 from harness.present import text
-from harness.present.colours import Ink, inks
+from harness.present.colours import AgentColours, inks
 from harness.report.agent_programs import programs
 from harness.report.chain_tree import holders, ranges
 
@@ -22,13 +22,13 @@ MAX_PARAMETERS = 10
 @dataclass(frozen=True, slots=True)
 class BlockRow:
     name: str
-    ink: Ink
+    ink: AgentColours
     at: str
     block_hash: str
     held_by: str
 
 
-def agent_inks(archive: RunArchive) -> dict[int, Ink]:
+def agent_inks(archive: RunArchive) -> dict[int, AgentColours]:
     exports = archive.exports.by_agent
     makers = {block.agent_id for export in exports.values() for block in export.blocks()}
     return inks({*archive.roster, *exports, *makers, *archive.traces})
@@ -58,7 +58,7 @@ VEHICLE_FAULTS_KEY = "befallen"
 """Key of the list of faults in a vehicle's record."""
 
 
-def agents_table(archive: RunArchive, ink: Mapping[int, Ink]) -> dict[str, Any]:
+def agents_table(archive: RunArchive, ink: Mapping[int, AgentColours]) -> dict[str, Any]:
     """Return the column titles and a row for each agent with its vehicle. A row is (agent ID, colour, cells by
     column).
     """
@@ -145,7 +145,7 @@ def _count_are(count: int) -> str:
     return f"{count} is" if count == 1 else f"{count} are"
 
 
-def block_rows(exports: Mapping[int, Export], ink: Mapping[int, Ink]) -> list[BlockRow]:
+def block_rows(exports: Mapping[int, Export], ink: Mapping[int, AgentColours]) -> list[BlockRow]:
     """Return a row for each block that is in a chain. The oldest is first."""
     names, held_by = name_blocks(exports), holders(exports)
     blocks = {block.block_hash: block for export in exports.values() for block in export.chain}

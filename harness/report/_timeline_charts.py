@@ -11,7 +11,7 @@ from harness.archive.run_record import Cycle, FaultRecord
 from harness.checker.recurring_cycles import findings, in_words
 from harness.present import text
 from harness.present.svg import n
-from harness.report._timeline_plot import Shade, draw_background, format_number, format_seconds, pin, plot
+from harness.report._timeline_plot import PartitionShade, draw_background, format_number, format_seconds, pin, plot
 
 HEIGHT = 72
 MAX_MOMENTS = 600
@@ -43,7 +43,7 @@ _LINE_CLASSES = ("broken", "whole")
 
 
 def draw(
-    spreads: Sequence[Replication], faults: Sequence[FaultRecord], shades: Sequence[Shade], end_s: float
+    spreads: Sequence[Replication], faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], end_s: float
 ) -> list[Chart]:
     """Return a chart for each group of figures. `spreads` contains the numbers of copies over time, with at least one
     entry.

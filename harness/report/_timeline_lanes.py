@@ -17,7 +17,15 @@ from markupsafe import Markup
 from harness.archive.history import CUT_SHORT, Commit, History, Phase, Reconcile, Tie, Vote
 from harness.archive.run_record import FaultRecord
 from harness.present.svg import n
-from harness.report._timeline_plot import Shade, draw_background, fault_text, format_number, format_seconds, pin, plot
+from harness.report._timeline_plot import (
+    PartitionShade,
+    draw_background,
+    fault_text,
+    format_number,
+    format_seconds,
+    pin,
+    plot,
+)
 from harness.scenario.faults import KINDS
 
 OUTCOMES = {
@@ -56,7 +64,7 @@ Span = TypeVar("Span", Vote, Reconcile)
 def draw(
     history: History,
     faults: Sequence[FaultRecord],
-    shades: Sequence[Shade],
+    shades: Sequence[PartitionShade],
     agents: Sequence[int],
     names: Mapping[str, str],
     end_s: float,
@@ -102,7 +110,7 @@ def draw(
 
 
 def _legend(
-    history: History, faults: Sequence[FaultRecord], shades: Sequence[Shade], *, by_phase: bool
+    history: History, faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], *, by_phase: bool
 ) -> list[tuple[Markup, str]]:
     """Return a legend of all marks that the picture contains."""
     outcomes = {vote.outcome for vote in history.votes}

@@ -17,7 +17,7 @@ TICK_HEIGHT = 22
 
 
 @dataclass(frozen=True, slots=True)
-class Shade:
+class PartitionShade:
     """An interval of mission time with a partition, and its description."""
 
     start_s: float
@@ -55,7 +55,7 @@ def pin(at_s: float, end_s: float, y: float, shape: Markup) -> Markup:
     )
 
 
-def draw_background(shades: Sequence[Shade], faults: Sequence[FaultRecord], height: float) -> Markup:
+def draw_background(shades: Sequence[PartitionShade], faults: Sequence[FaultRecord], height: float) -> Markup:
     """Draw the background: shades for partitions, and vertical lines for network changes and faults."""
     parts = [
         Markup('<rect class="shade" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(

@@ -26,11 +26,11 @@ from harness.archive.replication import replication_of
 from harness.archive.run_record import RunRecord
 from harness.archive.vocabulary import first_unknown, unknown_names
 from harness.present import text
-from harness.present.colours import Ink
+from harness.present.colours import AgentColours
 from harness.report import _timeline_charts, _timeline_lanes, facts
 from harness.report._report_source import ReportSource
 from harness.report._timeline_lanes import OUTCOMES
-from harness.report._timeline_plot import Shade, axis, format_seconds
+from harness.report._timeline_plot import PartitionShade, axis, format_seconds
 from harness.report.map_parts import divisions
 
 _HERE = Path(__file__).parent
@@ -58,7 +58,7 @@ class Timeline:
     """
 
     end_s: float
-    agents: list[tuple[int, Ink]]
+    agents: list[tuple[int, AgentColours]]
     lane_height: int
     lanes: Markup
     legend: list[tuple[Markup, str]]
@@ -141,12 +141,12 @@ def _planned_s(record: RunRecord) -> float:
     return record.scenario.duration_s
 
 
-def _shades(network: Connectivity, end_s: float) -> tuple[list[Shade], int]:
+def _shades(network: Connectivity, end_s: float) -> tuple[list[PartitionShade], int]:
     """Return the partitions with their times, and the number of shorter partitions that exceed `MAX_SHADES`."""
     known = divisions(network.states)
     ends = [*(division.at_s for division in known[1:]), end_s]
     shades = [
-        Shade(division.at_s, min(until_s, end_s), division.in_words())
+        PartitionShade(division.at_s, min(until_s, end_s), division.in_words())
         for division, until_s in zip(known, ends, strict=False)
         if not division.together and division.living and division.at_s < min(until_s, end_s)
     ]

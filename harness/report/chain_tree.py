@@ -23,7 +23,7 @@ OVAL_LINE_CHARACTERS = 14
 
 
 @dataclass(slots=True)
-class Node:
+class ChainTreeNode:
     """A block in the tree. In the inception block, `block` is None."""
 
     block: ExportedBlock | None
@@ -31,7 +31,7 @@ class Node:
     """Agents whose chains contain this history up to this block."""
     ends: list[int] = field(default_factory=list)
     """Agents whose chains end at this block."""
-    children: dict[str, "Node"] = field(default_factory=dict)
+    children: dict[str, "ChainTreeNode"] = field(default_factory=dict)
 
     @property
     def is_plain(self) -> bool:
@@ -40,27 +40,27 @@ class Node:
 
 
 @dataclass(slots=True)
-class Mark:
+class ChainTreeMark:
     """A mark of the picture, together with all marks above it."""
 
     kind: Literal["block", "ellipsis", "oval"]
-    nodes: list[Node]
+    nodes: list[ChainTreeNode]
     """The block of a box, the hidden blocks of an ellipsis, or the last block of an oval's agents."""
     lines: list[str]
     holders: list[int]
-    children: list["Mark"] = field(default_factory=list)
-    beside: "Mark | None" = None
+    children: list["ChainTreeMark"] = field(default_factory=list)
+    beside: "ChainTreeMark | None" = None
     """The oval of a block at which some chains end and others continue."""
 
 
-def chain_tree(exports: Mapping[int, Export]) -> Node:
+def chain_tree(exports: Mapping[int, Export]) -> ChainTreeNode:
     """Return the inception block as the root of a tree with the chains of all agents."""
-    inception = Node(None)
+    inception = ChainTreeNode(None)
     for agent_id, export in sorted(exports.items()):
         node = inception
         node.holders.append(agent_id)
         for block in export.chain:
-            node = node.children.setdefault(block.block_hash, Node(block))
+            node = node.children.setdefault(block.block_hash, ChainTreeNode(block))
             node.holders.append(agent_id)
         node.ends.append(agent_id)
     return inception
@@ -75,17 +75,17 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
     return held_by
 
 
-def marks(inception: Node, names: Mapping[str, str], *, abridged: bool) -> Mark:
+def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool) -> ChainTreeMark:
     """Return the mark of the inception block with all marks above it. `names` contains the names of blocks.
 
     The marks above a block are ordered by their lowest agent ID.
     """
-    root = Mark("block", [inception], ["inception block"], inception.holders)
+    root = ChainTreeMark("block", [inception], ["inception block"], inception.holders)
     to_grow = [(root, inception)]
     while to_grow:
         mark, node = to_grow.pop()
         if node.ends:
-            oval = Mark("oval", [node], wrapped(ranges(node.ends)), node.ends)
+            oval = ChainTreeMark("oval", [node], wrapped(ranges(node.ends)), node.ends)
             if node.children:
                 mark.beside = oval
             else:
@@ -97,7 +97,9 @@ def marks(inception: Node, names: Mapping[str, str], *, abridged: bool) -> Mark:
     return root
 
 
-def _stretch(below: Mark, first: Node, names: Mapping[str, str], abridged: bool) -> tuple[Mark, Node]:
+def _stretch(
+    below: ChainTreeMark, first: ChainTreeNode, names: Mapping[str, str], abridged: bool
+) -> tuple[ChainTreeMark, ChainTreeNode]:
     """Add marks above `below`, from the block `first` to the next block where the tree branches or a chain ends.
 
     Return the topmost mark and its node.
@@ -113,15 +115,17 @@ def _stretch(below: Mark, first: Node, names: Mapping[str, str], abridged: bool)
         if height in hidden[1:]:
             continue
         if height in hidden:
-            mark = Mark("ellipsis", stretch[hidden.start : hidden.stop], [str(len(hidden)), "blocks"], node.holders)
+            mark = ChainTreeMark(
+                "ellipsis", stretch[hidden.start : hidden.stop], [str(len(hidden)), "blocks"], node.holders
+            )
         else:
-            mark = Mark("block", [node], [_name(node, names)], node.holders)
+            mark = ChainTreeMark("block", [node], [_name(node, names)], node.holders)
         top.children.append(mark)
         top = mark
     return top, stretch[-1]
 
 
-def _name(node: Node, names: Mapping[str, str]) -> str:
+def _name(node: ChainTreeNode, names: Mapping[str, str]) -> str:
     return names[node.block.block_hash] if node.block else "inception block"
 
 

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from harness.archive.exports import Export, name_blocks
 from harness.present import text as words
-from harness.present.colours import Ink
+from harness.present.colours import AgentColours
 from harness.report._chain_tree_layout import (
     BOX_HEIGHT,
     FONT_SIZE,
@@ -21,12 +21,12 @@ from harness.report._chain_tree_layout import (
     PlacedMark,
     lay_out,
 )
-from harness.report.chain_tree import Node, chain_tree, holders, marks, ranges
+from harness.report.chain_tree import ChainTreeNode, chain_tree, holders, marks, ranges
 
 STYLE = (Path(__file__).parent / "chain_tree.css").read_text(encoding="utf-8")
 
 _FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu Sans', sans-serif"
-_INCEPTION = Ink("#ffffff", "#5c6670", "#1c2126")
+_INCEPTION = AgentColours("#ffffff", "#5c6670", "#1c2126")
 _CORNER = 6
 _TURN = 11  # distance above a block at which links to diverging successors turn
 _FIRST_DOT, _DOT_SPACING = 5, 7
@@ -43,7 +43,7 @@ class ChainTreePicture:
     def __init__(
         self,
         exports: Mapping[int, Export],
-        ink: Mapping[int, Ink],
+        ink: Mapping[int, AgentColours],
         key: str = "chains",
         names: Mapping[str, str] | None = None,
     ) -> None:
@@ -154,7 +154,7 @@ class ChainTreePicture:
             _text(placed, ink.text),
         )
 
-    def _tooltip(self, node: Node) -> str:
+    def _tooltip(self, node: ChainTreeNode) -> str:
         if node.block is None:
             return f"Inception block, of {_agents(node.holders)}" if node.holders else "Inception block"
         held_by = self._held_by[node.block.block_hash]
@@ -168,7 +168,7 @@ class ChainTreePicture:
             lines.append(f"with this history: {_agents(node.holders)}")
         return "\n".join(lines)
 
-    def _name(self, node: Node) -> str:
+    def _name(self, node: ChainTreeNode) -> str:
         return self._names[node.block.block_hash] if node.block else "inception block"
 
 

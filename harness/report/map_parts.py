@@ -13,7 +13,7 @@ from itertools import count
 from operator import attrgetter
 
 from harness.archive.connectivity import Connectivity, Topology
-from harness.archive.tracks import Fix, Tracks, between
+from harness.archive.tracks import PositionFix, Tracks, between
 from harness.present import svg
 from harness.report.chain_tree import ranges
 
@@ -24,7 +24,7 @@ MAX_NAMED = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Division:
+class NetworkDivision:
     """The groups of connected vehicles from `at_s` on, by number from 0. All other living vehicles are alone.
 
     If all vehicles reach each other, all are in `together`, and there are no parts.
@@ -55,7 +55,7 @@ class Division:
             return self.parts[part]
         return self.together if vehicle in self.together else frozenset({vehicle})
 
-    def changed_since(self, before: "Division") -> int:
+    def changed_since(self, before: "NetworkDivision") -> int:
         """Return the number of vehicles that were lost, came back, or reach different vehicles than before.
 
         Vehicles that live in only one of the two states are ignored in the comparison of reached vehicles.
@@ -86,8 +86,8 @@ class TrackSegment:
     """
 
     vehicle: int
-    fixes: list[Fix]
-    division: Division | None
+    fixes: list[PositionFix]
+    division: NetworkDivision | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +99,11 @@ class Flight:
     lost: bool
 
     @property
-    def start(self) -> Fix:
+    def start(self) -> PositionFix:
         return self.segments[0].fixes[0]
 
     @property
-    def end(self) -> Fix:
+    def end(self) -> PositionFix:
         return self.segments[-1].fixes[-1]
 
 
@@ -116,18 +116,18 @@ def listed(vehicles: frozenset[int]) -> str:
     return ", ".join(ranges(sorted(vehicles)))
 
 
-def divisions(states: Sequence[Topology]) -> list[Division]:
-    all_divisions: list[Division] = []
+def divisions(states: Sequence[Topology]) -> list[NetworkDivision]:
+    all_divisions: list[NetworkDivision] = []
     before: dict[int, frozenset[int]] = {}
     for state in states:
         if len(state.components) == 1:
-            all_divisions.append(Division(state.at_s, state.what, {}, frozenset(), state.components[0]))
+            all_divisions.append(NetworkDivision(state.at_s, state.what, {}, frozenset(), state.components[0]))
             continue
         parts = [group for group in state.components if len(group) > 1]
         alone = frozenset().union(*(group for group in state.components if len(group) == 1))
         numbered = _numbered(parts, before)
         before = numbered or before
-        all_divisions.append(Division(state.at_s, state.what, numbered, alone, frozenset()))
+        all_divisions.append(NetworkDivision(state.at_s, state.what, numbered, alone, frozenset()))
     return all_divisions
 
 
@@ -147,7 +147,7 @@ def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]
     return dict(sorted((number if number >= 0 else next(free), part) for number, part in numbers.items()))
 
 
-def longest_divisions(all_divisions: Sequence[Division], end_s: float, most: int) -> list[Division]:
+def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, most: int) -> list[NetworkDivision]:
     """Return the first grouping and the longest others, at most `most` in all. Each lasts until the next returned
     one.
     """
@@ -159,10 +159,10 @@ def longest_divisions(all_divisions: Sequence[Division], end_s: float, most: int
 
 
 def flights(
-    vehicle: int, tracks: Tracks, network: Connectivity, all_divisions: Sequence[Division], end_s: float
+    vehicle: int, tracks: Tracks, network: Connectivity, all_divisions: Sequence[NetworkDivision], end_s: float
 ) -> Iterator[Flight]:
     """Yield the paths of a vehicle, and of the vehicles that replaced it after a loss."""
-    wreck: Fix | None = None
+    wreck: PositionFix | None = None
     for begin_s, until_s, lost in network.airborne_intervals(vehicle, end_s):
         flown = [fix for fix in tracks.by_vehicle[vehicle] if begin_s <= fix.at_s <= until_s]
         while wreck and flown and flown[0][1:] == wreck[1:]:  # the replacement still reports the position of the wreck
@@ -173,7 +173,9 @@ def flights(
             wreck = end
 
 
-def _segments(vehicle: int, path: list[Fix], all_divisions: Sequence[Division]) -> Iterator[TrackSegment]:
+def _segments(
+    vehicle: int, path: list[PositionFix], all_divisions: Sequence[NetworkDivision]
+) -> Iterator[TrackSegment]:
     now = next((division for division in reversed(all_divisions) if division.at_s <= path[0].at_s), None)
     begin = 0
     for division in all_divisions:
@@ -218,7 +220,7 @@ class Extent:
         return self.north_m - self.south_m
 
 
-def extent(fixes: Sequence[Fix]) -> Extent:
+def extent(fixes: Sequence[PositionFix]) -> Extent:
     """Return a rectangle around the positions. There must be at least one position."""
     north, east = [fix.north_m for fix in fixes], [fix.east_m for fix in fixes]
     shortest = max(MIN_SPAN_M, MIN_ASPECT * max(max(north) - min(north), max(east) - min(east)))
@@ -259,7 +261,7 @@ class Projection:
     def y(self, north_m: float) -> float:
         return self.top + (self.land.north_m - north_m) * self.px_per_m
 
-    def __call__(self, fix: Fix) -> Point:
+    def __call__(self, fix: PositionFix) -> Point:
         return self.x(fix.east_m), self.y(fix.north_m)
 
     def ticks_m(self) -> tuple[list[float], list[float]]:

@@ -11,11 +11,21 @@ from pathlib import Path
 from markupsafe import Markup
 
 from harness.archive.connectivity import quality
-from harness.archive.tracks import Fix
+from harness.archive.tracks import PositionFix
 from harness.present import text as words
-from harness.present.colours import Ink
+from harness.present.colours import AgentColours
 from harness.present.svg import FONT, n
-from harness.report.map_parts import Division, Extent, Flight, Point, Projection, TrackSegment, letter, listed, thin
+from harness.report.map_parts import (
+    Extent,
+    Flight,
+    NetworkDivision,
+    Point,
+    Projection,
+    TrackSegment,
+    letter,
+    listed,
+    thin,
+)
 from sitl.vehicle import VehicleType
 
 HEIGHT, DIGIT, PADDING = 16, 7.5, 8
@@ -28,7 +38,7 @@ Box = tuple[float, float, float, float]
 
 
 def tags(
-    tagged: Sequence[tuple[int, Point]], crosses: Sequence[Point], to_px: Projection, ink: Mapping[int, Ink]
+    tagged: Sequence[tuple[int, Point]], crosses: Sequence[Point], to_px: Projection, ink: Mapping[int, AgentColours]
 ) -> Markup:
     """Draw tags with vehicle IDs that overlap neither each other nor the `crosses`.
 
@@ -57,7 +67,7 @@ def _boxes(digits: int, place: Point) -> list[Box]:
     return boxes
 
 
-def _tag(vehicle: int, box: Box, place: Point, ink: Ink) -> Markup:
+def _tag(vehicle: int, box: Box, place: Point, ink: AgentColours) -> Markup:
     left, top, right, bottom = box
     x, y = (left + right) / 2, (top + bottom) / 2
     leader = Markup('<path class="leader" d="M{} {}L{} {}"/>').format(n(place[0]), n(place[1]), n(x), n(y))
@@ -110,7 +120,7 @@ _ROOM_WIDTH, _ROOM_HEIGHT = 900, 600
 _MOMENT_WIDTH, _MOMENT_HEIGHT = 300, 240
 
 
-def css_class(division: Division | None, vehicle: int) -> str:
+def css_class(division: NetworkDivision | None, vehicle: int) -> str:
     """Return the CSS class of a vehicle in this grouping of the network."""
     if division is None:
         return "unknown"
@@ -122,9 +132,9 @@ def css_class(division: Division | None, vehicle: int) -> str:
 
 def draw_tracks(
     flights: Sequence[Flight],
-    reboots: Sequence[tuple[Fix, int]],
+    reboots: Sequence[tuple[PositionFix, int]],
     land: Extent,
-    ink: Mapping[int, Ink],
+    ink: Mapping[int, AgentColours],
     description: str,
 ) -> Markup:
     """Draw the map. `reboots` contains positions and agents of reboots, and `description` describes the picture."""
@@ -146,12 +156,12 @@ def draw_tracks(
 
 
 def draw_moment(
-    swarm: Mapping[int, Fix],
-    lost: Sequence[Fix],
+    swarm: Mapping[int, PositionFix],
+    lost: Sequence[PositionFix],
     links: Mapping[tuple[int, int], float],
-    division: Division | None,
+    division: NetworkDivision | None,
     land: Extent,
-    ink: Mapping[int, Ink],
+    ink: Mapping[int, AgentColours],
     types: Mapping[int, VehicleType],
     description: str,
 ) -> Markup:
@@ -178,7 +188,7 @@ def draw_moment(
     )
 
 
-def _links(at: Mapping[int, Point], links: Mapping[tuple[int, int], float], division: Division | None) -> Markup:
+def _links(at: Mapping[int, Point], links: Mapping[tuple[int, int], float], division: NetworkDivision | None) -> Markup:
     """Draw the links. Those with small loss rates are drawn last, so that they are on top."""
     drawn: dict[tuple[int, str], list[str]] = {}
     shortest = sorted(links, key=lambda pair: math.dist(at[pair[0]], at[pair[1]]))
@@ -192,7 +202,9 @@ def _links(at: Mapping[int, Point], links: Mapping[tuple[int, int], float], divi
     )
 
 
-def _dot(vehicle: int, place: Point, division: Division | None, ink: Ink, vehicle_type: VehicleType) -> Markup:
+def _dot(
+    vehicle: int, place: Point, division: NetworkDivision | None, ink: AgentColours, vehicle_type: VehicleType
+) -> Markup:
     tip = f"vehicle {vehicle}, a {vehicle_type}: {_connection_text(division, vehicle)}"
     return Markup('<path class="dot {}" d="{}" fill="{}"><title>{}</title></path>').format(
         css_class(division, vehicle), _shape(vehicle_type, place), ink.fill, tip
@@ -289,7 +301,7 @@ def _segment_tip(segment: TrackSegment) -> str:
     return f"vehicle {segment.vehicle}, {begin} to {end}: {_connection_text(segment.division, segment.vehicle)}"
 
 
-def _connection_text(division: Division | None, vehicle: int) -> str:
+def _connection_text(division: NetworkDivision | None, vehicle: int) -> str:
     if division is None:
         return "network not recorded"
     part, reachable_from = division.place_of(vehicle)
@@ -300,7 +312,10 @@ def _connection_text(division: Division | None, vehicle: int) -> str:
 
 
 def _marks(
-    flights: Sequence[Flight], reboots: Iterable[tuple[Fix, int]], to_px: Projection, ink: Mapping[int, Ink]
+    flights: Sequence[Flight],
+    reboots: Iterable[tuple[PositionFix, int]],
+    to_px: Projection,
+    ink: Mapping[int, AgentColours],
 ) -> Markup:
     """Draw the starts, reboots and ends of flight paths, with tags at the ends."""
     parts = []

@@ -162,7 +162,7 @@ class SuspectCommits:
     first: tuple[str, ...]
 
 
-class History:
+class GitBisection:
     """A clone of the repository. `tree` is its working directory."""
 
     def __init__(self, repository: Path, tree: Path) -> None:
@@ -170,7 +170,7 @@ class History:
         self.tree = tree
 
     @classmethod
-    def clone(cls, repository: Path, tree: Path) -> "History":
+    def clone(cls, repository: Path, tree: Path) -> "GitBisection":
         """Clone the repository into the directory `tree`. Raises RepositoryError."""
         history = cls(repository, tree)
         top = history._git(repository, "rev-parse", "--git-common-dir").strip()

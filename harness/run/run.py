@@ -28,7 +28,7 @@ from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
-from harness.play.progress import Progress, Silent
+from harness.play.progress import Progress, SilentProgress
 from harness.play.request_socket import serve_requests
 from harness.report import facts
 from harness.run.provenance import versions
@@ -103,7 +103,7 @@ def run(
     Raises HarnessError if the run cannot start: the scenario does not suit the backend, the machine lacks something, or
     `out` is not empty.
     """
-    progress = progress or Silent()
+    progress = progress or SilentProgress()
     out = out or default_path(scenario.name)
     chosen = BACKENDS[backend]
     chosen.refuse(scenario)

@@ -13,7 +13,7 @@ from sitl import parameters, start_places
 from sitl.airframes import NOT_FLOWN, airframe
 from sitl.plan import MAX_LEGS, By, GoTo, Land, Loiter, Plan, TakeOff
 from sitl.plan import Leg as PlannedLeg
-from sitl.setup import Debugger, Setup
+from sitl.setup import Debugger, VehicleSetup
 from sitl.start_places import Offset
 from sitl.vehicle import SPACING_M, Home, VehicleError, VehicleType, home_in_field
 
@@ -178,14 +178,14 @@ class Vehicles(Model):
     def type_of(self, vehicle: int) -> VehicleType:
         return self.types.get(vehicle, self.type)
 
-    def setup_of(self, vehicle: int) -> Setup:
+    def setup_of(self, vehicle: int) -> VehicleSetup:
         """Return the frame, parameters, arguments, debugger and log size of this vehicle."""
         own = self.each.get(vehicle, EachVehicle())
         given: dict[str, float] = {}
         for asked in (self, own):
             given |= asked.wind.parameters() if asked.wind else {}
             given |= asked.parameters
-        return Setup(
+        return VehicleSetup(
             own.frame or self.frame,
             given,
             (*self.arguments, *own.arguments),

@@ -10,13 +10,13 @@ from collections.abc import Collection
 from typing import Protocol
 
 from netem.channel._frame import Frame
-from netem.channel._parameters import Chirps, Turns, nanoseconds
+from netem.channel._parameters import LoraRadio, TimeSlotRadio, nanoseconds
 
 NEVER = 1 << 62
 """A time in nanoseconds that no run reaches."""
 
 
-class Access(Protocol):
+class ChannelAccess(Protocol):
     """A rule for access to the channel. Stations are numbered from 0, and times are nanoseconds."""
 
     next_due: int
@@ -45,7 +45,7 @@ class DutyCycle:
     LoRaWAN devices apply it).
     """
 
-    def __init__(self, count: int, radio: Chirps | Turns) -> None:
+    def __init__(self, count: int, radio: LoraRadio | TimeSlotRadio) -> None:
         self.next_due = NEVER
         self._due: dict[int, int] = {}
         self._duty = radio.duty
@@ -80,7 +80,7 @@ class DutyCycle:
 class TimeSlots(DutyCycle):
     """The rule to send only in the station's own time slot. A frame that no longer fits waits for the next slot."""
 
-    def __init__(self, count: int, radio: Turns) -> None:
+    def __init__(self, count: int, radio: TimeSlotRadio) -> None:
         super().__init__(count, radio)
         self._turn = nanoseconds(radio.turn_s)
         self._usable = self._turn - nanoseconds(radio.guard_s)

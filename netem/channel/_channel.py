@@ -29,11 +29,11 @@ from itertools import count
 from operator import add
 from random import Random
 
-from netem.channel._access import NEVER, Access, DutyCycle, TimeSlots
+from netem.channel._access import NEVER, ChannelAccess, DutyCycle, TimeSlots
 from netem.channel._contention import CarrierSense
-from netem.channel._frame import Fate, Frame, Transmission
+from netem.channel._frame import Frame, FrameFate, Transmission
 from netem.channel._links import Links, linear
-from netem.channel._parameters import NANOSECONDS, Chirps, Contention, Radio, Turns, nanoseconds
+from netem.channel._parameters import NANOSECONDS, LoraRadio, Radio, TimeSlotRadio, WifiRadio, nanoseconds
 from netem.radio import Place
 
 
@@ -46,7 +46,7 @@ class Channel:
     def __init__(self, vehicles: Sequence[int], radio: Radio, seed: int) -> None:
         self._radio = radio
         self._access = _access(radio, vehicles, seed)
-        energy_dbm = radio.energy_dbm if isinstance(radio, Contention) else radio.sensitivity_dbm
+        energy_dbm = radio.energy_dbm if isinstance(radio, WifiRadio) else radio.sensitivity_dbm
         self._links = Links(len(vehicles), radio, energy_dbm, Random(f"{seed}/shadowing"))
         self._queues: list[deque[Frame]] = [deque() for _ in vehicles]
         self._active: list[Frame] = []
@@ -58,12 +58,12 @@ class Channel:
         self._airtimes: dict[int, int | None] = {}
         """Data bytes -> nanoseconds; None if the radio cannot send a message of this length."""
         self._silence = [linear(round(100 * radio.noise_dbm))] * len(vehicles)
-        self._energy = self._silence[0] + linear(round(100 * energy_dbm)) if isinstance(radio, Contention) else math.inf
+        self._energy = self._silence[0] + linear(round(100 * energy_dbm)) if isinstance(radio, WifiRadio) else math.inf
         self._begins = 1 + linear(round(-100 * radio.preamble_db)) / linear(0)
         self._suffices = 1 + linear(round(-100 * radio.sinr_db)) / linear(0)
         self._capture_window = nanoseconds(radio.capture_window_s)
 
-    def send(self, sender: int, now: float, data_bytes: int) -> int | Fate:
+    def send(self, sender: int, now: float, data_bytes: int) -> int | FrameFate:
         """Queue a message of this length. Return the number of its frame, or the reason why it is never sent.
 
         Return Fate.QUEUE or Fate.TOO_LONG if the radio drops the message.
@@ -75,10 +75,10 @@ class Channel:
             self._airtimes[data_bytes] = self._airtime(data_bytes)
         airtime = self._airtimes[data_bytes]
         if airtime is None:
-            return Fate.TOO_LONG
+            return FrameFate.TOO_LONG
         queue = self._queues[sender]
         if len(queue) >= self._radio.queue_frames:
-            return Fate.QUEUE
+            return FrameFate.QUEUE
         frame = Frame(next(self._numbers), sender, data_bytes, now_ns, airtime)
         queue.append(frame)
         if len(queue) == 1 and not self._sending >> sender & 1:
@@ -215,10 +215,10 @@ def _sufficient(frame: Frame, totals: Sequence[float], ratio: float) -> int:
     return receivers
 
 
-def _access(radio: Radio, vehicles: Sequence[int], seed: int) -> Access:
-    if isinstance(radio, Contention):
+def _access(radio: Radio, vehicles: Sequence[int], seed: int) -> ChannelAccess:
+    if isinstance(radio, WifiRadio):
         return CarrierSense(radio, [Random(f"{seed}/backoff/{vehicle}") for vehicle in vehicles])
-    if isinstance(radio, Turns):
+    if isinstance(radio, TimeSlotRadio):
         return TimeSlots(len(vehicles), radio)
-    assert isinstance(radio, Chirps), f"no access rule for {type(radio).__name__}"
+    assert isinstance(radio, LoraRadio), f"no access rule for {type(radio).__name__}"
     return DutyCycle(len(vehicles), radio)

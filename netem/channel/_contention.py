@@ -17,7 +17,7 @@ from random import Random
 
 from netem.channel._access import NEVER
 from netem.channel._frame import Frame
-from netem.channel._parameters import Contention, nanoseconds
+from netem.channel._parameters import WifiRadio, nanoseconds
 
 _WORD_BITS = 32
 
@@ -25,7 +25,7 @@ _WORD_BITS = 32
 class CarrierSense:
     """The waiting times of all stations. `draws` contains a random number stream for each station."""
 
-    def __init__(self, radio: Contention, draws: Sequence[Random]) -> None:
+    def __init__(self, radio: WifiRadio, draws: Sequence[Random]) -> None:
         self.next_due = NEVER
         self._due: dict[int, int] = {}
         """Station with a frame -> when it will send this frame, if nothing changes."""

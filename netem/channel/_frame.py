@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from netem.channel._links import Reach
+from netem.channel._links import FrameReach
 from netem.channel._parameters import NANOSECONDS
 
 
-class Fate(StrEnum):
+class FrameFate(StrEnum):
     """The result of a frame at one receiver. A frame with one of the last two results was never sent."""
 
     RECEIVED = "received"
@@ -32,7 +32,7 @@ class Fate(StrEnum):
 
 @dataclass(slots=True, eq=False)
 class Frame:
-    """A frame. Times are nanoseconds. Sets of receivers are bits, as in `Reach`."""
+    """A frame. Times are nanoseconds. Sets of receivers are bits, as in `FrameReach`."""
 
     number: int
     sender: int
@@ -41,7 +41,7 @@ class Frame:
     airtime_ns: int
     begins_ns: int = 0
     ends_ns: int = 0
-    reach: Reach = field(init=False)
+    reach: FrameReach = field(init=False)
     """Known when the frame begins."""
     receiving: int = 0
     """Receivers that receive this frame and no other."""
@@ -105,22 +105,22 @@ class Transmission:
         """The receivers that received the frame, as bits. Receiver 0 is the lowest bit."""
         return self._frame.received
 
-    def lost(self) -> dict[Fate, int]:
+    def lost(self) -> dict[FrameFate, int]:
         """Return the receivers that lost the frame, as bits, by the reason."""
         frame, reach = self._frame, self._frame.reach
         lost = {
-            Fate.COLLISION: frame.collided,
-            Fate.HALF_DUPLEX: frame.deaf,
-            Fate.FADE: reach.faded,
-            Fate.RANGE: reach.far,
-            Fate.PARTITION: reach.cut,
+            FrameFate.COLLISION: frame.collided,
+            FrameFate.HALF_DUPLEX: frame.deaf,
+            FrameFate.FADE: reach.faded,
+            FrameFate.RANGE: reach.far,
+            FrameFate.PARTITION: reach.cut,
         }
         return {fate: receivers for fate, receivers in lost.items() if receivers}
 
-    def fate(self, receiver: int) -> Fate:
+    def fate(self, receiver: int) -> FrameFate:
         """Return the result of the frame at this receiver, which must not be the sender."""
         bit = 1 << receiver
-        return next((fate for fate, receivers in self.lost().items() if receivers & bit), Fate.RECEIVED)
+        return next((fate for fate, receivers in self.lost().items() if receivers & bit), FrameFate.RECEIVED)
 
 
 def numbers(receivers: int) -> Iterator[int]:

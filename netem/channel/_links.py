@@ -54,7 +54,7 @@ def _deviations(shadowing_db: float) -> list[int]:
 
 
 @dataclass(slots=True)
-class Reach:
+class FrameReach:
     """The reception of one sender's frames at each receiver. Sets of receivers are bits. Receiver 0 is the lowest
     bit.
     """
@@ -118,7 +118,7 @@ class Links:
         self._shadow = [[0] * count for _ in range(count)]
         self._shadowed_at = 0
         self._ages_at = 0
-        self._reaches: list[Reach | None] = [None] * count
+        self._reaches: list[FrameReach | None] = [None] * count
         if self._correlated:
             self._ages_at = nanoseconds(STEP * radio.shadowing_s)
             self._shift(None)
@@ -144,7 +144,7 @@ class Links:
         self._means = [None] * self._count
         self._reaches = [None] * self._count
 
-    def reach(self, sender: int, now_ns: int) -> Reach:
+    def reach(self, sender: int, now_ns: int) -> FrameReach:
         """Return the reception of a frame that `sender` begins to send now."""
         if self._each_frame:
             return self._computed(sender, self._drawn(self._count))
@@ -155,7 +155,7 @@ class Links:
             found = self._reaches[sender] = self._computed(sender, self._shadow[sender])
         return found
 
-    def _computed(self, sender: int, shadow: Sequence[int]) -> Reach:
+    def _computed(self, sender: int, shadow: Sequence[int]) -> FrameReach:
         mean = self._means[sender]
         if mean is None:
             mean = self._means[sender] = self._mean(sender)
@@ -167,7 +167,7 @@ class Links:
                 heard |= bit
             if level >= energy:
                 energetic |= bit
-        return Reach(levels, heard, energetic, mean.near & ~heard, mean.far & ~heard, mean.cut)
+        return FrameReach(levels, heard, energetic, mean.near & ~heard, mean.far & ~heard, mean.cut)
 
     def _mean(self, sender: int) -> _Mean:
         levels = [_SILENT] * self._count

@@ -52,7 +52,7 @@ class Radio:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contention(Radio):
+class WifiRadio(Radio):
     """An IEEE 802.11 radio for broadcasts, with carrier sense and random waiting times, without acknowledgements or
     retries.
     """
@@ -83,7 +83,7 @@ class Contention(Radio):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Turns(Radio):
+class TimeSlotRadio(Radio):
     """A telemetry radio with time slots. The vehicles send one after another, each in its own slot."""
 
     rate_bps: float
@@ -105,7 +105,7 @@ class Turns(Radio):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chirps(Radio):
+class LoraRadio(Radio):
     """A LoRa radio. It sends at once, without carrier sense, as often as its duty cycle allows."""
 
     spreading_factor: int

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from netem.channel._parameters import Chirps, Contention, Radio, Turns
+from netem.channel._parameters import LoraRadio, Radio, TimeSlotRadio, WifiRadio
 
 _UDP_OVER_80211 = 24 + 4 + 8 + 20 + 8
 """Bytes of MAC header, frame check sequence, LLC and SNAP, IPv4, and UDP."""
@@ -16,7 +16,7 @@ def _noise_dbm(bandwidth_hz: float, figure_db: float) -> float:
     return round(_THERMAL_DBM_PER_HZ + 10 * math.log10(bandwidth_hz) + figure_db, 2)
 
 
-def _dsss(rate_bps: float, sinr_db: float) -> Contention:
+def _dsss(rate_bps: float, sinr_db: float) -> WifiRadio:
     """Return an 802.11b radio (IEEE 802.11-2020, clauses 15 and 16).
 
     The long preamble and PLCP header take 192 us at 1 Mbit/s (16.2.2.2). A frame takes whole microseconds (16.2.3.5).
@@ -24,7 +24,7 @@ def _dsss(rate_bps: float, sinr_db: float) -> Contention:
     acknowledgement of 304 us at 1 Mbit/s (10.3.7). Energy detection: -76 dBm for 50 to 100 mW (16.3.8.5). The ratio of
     signal to interference is where half of the frames of 111 bytes arrive in ns-3's DsssErrorRateModel.
     """
-    return Contention(
+    return WifiRadio(
         power_dbm=20.0,
         sensitivity_dbm=-82.0,
         noise_dbm=_noise_dbm(22e6, 7.0),
@@ -47,7 +47,7 @@ def _dsss(rate_bps: float, sinr_db: float) -> Contention:
     )
 
 
-def _ofdm(rate_bps: float, sinr_db: float) -> Contention:
+def _ofdm(rate_bps: float, sinr_db: float) -> WifiRadio:
     """Return an 802.11g radio in an ad hoc network (IEEE 802.11-2020, clauses 17 and 18).
 
     Preamble and SIGNAL field take 20 us, a symbol 4 us, and SERVICE and tail are 22 bits (17.3). At 2.4 GHz there is a
@@ -56,7 +56,7 @@ def _ofdm(rate_bps: float, sinr_db: float) -> Contention:
     detection: -62 dBm (17.3.10.6). The ratio of signal to interference is where half of the frames of 111 bytes arrive
     in ns-3's TableBasedErrorRateModel.
     """
-    return Contention(
+    return WifiRadio(
         power_dbm=20.0,
         sensitivity_dbm=-82.0,
         noise_dbm=_noise_dbm(20e6, 7.0),
@@ -80,7 +80,7 @@ def _ofdm(rate_bps: float, sinr_db: float) -> Contention:
     )
 
 
-def _telemetry() -> Turns:
+def _telemetry() -> TimeSlotRadio:
     """Return a radio of the RFD900 class with the multipoint firmware of SiK.
 
     Air rate 64 kbit/s, 1 W at 915 MHz. As in SiK (Firmware/radio/tdm.c), the latency of a packet is 13 bytes and 13
@@ -88,7 +88,7 @@ def _telemetry() -> Turns:
     sensitivity is computed: a noise bandwidth of 128 kHz, a noise figure of 5 dB, and 11 dB for GFSK.
     """
     noise_dbm = _noise_dbm(128e3, 5.0)
-    return Turns(
+    return TimeSlotRadio(
         power_dbm=30.0,
         sensitivity_dbm=round(noise_dbm + 11.0, 2),
         noise_dbm=noise_dbm,
@@ -106,7 +106,7 @@ def _telemetry() -> Turns:
     )
 
 
-def _lora(factor: int, sensitivity_dbm: float) -> Chirps:
+def _lora(factor: int, sensitivity_dbm: float) -> LoraRadio:
     """Return a LoRa radio at 868 MHz with a bandwidth of 125 kHz and coding rate 4/5.
 
     Sensitivities: SX1276 data sheet, rev. 7, Table 10. Power 14 dBm and a duty cycle of 1 % are the limits of ETSI EN
@@ -116,7 +116,7 @@ def _lora(factor: int, sensitivity_dbm: float) -> Chirps:
     2016). The noise is what remains of it after despreading. A frame has at most 255 bytes.
     """
     bandwidth_hz, preamble_symbols = 125e3, 8
-    return Chirps(
+    return LoraRadio(
         power_dbm=14.0,
         sensitivity_dbm=sensitivity_dbm,
         noise_dbm=round(_noise_dbm(bandwidth_hz, 6.0) - 10 * math.log10(2**factor), 2),

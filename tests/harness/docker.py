@@ -9,21 +9,21 @@ from pathlib import Path
 
 from harness.play.containers import ownership
 from harness.play.containers._images import HOST_IMAGE, from_host, idle_command
-from harness.play.containers.docker_engine import DEFAULT_HOST, Engine
+from harness.play.containers.docker_engine import DEFAULT_HOST, DockerEngine
 
 
 def containers(run: Path) -> list[str]:
     """Return the names of all containers of the run in this directory, including stopped ones."""
-    engine = Engine.connect()
+    engine = DockerEngine.connect()
     found = engine.api.containers(all=True, filters={"label": f"{ownership.RUN}={ownership.run_name(run)}"})
     engine.close()
     return sorted(one["Names"][0].removeprefix("/") for one in found)
 
 
 @contextmanager
-def foreign_container(name: str) -> Iterator[Engine]:
+def foreign_container(name: str) -> Iterator[DockerEngine]:
     """Start a container that does not belong to any run."""
-    engine = Engine.connect()
+    engine = DockerEngine.connect()
     image = from_host(engine)
     settings = engine.api.create_host_config(network_mode="none", binds=[f"{it}:{it}:ro" for it in image.mounted])
     made = engine.api.create_container(HOST_IMAGE, idle_command(), name=name, host_config=settings)

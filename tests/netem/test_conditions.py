@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from netem import addresses
 from netem.conditions import Delay, Distribution, GilbertElliott, LinkConditions, NetworkConditions
-from netem.engine import Applied, Engine, ReceiverFigures
+from netem.engine import AppliedConditions, Engine, ReceiverFigures
 from netem.errors import ConditionsError, EngineError, NetemError
 
 
@@ -169,7 +169,7 @@ class _Untouchable(Engine):
     def change(self, conditions: NetworkConditions) -> None:
         raise AssertionError("changed")
 
-    def read(self) -> Applied:
+    def read(self) -> AppliedConditions:
         raise AssertionError("read")
 
 
@@ -203,9 +203,9 @@ class _Forgetful(Engine):
         if not (self.stuck and hasattr(self, "_held")):
             self._held = conditions
 
-    def read(self) -> Applied:
+    def read(self) -> AppliedConditions:
         held = {sender: self._held.link(sender, 1) for sender in (2, 3)}
-        return Applied(self.name, {1: ReceiverFigures.of(held, (), 0, 0, 0)})
+        return AppliedConditions(self.name, {1: ReceiverFigures.of(held, (), 0, 0, 0)})
 
 
 def test_refused_change_is_undone_and_reported() -> None:

@@ -13,11 +13,11 @@ import pytest
 
 from netem import estimates
 from netem.conditions import NetworkConditions
-from netem.engine import Applied, ReceiverFigures
+from netem.engine import AppliedConditions, ReceiverFigures
 from netem.estimates import Estimate, Lateness, ReceivedStream
 from netem.lab import EngineName, Lab
 from netem.link import Delay, GilbertElliott, LinkConditions
-from netem.measure import EngineMeasurement, Question, Study, measure, studies
+from netem.measure import EngineMeasurement, MeasuredQuantity, NetworkStudy, measure, studies
 from netem.observers import Arrival, DisturbedError, check, in_lab, in_medium
 from tests.machine import require
 from tests.netem.conftest import PORT, Air, play
@@ -131,23 +131,23 @@ def test_limit_is_the_number_waiting_at_a_loss() -> None:
 # Questions and answers
 
 
-def one_question(asked: float) -> Study:
-    question = Question(1, 4, "loss", "lost", asked, estimates.lost)
-    return Study(NetworkConditions(LinkConditions(asked), {3: LinkConditions()}), (question,))
+def one_question(asked: float) -> NetworkStudy:
+    question = MeasuredQuantity(1, 4, "loss", "lost", asked, estimates.lost)
+    return NetworkStudy(NetworkConditions(LinkConditions(asked), {3: LinkConditions()}), (question,))
 
 
-def losing(*shares: float) -> tuple[list[tuple[Study, int]], EngineMeasurement]:
+def losing(*shares: float) -> tuple[list[tuple[NetworkStudy, int]], EngineMeasurement]:
     """Return a measurement whose network loses these shares, and its results."""
-    asked: list[tuple[Study, int]] = []
+    asked: list[tuple[NetworkStudy, int]] = []
     kept = iter(shares)
 
-    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
+    def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         asked.append((study, packets))
         first = round(next(kept) * packets)
         stream = received([(number, 0.0) for number in range(first, packets)], [0.0] * packets)
         return {(1, receiver): stream for receiver in study.receivers}
 
-    other = Question(1, 5, "nothing", "lost", shares[0], estimates.lost)
+    other = MeasuredQuantity(1, 5, "nothing", "lost", shares[0], estimates.lost)
     study = replace(one_question(0.15), questions=(*one_question(0.15).questions, other))
     return asked, measure("test", [study], observe, 1000)
 
@@ -201,7 +201,7 @@ def test_wrong_conditions_are_found(condition: str) -> None:
     everything = [question for study in studies("medium") for question in study.questions]
     questions = tuple(replace(question, receiver=4) for question in everything if question.condition == condition)
     wrong = NetworkConditions(receivers={4: WRONG[condition]})
-    assert not measure("medium", [Study(wrong, questions)], in_medium(seed=6)).ok
+    assert not measure("medium", [NetworkStudy(wrong, questions)], in_medium(seed=6)).ok
 
 
 # Real packets
@@ -228,8 +228,8 @@ def test_network_with_excessive_loss_is_found(engine: EngineName) -> None:
 
 @pytest.mark.lab
 def test_network_with_excessive_delay_is_found(netem: EngineName) -> None:
-    question = Question(1, 4, "delay 100 ms", "mean", 0.1, estimates.delay_mean)
-    study = Study(NetworkConditions(receivers={4: LinkConditions(delay=Delay(0.11))}), (question,))
+    question = MeasuredQuantity(1, 4, "delay 100 ms", "mean", 0.1, estimates.delay_mean)
+    study = NetworkStudy(NetworkConditions(receivers={4: LinkConditions(delay=Delay(0.11))}), (question,))
     (row,) = measure(netem, [study], in_lab(netem), SOME).rows
     assert not row.ok
     assert row.answer.measured == pytest.approx(0.11, abs=0.005)
@@ -256,7 +256,7 @@ def test_receiver_reports_overflows_of_its_buffer(tmp_path: Path) -> None:
 
 def test_loss_by_the_machine_is_an_error_unless_corruption_hides_it() -> None:
     study = one_question(0.15)
-    one, two = (Applied("test", {4: ReceiverFigures.of({}, (), passed, 0, 0)}) for passed in (1, 2))
+    one, two = (AppliedConditions("test", {4: ReceiverFigures.of({}, (), passed, 0, 0)}) for passed in (1, 2))
     received_packets = {(1, 4): [Arrival(0, 0.0, 0.1)]}
     check(study, {4: {"overflow": 0}}, received_packets, one)
     with pytest.raises(DisturbedError, match="itself lost 1 of the packets to vehicle 4"):

@@ -12,7 +12,7 @@ from typing import Any
 
 from netem.conditions import LinkConditions, NetworkConditions
 from netem.lab import Lab
-from netem.relay import Heard
+from netem.relay import ReceivedBroadcast
 from tests.netem.conftest import AIR, DEADLINE_S, PORT, Air
 
 PACKETS = 60
@@ -87,10 +87,10 @@ def test_engine_passes_delivered_frames_over_any_loss_and_cut(engine: str, tmp_p
 
 def frame(
     protocol: int = 17, fragment: int = 0x4000, port: int = PORT, kind: int = 0x800, data: bytes = b"ucp"
-) -> Heard:
+) -> ReceivedBroadcast:
     udp = struct.pack("!HHHH", 1, port, 8 + len(data), 0) + data
     ip = struct.pack("!BBHHHBBHII", 0x45, 0, 20 + len(udp), 0, fragment, 64, protocol, 0, 1, 2)
-    return Heard(1, 0, bytes(10) + b"\xff" * 6 + bytes(6) + struct.pack("!H", kind) + ip + udp + bytes(20))
+    return ReceivedBroadcast(1, 0, bytes(10) + b"\xff" * 6 + bytes(6) + struct.pack("!H", kind) + ip + udp + bytes(20))
 
 
 def test_only_whole_udp_datagrams_to_the_port_have_data() -> None:
@@ -98,5 +98,5 @@ def test_only_whole_udp_datagrams_to_the_port_have_data() -> None:
     assert frame(data=b"").udp_data(PORT) == b""
     others = [frame(protocol=6), frame(fragment=0x2000), frame(fragment=1), frame(port=5), frame(kind=0x806)]
     assert [other.udp_data(PORT) for other in others] == [None] * 5
-    short = Heard(1, 0, frame().frame[:30])
+    short = ReceivedBroadcast(1, 0, frame().frame[:30])
     assert short.udp_data(PORT) is None

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from harness.archive.exports import read_export
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run as play
 from harness.scenario.load import parse
 from tests.pytest_plugin.inner import SCENARIOS, no_internals, report, run, run_directories
@@ -181,7 +181,7 @@ def test_queries_change_nothing_and_the_run_can_be_played_again(pytester: pytest
     looking, not_looking = sorted(run_directories(pytester))
     record = json.loads((looking / "run.json").read_text())
     assert record["scenario"]["duration_s"] == pytest.approx(308.503)
-    play(parse(record["scenario"]), 4, tmp_path / "again", Silent(), "sim")
+    play(parse(record["scenario"]), 4, tmp_path / "again", SilentProgress(), "sim")
     for agent in (1, 2, 3, 5):
         exports = [read_export(path / "agents" / f"{agent}.chain.json") for path in (looking, not_looking)]
         assert exports[0] == exports[1] == read_export(tmp_path / "again" / "agents" / f"{agent}.chain.json")

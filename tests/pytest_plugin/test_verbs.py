@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from harness.archive.exports import read_export
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run as play
 from harness.scenario.load import parse
 from tests.pytest_plugin.inner import no_internals, run, run_directories
@@ -30,7 +30,7 @@ def is_played_again_alike(pytester: pytest.Pytester, directory: Path) -> None:
     """Check that the recorded scenario leads to the same chain when it is played again."""
     (kept,) = run_directories(pytester)
     told = record(pytester)
-    play(parse(told["scenario"]), told["seed"], directory, Silent(), "sim")
+    play(parse(told["scenario"]), told["seed"], directory, SilentProgress(), "sim")
     for agent in told["agents"]:
         first, again = (read_export(path / "agents" / f"{agent}.chain.json") for path in (kept, directory))
         assert first.chain == again.chain

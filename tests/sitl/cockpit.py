@@ -12,7 +12,7 @@ from sitl._mission_upload import Mission
 from sitl._route import route
 from sitl.modes import MODES
 from sitl.plan import Plan
-from sitl.serial_channel import Channel
+from sitl.serial_channel import ClientChannel
 from sitl.vehicle import VehicleType
 from tests.sitl.flying import HOME
 
@@ -28,7 +28,7 @@ class Cockpit:
 
     def __init__(self, vehicle_type: VehicleType = "copter") -> None:
         self.vehicle = Autopilot(3, HOME, 0, vehicle_type)
-        self.channel = Channel(self.vehicle)
+        self.channel = ClientChannel(self.vehicle)
         self._mav = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
         self._parser = mavlink.MAVLink(None)
         self.heard: list[Any] = []

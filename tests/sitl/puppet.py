@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sitl._autopilot import Autopilot
 from sitl.pilot import Pilot
-from sitl.serial_channel import Channel
+from sitl.serial_channel import ClientChannel
 from sitl.vehicle import VehicleType
 from tests.sitl.flying import HOME
 
@@ -24,7 +24,7 @@ class Puppet:
     def __init__(self, vehicle_type: VehicleType, sock: socket.socket) -> None:
         self.vehicle = Autopilot(3, HOME, 0, vehicle_type)
         self.tamper: Callable[[bytes], bytes] = lambda frame: frame
-        self._channel = Channel(self.vehicle)
+        self._channel = ClientChannel(self.vehicle)
         self._sock = sock
         self._sock.setblocking(False)
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import pytest
 
 from sitl.ardupilot import ArduPilot
-from sitl.download import DownloadError, NotThereError, StayEncrypted, UnreachableError, download, fetch_text
-from sitl.firmware import CacheError, Outcome, RequestError, install
-from sitl.installed import Installed, all_installed, cache, current
-from sitl.setup import Setup
+from sitl.download import DownloadError, HttpsRedirectHandler, NotThereError, UnreachableError, download, fetch_text
+from sitl.firmware import CacheError, InstallOutcome, RequestError, install
+from sitl.installed import InstalledVersion, all_installed, cache, current
+from sitl.setup import VehicleSetup
 from sitl.vehicle import NoBinaryError, UnusableBinaryError, VehicleError
 from tests.sitl.firmware_server import (
     BINARY,
@@ -90,7 +90,7 @@ def install_copter(
     version: str = "stable",
     watcher: Onlooker | None = None,
     stall_s: float = 10.0,
-) -> Outcome:
+) -> InstallOutcome:
     return install("copter", version, environ, watcher or Onlooker(), server.url, stall_s=stall_s)
 
 
@@ -316,8 +316,10 @@ def test_redirect_is_followed(server: FirmwareServer, environ: dict[str, str]) -
 def test_redirect_to_an_unencrypted_address_is_refused() -> None:
     request, headers = urllib.request.Request("https://a.example/x"), Message()
     with pytest.raises(DownloadError, match=r"leads to http://b\.example/x, which is not encrypted"):
-        StayEncrypted().redirect_request(request, io.BytesIO(), 302, "Found", headers, "http://b.example/x")
-    followed = StayEncrypted().redirect_request(request, io.BytesIO(), 302, "Found", headers, "https://b.example/x")
+        HttpsRedirectHandler().redirect_request(request, io.BytesIO(), 302, "Found", headers, "http://b.example/x")
+    followed = HttpsRedirectHandler().redirect_request(
+        request, io.BytesIO(), 302, "Found", headers, "https://b.example/x"
+    )
     assert followed is not None
 
 
@@ -466,7 +468,7 @@ def test_changed_file_is_not_used_and_is_replaced(
 @pytest.mark.parametrize("manifest", ["3", "{}", '{"files": []}', '{"files": {"arducopter": 3}}', '{"files": {}}'])
 def test_invalid_manifest_counts_as_damage(manifest: str, tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text(manifest)
-    assert Installed("copter", tmp_path).damage == "manifest.json is missing or cannot be read"
+    assert InstalledVersion("copter", tmp_path).damage == "manifest.json is missing or cannot be read"
 
 
 def test_file_missing_in_the_manifest_counts_as_damage(server: FirmwareServer, environ: dict[str, str]) -> None:
@@ -474,20 +476,20 @@ def test_file_missing_in_the_manifest_counts_as_damage(server: FirmwareServer, e
     manifest = json.loads((directory / "manifest.json").read_text())
     del manifest["files"]["arducopter"]
     (directory / "manifest.json").write_text(json.dumps(manifest))
-    assert Installed("copter", directory).damage == "arducopter is not the file that was fetched (SHA-256)"
+    assert InstalledVersion("copter", directory).damage == "arducopter is not the file that was fetched (SHA-256)"
 
 
 def test_binary_without_execute_permission_counts_as_damage(server: FirmwareServer, environ: dict[str, str]) -> None:
     installed = install_copter(server, environ).installed
     installed.binary.chmod(0o644)
-    assert Installed("copter", installed.directory).damage == "arducopter is not executable"
+    assert InstalledVersion("copter", installed.directory).damage == "arducopter is not executable"
 
 
 def test_install_waits_for_a_concurrent_install(server: FirmwareServer, environ: dict[str, str]) -> None:
     home = cache(environ) / "copter"
     install_copter(server, environ)
     server.asked.clear()
-    watcher, outcomes = Onlooker(), list[Outcome]()
+    watcher, outcomes = Onlooker(), list[InstallOutcome]()
     waiting = threading.Thread(
         target=lambda: outcomes.append(install_copter(server, environ, watcher=watcher)), daemon=True
     )
@@ -501,7 +503,7 @@ def test_install_waits_for_a_concurrent_install(server: FirmwareServer, environ:
 
 
 def test_concurrent_installs_download_the_binary_once(server: FirmwareServer, environ: dict[str, str]) -> None:
-    outcomes: list[Outcome] = []
+    outcomes: list[InstallOutcome] = []
     threads = [
         threading.Thread(target=lambda: outcomes.append(install_copter(server, environ)), daemon=True) for _ in range(5)
     ]
@@ -599,9 +601,11 @@ def test_parameters_of_frames_are_downloaded_if_they_exist(server: FirmwareServe
     for name in ("default_params/copter-hexa.parm", "models/copter-single.parm"):
         server.files[f"{tree}{name}"] = Resource(b"FRAME_CLASS 2\n")
     directory = install("copter", "stable", environ, Onlooker(), server.url).installed.directory
-    hexa = ArduPilot.find(directory / "arducopter", {}, "copter", Setup(frame="hexa"))
+    hexa = ArduPilot.find(directory / "arducopter", {}, "copter", VehicleSetup(frame="hexa"))
     assert [path.name for path in hexa.defaults] == ["copter.parm", "copter-hexa.parm"]
-    assert ArduPilot.find(directory / "arducopter", {}, "copter", Setup(frame="octa")).missing == ("copter-octa.parm",)
+    assert ArduPilot.find(directory / "arducopter", {}, "copter", VehicleSetup(frame="octa")).missing == (
+        "copter-octa.parm",
+    )
     assert (directory / "copter-single.parm").exists()
     (directory / "copter-hexa.parm").write_text("FRAME_CLASS 3\n")
-    assert Installed("copter", directory).damage == "copter-hexa.parm is not the file that was fetched (SHA-256)"
+    assert InstalledVersion("copter", directory).damage == "copter-hexa.parm is not the file that was fetched (SHA-256)"

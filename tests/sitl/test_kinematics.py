@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl._kinematics import Arc, Climbing, Course, Fall, Line, Motion, Point, Rest, Segment, end_of
+from sitl._kinematics import Arc, Climbing, Course, Fall, Line, Motion, Point, RestSegment, Segment, end_of
 from sitl._models import MODELS
 from sitl._plane import LOITER_RADIUS_M
 from sitl.vehicle import VehicleType
@@ -72,7 +72,7 @@ def test_fall_ends_at_the_speed_of_free_fall() -> None:
 
 def test_course_joins_its_segments() -> None:
     line = Line(Motion(), Point(10, 0, 0), 10, 10)
-    course = Course(100, [Rest(Motion(), 5), line, Rest(end_of([line]))])
+    course = Course(100, [RestSegment(Motion(), 5), line, RestSegment(end_of([line]))])
     assert course.at(0) == course.at(104.9) == Motion()
     assert course.at(105 + line.duration_s / 2).north_m == pytest.approx(5)
     assert course.at(1e6).north_m == 10

@@ -17,7 +17,7 @@ import sitl.pilot
 from sitl._autopilot import Autopilot
 from sitl._vehicle_state import Battery, Position
 from sitl.pilot import Pilot
-from sitl.serial_channel import Channel
+from sitl.serial_channel import ClientChannel
 from sitl.streams import heartbeat
 from sitl.vehicle import FlightError, VehicleType
 from tests.sitl.flying import DEADLINE_S, HOME, connect, embedded
@@ -124,11 +124,11 @@ def test_vehicle_that_ends_during_take_off_is_given_up_at_once(tmp_path: Path) -
 
 
 @contextmanager
-def connected_pilot(tmp_path: Path) -> Iterator[tuple[Pilot, Channel]]:
+def connected_pilot(tmp_path: Path) -> Iterator[tuple[Pilot, ClientChannel]]:
     """Provide a pilot, and an autopilot's connection with which the test creates its messages."""
     ours, theirs = socket.socketpair()
     pilot = Pilot(3, ours, tmp_path / "3.tlog", 1.0, HOME)
-    channel = Channel(Autopilot(3, HOME, 0))
+    channel = ClientChannel(Autopilot(3, HOME, 0))
     with theirs:
         yield pilot, channel
         asyncio.run(pilot.close())

@@ -12,7 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl._autopilot import Autopilot
-from sitl._port import MAX_UNSENT_BYTES, Port
+from sitl._port import MAX_UNSENT_BYTES, VehiclePort
 from sitl.streams import heartbeat
 from tests.sitl.flying import DEADLINE_S, HOME, free_ports
 
@@ -23,10 +23,10 @@ def turn(selector: selectors.BaseSelector, timeout_s: float = 0.0) -> None:
 
 
 @pytest.fixture
-def connected() -> Iterator[tuple[Port, selectors.BaseSelector, socket.socket]]:
+def connected() -> Iterator[tuple[VehiclePort, selectors.BaseSelector, socket.socket]]:
     (number,) = free_ports(1)
     with selectors.DefaultSelector() as selector, socket.socket() as client:
-        port = Port(number, Autopilot(3, HOME, 0), selector)
+        port = VehiclePort(number, Autopilot(3, HOME, 0), selector)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         client.connect(("127.0.0.1", number))
         turn(selector, DEADLINE_S)
@@ -35,7 +35,7 @@ def connected() -> Iterator[tuple[Port, selectors.BaseSelector, socket.socket]]:
 
 
 def test_client_that_reads_late_gets_complete_messages(
-    connected: tuple[Port, selectors.BaseSelector, socket.socket],
+    connected: tuple[VehiclePort, selectors.BaseSelector, socket.socket],
 ) -> None:
     port, selector, client = connected
     assert port.channel is not None
@@ -63,7 +63,7 @@ def test_client_that_reads_late_gets_complete_messages(
 
 
 def test_unsent_bytes_end_with_their_client(
-    connected: tuple[Port, selectors.BaseSelector, socket.socket],
+    connected: tuple[VehiclePort, selectors.BaseSelector, socket.socket],
 ) -> None:
     port, selector, client = connected
     client.close()

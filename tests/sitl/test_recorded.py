@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl._pilot_link import Link
+from sitl._pilot_link import PilotLink
 from sitl.vehicle import Home
 from tests.sitl.recorded import Name, frames, messages
 from ucp.telemetry import EVENT_KINDS, POSITION, STATUS_TEXT, WAYPOINT, Position, TelemetryEvents, describe
@@ -21,16 +21,16 @@ GOOD_S: dict[Name, float] = {"copter-mission": 22.9, "plane-mission": 21.9, "pla
 
 
 @pytest.fixture
-def link(tmp_path: Path) -> Iterator[Link]:
+def link(tmp_path: Path) -> Iterator[PilotLink]:
     ours, theirs = socket.socketpair()
-    link = Link(1, ours, tmp_path / "1.tlog", 8.0, HOME)
+    link = PilotLink(1, ours, tmp_path / "1.tlog", 8.0, HOME)
     with ours, theirs:
         yield link
     link.connection_lost(None)
 
 
 @pytest.mark.parametrize("name", GOOD_S)
-def test_position_is_unknown_until_the_estimate_is_good(name: Name, link: Link) -> None:
+def test_position_is_unknown_until_the_estimate_is_good(name: Name, link: PilotLink) -> None:
     """A plane first reports a position near 0 N, 0 E, and a rover reports an altitude of 0."""
     for frame in frames(name):
         link.data_received(frame)
@@ -55,7 +55,7 @@ def test_position_is_unknown_until_the_estimate_is_good(name: Name, link: Link) 
     ],
 )
 def test_height_is_relative_to_home_unless_home_is_wrong(
-    says: list[tuple[int, int]], height_m: float, link: Link
+    says: list[tuple[int, int]], height_m: float, link: PilotLink
 ) -> None:
     """A copter without GPS always reports the same altitude. A rover sets its home before it knows its altitude."""
     vehicle, ahrs = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAV_SYS_STATUS_AHRS

@@ -13,7 +13,7 @@ from sitl import parameters, start_places
 from sitl.airframes import airframe
 from sitl.ardupilot import ArduPilot
 from sitl.embedded import Embedded
-from sitl.setup import Setup
+from sitl.setup import VehicleSetup
 from sitl.vehicle import NoBinaryError, NoProgramError, VehicleError, VehicleType
 from tests.sitl.flying import HOME
 from tests.sitl.test_ardupilot import program
@@ -158,7 +158,7 @@ def test_unknown_frame_is_refused_with_the_nearest_one(frame: str, vehicle_type:
 
 def test_parameter_files_are_copied_in_order_with_the_users_last(tmp_path: Path) -> None:
     binary = program(tmp_path / "bin" / "arducopter", LISTS_ITS_MODELS)
-    setup = Setup("hexa", {"RTL_ALT": 30.0}, ("--rate", "400"))
+    setup = VehicleSetup("hexa", {"RTL_ALT": 30.0}, ("--rate", "400"))
     lacking = ArduPilot.find(binary, {}, setup=setup)
     with pytest.raises(VehicleError, match=r"frame hexa needs .* copter.parm and copter-hexa.parm, which are not"):
         lacking.check()
@@ -179,28 +179,30 @@ def test_missing_frame_and_missing_debugger_are_refused(tmp_path: Path, monkeypa
     for name in ("copter.parm", "copter-octa.parm"):
         written(tmp_path / name, "")
     with pytest.raises(VehicleError, match=r"has no frame 'octa': it offers quadplane, \+, hexa, heli, plane"):
-        ArduPilot.find(binary, {}, setup=Setup("octa")).check()
+        ArduPilot.find(binary, {}, setup=VehicleSetup("octa")).check()
     with pytest.raises(NoBinaryError, match="no arducopter-heli is on PATH"):
-        ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path), "PATH": ""}, setup=Setup("heli"))
+        ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path), "PATH": ""}, setup=VehicleSetup("heli"))
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(NoProgramError, match="no valgrind is on PATH: install it, or leave out `debugger`"):
-        ArduPilot.find(binary, {}, setup=Setup(debugger="valgrind")).check()
+        ArduPilot.find(binary, {}, setup=VehicleSetup(debugger="valgrind")).check()
 
 
 def test_log_can_be_disabled_or_limited(tmp_path: Path) -> None:
     binary = program(tmp_path / "arducopter", LISTS_ITS_MODELS)
-    without = ArduPilot(binary, setup=Setup(log_mib=0)).launch(7, HOME, 1.0, tmp_path)
+    without = ArduPilot(binary, setup=VehicleSetup(log_mib=0)).launch(7, HOME, 1.0, tmp_path)
     assert without.argv[0] == str(binary) and "LOG_BACKEND_TYPE 0\n" in (tmp_path / "vehicle.parm").read_text()
-    bounded = ArduPilot(binary, setup=Setup(log_mib=3)).launch(7, HOME, 1.0, tmp_path)
+    bounded = ArduPilot(binary, setup=VehicleSetup(log_mib=3)).launch(7, HOME, 1.0, tmp_path)
     said = subprocess.run(bounded.argv, capture_output=True, text=True, check=True).stdout.splitlines()
     assert said[-1] == str(3 * 2048)
-    ArduPilot(binary, setup=Setup(parameters={"LOG_BACKEND_TYPE": 2.0}, log_mib=0)).launch(7, HOME, 1.0, tmp_path)
+    ArduPilot(binary, setup=VehicleSetup(parameters={"LOG_BACKEND_TYPE": 2.0}, log_mib=0)).launch(
+        7, HOME, 1.0, tmp_path
+    )
     assert (tmp_path / "vehicle.parm").read_text().endswith("\nLOG_BACKEND_TYPE 2\n")
 
 
 def test_embedded_vehicle_refuses_features_of_ardupilot() -> None:
-    Embedded("plane", Setup("plane", {"TKOFF_ALT": 30.0})).check()
+    Embedded("plane", VehicleSetup("plane", {"TKOFF_ALT": 30.0})).check()
     with pytest.raises(VehicleError, match="embedded vehicles have no wind: fly ArduPilot, or leave it out"):
-        Embedded("plane", Setup(parameters={"SIM_WIND_SPD": 3.0})).check()
+        Embedded("plane", VehicleSetup(parameters={"SIM_WIND_SPD": 3.0})).check()
     with pytest.raises(VehicleError, match="embedded vehicles have no frame quadplane and no debugger: fly ArduPilot"):
-        Embedded("plane", Setup("quadplane", debugger="gdb")).check()
+        Embedded("plane", VehicleSetup("quadplane", debugger="gdb")).check()

@@ -5,7 +5,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl.plan import GoTo, Plan, TakeOff
-from sitl.serial_channel import Channel
+from sitl.serial_channel import ClientChannel
 from sitl.shown_vehicle import REFUSAL, ShownVehicle
 from sitl.track import track
 from tests.sitl.flying import HOME
@@ -13,13 +13,13 @@ from tests.sitl.flying import HOME
 NAMES = ("COMMAND_ACK", "MISSION_ACK", "PARAM_VALUE", "STATUSTEXT")
 
 
-def shown() -> tuple[ShownVehicle, Channel]:
+def shown() -> tuple[ShownVehicle, ClientChannel]:
     flown = track("copter", Plan((TakeOff(20.0), GoTo(100.0, 0.0))))
     vehicle = ShownVehicle(3, HOME, 0, "copter", flown)
-    return vehicle, Channel(vehicle)
+    return vehicle, ClientChannel(vehicle)
 
 
-def said(channel: Channel) -> list[Any]:
+def said(channel: ClientChannel) -> list[Any]:
     return mavlink.MAVLink(None).parse_buffer(bytearray(channel.take())) or []
 
 

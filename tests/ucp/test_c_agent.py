@@ -14,7 +14,7 @@ import pytest
 import ucp
 from harness.conformance._state_space import VARIANTS, explore
 from harness.conformance.vectors import VectorSet, to_lines
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import simulate
 from tests.harness.command import harness, write_scenario
@@ -228,7 +228,7 @@ def test_c_agents_and_our_agent_agree_in_virtual_time(agent: Path, tmp_path: Pat
     reboot = {"at_s": 130, "reboot": [3], "down_s": 5, "disk": "kept"}
     keys = {**HARD_RUN, "timeline": [*HARD_RUN["timeline"], reboot], "duration_s": 200}
     mixed = scenario(agents=3, agent_command={1: [str(agent)], 3: [str(agent)]}, **keys)
-    finished = run(mixed, 1, tmp_path / "run", Silent(), "sim")
+    finished = run(mixed, 1, tmp_path / "run", SilentProgress(), "sim")
     assert finished.exit_status == 0
     assert_nothing_to_find(tmp_path / "run")
     record = json.loads((tmp_path / "run" / "run.json").read_text(encoding="utf-8"))

@@ -18,9 +18,9 @@ from docs.generate.wrong_agents.quirky import PROBABILITY
 from docs.generate.wrong_agents.trials_page import rows_of
 from harness.archive.exports import agents_directory
 from harness.archive.trace_files import SUFFIX
-from harness.field.replay import Player, open_record
+from harness.field.replay import RecordPlayer, open_record
 from harness.field.replay.replay_names import ReplayNames
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.parallel import FailedTask, sweep
 from harness.run.run import run
 from harness.scenario import load_scenario
@@ -64,7 +64,7 @@ def at_the_desk(quirk: str) -> AtTheDesk:
         with TemporaryDirectory(prefix="ucp-desk-") as name:
             brought_home = Path(name) / "home"
             brought_home.mkdir()
-            run_directory = run(scenario, seed, Path(name) / "run", Silent(), "process").directory
+            run_directory = run(scenario, seed, Path(name) / "run", SilentProgress(), "process").directory
             for trace in agents_directory(run_directory).glob(f"*{SUFFIX}"):
                 shutil.copy(trace, brought_home)
             traces = sorted(brought_home.iterdir())
@@ -77,7 +77,7 @@ def at_the_desk(quirk: str) -> AtTheDesk:
 def _first_differences(traces: Sequence[Path]) -> Iterator[Named]:
     for trace in traces:
         record = open_record(trace)
-        first = Player(record).to_end().first
+        first = RecordPlayer(record).to_end().first
         if first is not None:
             yield Named(first.t, first.handler, first.difference(ReplayNames(record).of))
 

@@ -55,7 +55,7 @@ be missing."""
 
 
 @dataclass(frozen=True)
-class Examination:
+class RecordComparisons:
     """The result of all comparisons between the records of a run."""
 
     contradictions: list[Contradiction]
@@ -69,7 +69,7 @@ class Examination:
         return [contradiction.finding for contradiction in self.contradictions if contradiction.touches == number]
 
 
-def cross_examine(evidence: Evidence) -> Examination:
+def cross_examine(evidence: Evidence) -> RecordComparisons:
     """Run all comparisons between the records of a run, and return their results."""
     comparisons = [compare for compare in COMPARISONS if not evidence.from_field or compare not in NEEDS_ALL_LINES]
     contradictions = [contradiction for compare in comparisons for contradiction in compare(evidence)]
@@ -86,7 +86,7 @@ def cross_examine(evidence: Evidence) -> Examination:
         short.setdefault(agent_id, "the run did not end normally, so the expected end of the trace is unknown")
     recorded = {agent_id: evidence.recorded(agent_id) for agent_id in evidence.traces}
     unsent = {agent_id: agent.send_failures for agent_id, agent in recorded.items() if agent and agent.send_failures}
-    return Examination(contradictions, short, unsent)
+    return RecordComparisons(contradictions, short, unsent)
 
 
 def _agents_without_known_end(evidence: Evidence) -> Iterator[int]:
@@ -129,7 +129,7 @@ def check(evidence: Evidence) -> Judgement:
     )
 
 
-def describe_incomplete(examination: Examination) -> str:
+def describe_incomplete(examination: RecordComparisons) -> str:
     """Return a phrase that names the incomplete traces. At least one trace must be incomplete."""
     agent_id, why = next(iter(examination.short.items()))
     others = len(examination.short) - 1

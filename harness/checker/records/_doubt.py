@@ -1,7 +1,7 @@
 """Change the verdict on a characteristic if records contradict each other or are incomplete."""
 
 from harness.checker.judgement import MAX_EVIDENCE, Judgement, agents, times
-from harness.checker.records import Examination, describe_incomplete
+from harness.checker.records import RecordComparisons, describe_incomplete
 
 NEEDS_TRACES = frozenset("123")
 """Characteristics that must hold at every step. They do not hold if steps are missing on record."""
@@ -9,7 +9,7 @@ NEEDS_CONNECTIVITY = frozenset("56")
 """Characteristics that must hold under full connectivity. An agent that could not send was not connected."""
 
 
-def in_doubt(number: str, judgement: Judgement, examination: Examination) -> Judgement:
+def in_doubt(number: str, judgement: Judgement, examination: RecordComparisons) -> Judgement:
     """Return the judgement on the characteristic with this number, corrected by the comparisons of all records."""
     touching = examination.touching(number)
     if touching:

@@ -85,7 +85,7 @@ def _while_stopped(run: HandlerRun, stops: list[Stop]) -> str | None:
     return None
 
 
-class _Cuts:
+class _CutIntervals:
     """The intervals in which each link loses all messages."""
 
     def __init__(self, link_losses: list[tuple[float, dict[Link, float]]], slack_s: float) -> None:
@@ -106,7 +106,7 @@ class _Cuts:
         return number % 2 == 1 and (number == len(times) or until_s < times[number])
 
 
-def _cuts(evidence: Evidence) -> _Cuts | None:
+def _cuts(evidence: Evidence) -> _CutIntervals | None:
     """Return the intervals in which links were cut, or None if no link was cut or a cut link may pass messages.
 
     Scripted fates deliver messages regardless of the loss, netem may pass a second copy of a lost message, and on a
@@ -117,10 +117,10 @@ def _cuts(evidence: Evidence) -> _Cuts | None:
     if not any(loss == 1.0 for _, losses in evidence.link_losses for loss in losses.values()):
         return None
     slack = max(map(slack_s, evidence.traces.values()), default=ROUNDED_S)
-    return _Cuts(evidence.link_losses, max(slack, SAME_TIME_S))
+    return _CutIntervals(evidence.link_losses, max(slack, SAME_TIME_S))
 
 
-def _over_a_cut(evidence: Evidence, agent_id: int, run: HandlerRun, cuts: _Cuts | None) -> str | None:
+def _over_a_cut(evidence: Evidence, agent_id: int, run: HandlerRun, cuts: _CutIntervals | None) -> str | None:
     trigger = run.trigger
     if cuts is None or not isinstance(trigger, MessageTrigger) or trigger.sender == agent_id:
         return None

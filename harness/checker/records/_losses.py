@@ -41,7 +41,7 @@ MAX_CHANCE = 1e-12
 
 
 @dataclass
-class _Expected:
+class _ExpectedDeliveries:
     """The messages to one receiver: their number, and the sums of the smallest and largest probability of loss."""
 
     messages: int = 0
@@ -117,8 +117,8 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     yield from _compare_counters(evidence, links)
 
 
-def _sum(expected: Iterable[_Expected]) -> _Expected:
-    total = _Expected()
+def _sum(expected: Iterable[_ExpectedDeliveries]) -> _ExpectedDeliveries:
+    total = _ExpectedDeliveries()
     for seen in expected:
         total.messages += seen.messages
         total.handled += seen.handled
@@ -127,13 +127,13 @@ def _sum(expected: Iterable[_Expected]) -> _Expected:
     return total
 
 
-def _is_impossible_at(seen: _Expected, sides: tuple[bool, ...]) -> bool:
+def _is_impossible_at(seen: _ExpectedDeliveries, sides: tuple[bool, ...]) -> bool:
     return seen.messages > 0 and any(
         _is_impossible(seen.handled, seen.messages, seen.pass_range(), fewer=fewer) for fewer in sides
     )
 
 
-def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) -> dict[int, _Expected]:
+def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) -> dict[int, _ExpectedDeliveries]:
     """Return, for each receiver, the messages that a correct agent handles if they arrive.
 
     `over_cuts` replaces the least and the greatest loss of a message whose link is cut.
@@ -141,9 +141,9 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
     slack = max([SAME_TIME_S, *map(slack_s, evidence.traces.values())])
     history = _LossHistory(evidence.link_losses, slack)
     known = {link for _, losses in evidence.link_losses for link in losses}
-    expected: dict[int, _Expected] = {}
+    expected: dict[int, _ExpectedDeliveries] = {}
     for receiver, trace in evidence.traces.items():
-        seen = expected[receiver] = _Expected()
+        seen = expected[receiver] = _ExpectedDeliveries()
         triggers = [run.trigger for run in trace.runs if isinstance(run.trigger, MessageTrigger)]
         handled = Counter((trigger.sender, trigger.message, trigger.sequence) for trigger in triggers)
         ready = _ReadyTimes(evidence, receiver) if in_virtual_time(trace) else None

@@ -20,7 +20,7 @@ from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
 from harness.checker.steps._late_timers import JudgedTimers
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.end_of_record import crash, failure
-from harness.checker.steps.follower import Follower, OptionalParts
+from harness.checker.steps.follower import Follower, OptionalTraceFields
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
 from ucp.messages import MalformedDatagramError
 from ucp.trace import CommandEntry, DroppedDatagram
@@ -96,7 +96,7 @@ def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: 
     def was_paused(since: float, until: float) -> bool:
         return evidence.was_paused(header.agent_id, since, until)
 
-    parts = OptionalParts.of(trace)
+    parts = OptionalTraceFields.of(trace)
     return [Follower(header, parts, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
 
 

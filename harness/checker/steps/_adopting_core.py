@@ -1,8 +1,8 @@
 """An agent core that can take over the state that another agent recorded, so that a comparison continues after a
 deviation.
 
-After a deviation the judge compares the agent from the agent's own state. `Adopting` adds this to any core that has the
-attributes of the reference's `State`: to the reference, by which agents are judged, and to the core in use, for a
+After a deviation the judge continues from the agent's own state. `AdoptingCore` adds this ability to any core that has
+the attributes of the reference's `State`: to the reference, by which agents are judged, and to the core in use, for a
 debugger and for `bisect` (`harness.checker.steps.core_in_use`).
 """
 
@@ -25,7 +25,7 @@ from ucp.sealed import SEAL_BYTES, sealed_to
 from ucp.trace import HandlerRun, SentMessage
 
 
-class Before(NamedTuple):
+class StateBeforeStep(NamedTuple):
     """The parts of the state before a step that the step's recorded changes do not restore."""
 
     stack: list[Block]
@@ -40,7 +40,7 @@ else:
     _Core = object
 
 
-class Adopting(_Core):
+class AdoptingCore(_Core):
     """An agent core whose last step can be undone with `undo`, and replaced with `adopt` by the recorded step of
     another agent.
     """
@@ -82,12 +82,14 @@ class Adopting(_Core):
         self.sequence = sequence
         self.step_is_over()
 
-    def before(self, run: HandlerRun) -> Before | None:
+    def before(self, run: HandlerRun) -> StateBeforeStep | None:
         """Return the data that `undo` needs in addition to the step's recorded changes, or None if it needs none."""
         logs, phase_three_ends = run.handler == "build_data_block", self.phase_three_timer.deadline
         if not (logs or self.reconcile_stack or phase_three_ends is not None):
             return None
-        return Before(list(self.reconcile_stack), bytes(self.current_block) if logs else None, phase_three_ends)
+        return StateBeforeStep(
+            list(self.reconcile_stack), bytes(self.current_block) if logs else None, phase_three_ends
+        )
 
     def step_is_over(self) -> None:
         """Forget the recorded changes, messages and timers of the last step."""
@@ -129,7 +131,7 @@ class Adopting(_Core):
             if hashes and len(hashes[0]) == 2 * HASH_BYTES:
                 self.majority_response_block_hash = bytes.fromhex(hashes[0])
 
-    def undo(self, before: Before | None) -> None:
+    def undo(self, before: StateBeforeStep | None) -> None:
         """Undo the last step's changes of blocks and timers. Afterwards `adopt` replaces the counted votes.
 
         `before` is None if the changes of the step are sufficient.

@@ -4,7 +4,7 @@ Agents are judged by the reference. The core in use also follows a record where 
 debugger, which stops in the handlers of `ucp`, and in `bisect`, which compares the cores of commits.
 """
 
-from harness.checker.steps._adopting_core import Adopting
+from harness.checker.steps._adopting_core import AdoptingCore
 from harness.checker.steps.implementation import Implementation
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
@@ -13,7 +13,7 @@ from ucp.core import Core
 from ucp.messages import Message
 
 
-class _CoreInUse(Adopting, Core):  # type: ignore[misc]  # a core has the attributes of the reference's state
+class _CoreInUse(AdoptingCore, Core):  # type: ignore[misc]  # a core has the attributes of the reference's state
     @property
     def sequence(self) -> int:
         return self._sequence
@@ -33,7 +33,7 @@ class _CoreInUse(Adopting, Core):  # type: ignore[misc]  # a core has the attrib
         self.changed(operation, block)
 
 
-def _core(header: CheckedHeader) -> Adopting:
+def _core(header: CheckedHeader) -> AdoptingCore:
     return _CoreInUse(header.agent_id, header.initial_data, header.settings)
 
 

@@ -23,7 +23,7 @@ from harness.checker.recorded_inputs import (
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_TIMER
 from harness.checker.reference.state import Handler, State, Timer
-from harness.checker.steps._adopting_core import Before
+from harness.checker.steps._adopting_core import StateBeforeStep
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.implementation import REFERENCE, Implementation
 from harness.checker.steps.trace_header import CheckedHeader
@@ -64,7 +64,7 @@ class Expiry(NamedTuple):
     late_s: float
 
 
-class OptionalParts(NamedTuple):
+class OptionalTraceFields(NamedTuple):
     """The optional fields that occur in a trace: the handlers with recorded vote counts, and whether timers are
     recorded.
     """
@@ -73,7 +73,7 @@ class OptionalParts(NamedTuple):
     timers: bool
 
     @classmethod
-    def of(cls, trace: Trace) -> "OptionalParts":
+    def of(cls, trace: Trace) -> "OptionalTraceFields":
         tallying = frozenset({run.handler for run in trace.runs if run.tally is not None})
         return cls(tallying, timers=any(run.started for run in trace.runs))
 
@@ -92,7 +92,7 @@ class Follower:
     def __init__(
         self,
         header: CheckedHeader,
-        parts: OptionalParts,
+        parts: OptionalTraceFields,
         blocks: Blocks,
         was_paused: Paused,
         implementation: Implementation = REFERENCE,
@@ -530,7 +530,7 @@ class Follower:
         expected.tally = self._implementation.tally_of(core, handler) if has_tally else run.tally
         return expected
 
-    def _adopt(self, line: int, run: HandlerRun, before: Before | None) -> None:
+    def _adopt(self, line: int, run: HandlerRun, before: StateBeforeStep | None) -> None:
         """Replace the state of the reference by the state that the agent recorded."""
         self._adopted = True
         self._state = None

@@ -5,18 +5,18 @@ from typing import Any, NamedTuple
 
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
 from harness.checker.reference.state import Settings, State
-from harness.checker.steps._adopting_core import Adopting
+from harness.checker.steps._adopting_core import AdoptingCore
 from harness.checker.steps.trace_header import CheckedHeader
 
 
-class ReferenceCore(Adopting, State):
+class ReferenceCore(AdoptingCore, State):
     """The reference implementation, extended so that it can take over the recorded state of an agent."""
 
 
 class Implementation(NamedTuple):
     """An agent core with its handlers by message type, by timer, by local event and by name."""
 
-    core: Callable[[CheckedHeader], Adopting]
+    core: Callable[[CheckedHeader], AdoptingCore]
     on_message: Mapping[Any, Any]
     on_timer: Mapping[str, Any]
     on_local_event: Mapping[Any, Any]
@@ -24,7 +24,7 @@ class Implementation(NamedTuple):
     tally_of: Callable[[Any, Any], Any]
 
 
-def _reference_core(header: CheckedHeader) -> Adopting:
+def _reference_core(header: CheckedHeader) -> AdoptingCore:
     return ReferenceCore(header.agent_id, header.initial_data, Settings.of(header.settings))
 
 

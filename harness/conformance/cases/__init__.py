@@ -12,6 +12,6 @@ from harness.conformance.cases import (  # noqa: F401  (each module adds its cas
     _record_cases,
     _secured_cases,
 )
-from harness.conformance.cases._bench import ALL_CASES, Bench, HandwrittenCase
+from harness.conformance.cases._bench import ALL_CASES, CaseBench, HandwrittenCase
 
-__all__ = ["ALL_CASES", "Bench", "HandwrittenCase"]
+__all__ = ["ALL_CASES", "CaseBench", "HandwrittenCase"]

@@ -49,19 +49,19 @@ class HandwrittenCase:
     """Number of the Algorithm under test. 0: none."""
     section: str
     """Section of the thesis or of the agent contract that the case tests."""
-    play: Callable[["Bench"], Awaitable[None]]
+    play: Callable[["CaseBench"], Awaitable[None]]
     """Function that plays the case. It raises WrongBehaviourError if the case fails."""
 
 
 ALL_CASES: list[HandwrittenCase] = []
 
 
-def case(name: str, section: str, algorithm: int = 0) -> Callable[[Callable[["Bench"], Awaitable[None]]], None]:
+def case(name: str, section: str, algorithm: int = 0) -> Callable[[Callable[["CaseBench"], Awaitable[None]]], None]:
     """Return a decorator that adds a test case to `ALL_CASES`. Algorithm 0 means that the case tests no single
     Algorithm.
     """
 
-    def declare(play: Callable[["Bench"], Awaitable[None]]) -> None:
+    def declare(play: Callable[["CaseBench"], Awaitable[None]]) -> None:
         ALL_CASES.append(HandwrittenCase(name, algorithm, section, play))
 
     return declare
@@ -144,7 +144,7 @@ class BenchAgent:
             raise WrongBehaviourError("the agent ends", "it runs on") from None
 
 
-class Bench:
+class CaseBench:
     """Starts agents in the virtual network for a handwritten test case."""
 
     def __init__(self, lab: UdpLab) -> None:
@@ -225,9 +225,9 @@ def _names(messages: Sequence[Message]) -> str:
 __all__ = [
     "ALL_CASES",
     "AgentEndedError",
-    "Bench",
     "BenchAgent",
     "CannotJudgeError",
+    "CaseBench",
     "HandwrittenCase",
     "WrongBehaviourError",
     "case",

@@ -2,7 +2,7 @@
 
 from harness.conformance._reference_model import PEERS
 from harness.conformance._state_space import VARIANTS
-from harness.conformance.cases._bench import INCEPTION, SPEEDUP, Bench, case, require
+from harness.conformance.cases._bench import INCEPTION, SPEEDUP, CaseBench, case, require
 from ucp.block import next_chain_hash
 from ucp.events import decode_events
 from ucp.messages import BlockAddRequest, BlockAddResponse, ChainContainQuery, CommitBlock
@@ -13,7 +13,7 @@ EVENT_DATA_BYTES = 100
 
 
 @case("a block is full when an event of maximum size might not fit", "Section 3.6.1", 1)
-async def _full(bench: Bench) -> None:
+async def _full(bench: CaseBench) -> None:
     async with bench.agent({"settings": SMALL_BLOCKS}) as agent:
         size, count = 0, 0
         while size < FULL_FROM:
@@ -39,7 +39,7 @@ async def _full(bench: Bench) -> None:
 
 
 @case("votes of the previous vote do not count", "Section 3.6.2", 2)
-async def _votes(bench: Bench) -> None:
+async def _votes(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         await agent.log(b"event")
         (proposed,) = await agent.receive(1, "a Block Add Request")
@@ -58,7 +58,7 @@ async def _votes(bench: Bench) -> None:
 
 
 @case("an agent that is stopped at the end of its vote decides once, late", "contract, Time", 5)
-async def _stopped(bench: Bench) -> None:
+async def _stopped(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         await agent.log(b"event")
         await agent.receive(1, "a Block Add Request")

@@ -6,7 +6,7 @@ from collections import Counter
 from random import Random
 
 from harness.conformance._reference_model import PEERS, STRANGER
-from harness.conformance.cases._bench import INCEPTION, Bench, case, require
+from harness.conformance.cases._bench import INCEPTION, CaseBench, case, require
 from ucp.block import Block, next_chain_hash
 from ucp.contract.vectors import drop_vectors
 from ucp.messages import (
@@ -24,7 +24,7 @@ BATCH = 50
 
 
 @case("malformed datagrams are dropped and change nothing", "contract, Datagrams")
-async def _malformed(bench: Bench) -> None:
+async def _malformed(bench: CaseBench) -> None:
     keys = {"agent_id": drop_vectors.AGENT_ID, "roster": list(drop_vectors.ROSTER)}
     async with bench.agent(keys) as agent:
         before = await agent.status()
@@ -44,7 +44,7 @@ async def _malformed(bench: Bench) -> None:
 
 
 @case("messages in the agent's own name, or of a sender not on the roster, are dropped", "contract, Datagrams")
-async def _strangers(bench: Bench) -> None:
+async def _strangers(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         for sender in (agent.agent_id, STRANGER):
             agent.send(sender, ChainContainQuery(INCEPTION))
@@ -53,7 +53,7 @@ async def _strangers(bench: Bench) -> None:
 
 
 @case("a block of an agent not on the roster is not committed", "contract, Datagrams", 6)
-async def _strange_block(bench: Bench) -> None:
+async def _strange_block(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         block = Block(STRANGER, 5, b"whatever")
         agent.send(PEERS[0], CommitBlock(block, next_chain_hash(INCEPTION, block.block_hash)))
@@ -61,7 +61,7 @@ async def _strange_block(bench: Bench) -> None:
 
 
 @case("datagrams carry the agent's ID, and sequence numbers that start at 0", "contract, Datagrams")
-async def _sequence(bench: Bench) -> None:
+async def _sequence(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         for _ in range(5):
             agent.send(PEERS[0], ChainContainQuery(INCEPTION))
@@ -75,7 +75,7 @@ async def _sequence(bench: Bench) -> None:
 
 
 @case("a block of maximum size is committed, and sent byte for byte", "contract, Bytes", 17)
-async def _largest_block(bench: Bench) -> None:
+async def _largest_block(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         block = Block(PEERS[1], 2**64 - 1, bytes(range(256)) * 4)
         agent.send(PEERS[0], CommitBlock(block, next_chain_hash(INCEPTION, block.block_hash)))
@@ -85,7 +85,7 @@ async def _largest_block(bench: Bench) -> None:
 
 
 @case("a query that arrives twice is answered twice", "contract, Datagrams", 9)
-async def _twice(bench: Bench) -> None:
+async def _twice(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         data = encode(PEERS[0], 7, ChainContainQuery(INCEPTION))
         agent.peer_socket.send(data)
@@ -95,7 +95,7 @@ async def _twice(bench: Bench) -> None:
 
 
 @case("a flood of noise and of unrequested answers changes nothing", "Section 4.1")
-async def _flood(bench: Bench) -> None:
+async def _flood(bench: CaseBench) -> None:
     rng = Random(1)
     async with bench.agent() as agent:
         for number in range(FLOOD):

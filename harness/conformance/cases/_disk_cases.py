@@ -8,9 +8,9 @@ from harness.conformance._reference_model import AGENT, PEERS
 from harness.conformance.cases._bench import (
     INCEPTION,
     AgentEndedError,
-    Bench,
     BenchAgent,
     CannotJudgeError,
+    CaseBench,
     case,
     require,
 )
@@ -23,7 +23,7 @@ STORE = {"store": STORE_FILE, "features": ["store"]}
 
 
 @case("a full disk ends the trace, and the agent continues", "contract, The program")
-async def _full(bench: Bench) -> None:
+async def _full(bench: CaseBench) -> None:
     def prepare(directory: Path) -> None:
         (directory / f"{AGENT}.trace.jsonl").symlink_to("/dev/full")
 
@@ -39,7 +39,7 @@ async def _full(bench: Bench) -> None:
 
 
 @case("an export that cannot be written gives an error and exit status 1", "contract, The program")
-async def _no_export(bench: Bench) -> None:
+async def _no_export(bench: CaseBench) -> None:
     def prepare(directory: Path) -> None:
         (directory / f"{AGENT}.chain.json" / "in the way").mkdir(parents=True)
 
@@ -66,7 +66,7 @@ async def _commit(agent: BenchAgent, count: int) -> list[Block]:
     return blocks
 
 
-async def _require_restart(bench: Bench, damage: Callable[[Path], None] | None) -> None:
+async def _require_restart(bench: CaseBench, damage: Callable[[Path], None] | None) -> None:
     port = bench.lab.take_port()
     try:
         async with bench.agent(STORE, port=port) as first:
@@ -89,12 +89,12 @@ async def _require_restart(bench: Bench, damage: Callable[[Path], None] | None) 
 
 
 @case("a killed agent restarts with its chain, and proposes the waiting block", "contract, Store", 20)
-async def _reboot(bench: Bench) -> None:
+async def _reboot(bench: CaseBench) -> None:
     await _require_restart(bench, None)
 
 
 @case("a store with a truncated end is valid up to its last whole entry", "contract, Store", 20)
-async def _torn(bench: Bench) -> None:
+async def _torn(bench: CaseBench) -> None:
     def damage(path: Path) -> None:
         with path.open("ab") as file:
             file.write(b"\x00half an ent")
@@ -103,7 +103,7 @@ async def _torn(bench: Bench) -> None:
 
 
 @case("an agent killed during a reconcile restores its stack at the restart", "contract, Store", 20)
-async def _reboot_in_reconcile(bench: Bench) -> None:
+async def _reboot_in_reconcile(bench: CaseBench) -> None:
     port = bench.lab.take_port()
     try:
         async with bench.agent(STORE, port=port) as first:

@@ -18,9 +18,9 @@ from harness.conformance.cases._bench import (
     INCEPTION,
     PATIENCE_S,
     SPEEDUP,
-    Bench,
     BenchAgent,
     CannotJudgeError,
+    CaseBench,
     WrongBehaviourError,
     case,
     require,
@@ -53,7 +53,7 @@ async def _refused(agent: BenchAgent, command: str, why: str, **arguments: Any) 
     "before the mission starts, the agent answers no message, and refuses to log and to reconcile",
     "contract, The program",
 )
-async def _not_started(bench: Bench) -> None:
+async def _not_started(bench: CaseBench) -> None:
     async with bench.agent(started=False) as agent:
         require((await agent.status()).get("started") is False, "`started` false", "not")
         agent.send(PEERS[0], ChainContainQuery(INCEPTION))
@@ -66,7 +66,7 @@ async def _not_started(bench: Bench) -> None:
 
 
 @case("an agent that joins a running mission uses the mission's time", "contract, Time")
-async def _joins(bench: Bench) -> None:
+async def _joins(bench: CaseBench) -> None:
     async with bench.agent(started=False) as agent:
         await agent.begin(ahead_s=-100.0)
         status = await agent.status()
@@ -79,14 +79,14 @@ async def _joins(bench: Bench) -> None:
 
 
 @case("mission time is 0 until the mission starts", "contract, Time")
-async def _ahead(bench: Bench) -> None:
+async def _ahead(bench: CaseBench) -> None:
     async with bench.agent(started=False) as agent:
         await agent.begin(ahead_s=30.0)
         shown = (await agent.status()).get("mission_s")
         require(shown in (None, 0), "mission second 0", shown)
 
 
-async def _ends(bench: Bench, number: int) -> None:
+async def _ends(bench: CaseBench, number: int) -> None:
     async with bench.agent({"settings": NO_EXPIRY}) as agent:
         await agent.log(b"event")
         await agent.receive_one(BlockAddRequest, "an event that fills a block")
@@ -106,12 +106,12 @@ async def _ends(bench: Bench, number: int) -> None:
 
 
 @case("SIGTERM exports the chain, exit status 0", "contract, The program")
-async def _sigterm(bench: Bench) -> None:
+async def _sigterm(bench: CaseBench) -> None:
     await _ends(bench, signal.SIGTERM)
 
 
 @case("SIGINT exports the chain, exit status 0", "contract, The program")
-async def _sigint(bench: Bench) -> None:
+async def _sigint(bench: CaseBench) -> None:
     await _ends(bench, signal.SIGINT)
 
 
@@ -124,7 +124,7 @@ async def _processes(agent: BenchAgent) -> list[int]:
 
 
 @case("a chain export replaces the earlier one in one step", "contract, The program")
-async def _whole_export(bench: Bench) -> None:
+async def _whole_export(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         await agent.process.export()
         with (agent.process.directory / f"{agent.agent_id}.chain.json").open() as earlier:
@@ -135,7 +135,7 @@ async def _whole_export(bench: Bench) -> None:
 
 
 @case("the agent leaves no process running at its end", "contract, The program")
-async def _children(bench: Bench) -> None:
+async def _children(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         await _processes(agent)
         await agent.process.send_signal(signal.SIGTERM)
@@ -145,7 +145,7 @@ async def _children(bench: Bench) -> None:
 
 
 @case("inputs and clients leave no descriptors open", "contract, The program")
-async def _descriptors(bench: Bench) -> None:
+async def _descriptors(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         before = _open_descriptors(await _processes(agent))
         for _ in range(INPUTS):
@@ -164,7 +164,7 @@ def _open_descriptors(pids: Iterable[int]) -> int:
 
 
 async def _ends_with(
-    bench: Bench, status: int, what: str, keys: Mapping[str, Any] = NO_KEYS, text: bytes | None = None
+    bench: CaseBench, status: int, what: str, keys: Mapping[str, Any] = NO_KEYS, text: bytes | None = None
 ) -> None:
     async with bench.program(keys, text=text) as agent:
         returned = await agent.end()
@@ -195,7 +195,7 @@ _WRONG: dict[str, dict[str, Any]] = {
 
 
 @case("a wrong mission file gives an error and exit status 2", "contract, The mission file")
-async def _broken(bench: Bench) -> None:
+async def _broken(bench: CaseBench) -> None:
     for what, text in _BROKEN.items():
         await _ends_with(bench, WRONG_MISSION, what, text=text)
     for what, keys in _WRONG.items():
@@ -203,12 +203,12 @@ async def _broken(bench: Bench) -> None:
 
 
 @case("an unknown feature gives an error and exit status 127", "contract, The mission file")
-async def _feature(bench: Bench) -> None:
+async def _feature(bench: CaseBench) -> None:
     await _ends_with(bench, UNSUPPORTED, "an unknown feature", {"features": ["an unknown feature"]})
 
 
 @case("an agent makes a requested mistake, or refuses the mission with status 127", "contract, Quirks")
-async def _quirk(bench: Bench) -> None:
+async def _quirk(bench: CaseBench) -> None:
     keys = {"features": ["quirks"], "quirks": {"ignore_commit": 1.0}}
     async with bench.agent(keys) as agent:
         block = Block(PEERS[0], 1, b"block")
@@ -218,7 +218,7 @@ async def _quirk(bench: Bench) -> None:
 
 
 @case("missions in doubt are played or refused as in the vectors", "contract, Features")
-async def _in_doubt(bench: Bench) -> None:
+async def _in_doubt(bench: CaseBench) -> None:
     for vector in REFUSALS["missions"]:
         needs, plays = vector["needs"], vector["plays"]
         if "in virtual time" in vector["what"] or (needs and needs != [UNKNOWN]):
@@ -232,13 +232,13 @@ async def _in_doubt(bench: Bench) -> None:
 
 
 @case("unknown keys of the mission file are ignored", "contract, The mission file")
-async def _unknown_keys(bench: Bench) -> None:
+async def _unknown_keys(bench: CaseBench) -> None:
     async with bench.agent({"something": {"else": [1, 2, 3]}}) as agent:
         await agent.require_single_answer(INCEPTION, "a mission with an unknown key")
 
 
 @case("a port in use gives an error and exit status 2", "contract, The program")
-async def _port(bench: Bench) -> None:
+async def _port(bench: CaseBench) -> None:
     port = bench.lab.take_port()
     try:
         async with bench.agent(port=port):
@@ -274,7 +274,7 @@ async def _lines(agent: BenchAgent, *requests: bytes) -> list[Any]:
 
 
 @case("the control socket answers each line, including invalid ones", "contract, Control socket")
-async def _control(bench: Bench) -> None:
+async def _control(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         wrong = (b"no JSON", b"[]", b"{}", b'{"command": "nothing of the kind"}', b'{"command": 7}', b'"status"')
         answers = await _lines(agent, *wrong, b'{"command": "status"}')
@@ -291,7 +291,7 @@ async def _control(bench: Bench) -> None:
 
 
 @case("two simultaneous clients of the control socket are both answered", "contract, Control socket")
-async def _two_clients(bench: Bench) -> None:
+async def _two_clients(bench: CaseBench) -> None:
     async with bench.agent() as agent:
         status = b'{"command": "status"}'
         both = await asyncio.gather(_lines(agent, status, status), _lines(agent, status, status))
@@ -299,7 +299,7 @@ async def _two_clients(bench: Bench) -> None:
 
 
 @case("after stop_events, no further events are logged", "contract, Control socket", 1)
-async def _stop_events(bench: Bench) -> None:
+async def _stop_events(bench: CaseBench) -> None:
     often = {"source": "random", "mean_s": 1.0}
     async with bench.agent({"events": often, "settings": {**NO_EXPIRY, "max_event_bytes": 267}}) as agent:
         await agent.receive_one(BlockAddRequest, "random events")

@@ -19,8 +19,8 @@ from harness.conformance._state_space import VARIANTS
 from harness.conformance.cases._bench import (
     INCEPTION,
     SPEEDUP,
-    Bench,
     CannotJudgeError,
+    CaseBench,
     WrongBehaviourError,
     case,
     require,
@@ -67,7 +67,7 @@ class _Records:
         return Evidence({agent_id: self.export}, {agent_id: self.trace})
 
 
-async def _play_recorded_mission(bench: Bench) -> _Records:
+async def _play_recorded_mission(bench: CaseBench) -> _Records:
     """Play a mission with every kind of step, kill the agent, and return its records."""
     async with bench.agent({"settings": SETTINGS, "roster": [*ROSTER, *PEERS]}) as agent:
         first, second, *_ = PEERS
@@ -117,7 +117,7 @@ def _bytes(recorded: RecordedBytes | None) -> bytes:
 
 
 @case("the trace has each datagram, event and command, in order and with its time", "contract, Trace")
-async def _inputs(bench: Bench) -> None:
+async def _inputs(bench: CaseBench) -> None:
     played = await _play_recorded_mission(bench)
     runs, asides = played.trace.runs, [aside for _, aside in played.trace.asides]
     drops = {aside.datagram.text: aside.dropped for aside in asides if isinstance(aside, DroppedDatagram)}
@@ -143,7 +143,7 @@ async def _inputs(bench: Bench) -> None:
 
 
 @case("the first line of the trace describes the mission", "contract, Trace")
-async def _header(bench: Bench) -> None:
+async def _header(bench: CaseBench) -> None:
     played = await _play_recorded_mission(bench)
     header = played.trace.header
     require(sorted(header.roster) == sorted(ROSTER), f"each agent of {list(ROSTER)} once", header.roster)
@@ -155,13 +155,13 @@ async def _header(bench: Bench) -> None:
 
 
 @case("each handler run in the trace follows Algorithms 1 to 20", "contract, Trace")
-async def _steps(bench: Bench) -> None:
+async def _steps(bench: CaseBench) -> None:
     played = await _play_recorded_mission(bench)
     played.require_verdict(steps.check(played.evidence()), "deviates", "the steps of the reference")
 
 
 @case("status, chain export and trace agree", "contract, Judgement")
-async def _agree(bench: Bench) -> None:
+async def _agree(bench: CaseBench) -> None:
     played = await _play_recorded_mission(bench)
     status, trace, export = played.status, played.trace, played.export
     runs = len(trace.runs)

@@ -13,9 +13,9 @@ from harness.conformance.cases._bench import (
     INCEPTION,
     PATIENCE_S,
     SILENCE_S,
-    Bench,
     BenchAgent,
     CannotJudgeError,
+    CaseBench,
     case,
     require,
 )
@@ -109,7 +109,7 @@ class SecuredPeers:
 
 
 @asynccontextmanager
-async def _secured(bench: Bench) -> AsyncIterator[tuple[SecuredPeers, "KeySet"]]:
+async def _secured(bench: CaseBench) -> AsyncIterator[tuple[SecuredPeers, "KeySet"]]:
     try:
         from ucp.secure.bundle import KeySet, write_bundle
     except ModuleNotFoundError as error:
@@ -125,7 +125,7 @@ async def _secured(bench: Bench) -> AsyncIterator[tuple[SecuredPeers, "KeySet"]]
 
 
 @case("with keys, only authentic and new datagrams have an effect", SECTION)
-async def _authentic(bench: Bench) -> None:
+async def _authentic(bench: CaseBench) -> None:
     from ucp.secure.bundle import KeySet
     from ucp.secure.envelope import CLEAR
     from ucp.secure.session import Session
@@ -157,7 +157,7 @@ async def _authentic(bench: Bench) -> None:
 
 
 @case("with keys, blocks are signed in messages and in the export", SECTION, 1)
-async def _signed(bench: Bench) -> None:
+async def _signed(bench: CaseBench) -> None:
     from ucp.secure.block_signature import block_claim
     from ucp.secure.crypto_suite import verify
 
@@ -177,7 +177,7 @@ async def _signed(bench: Bench) -> None:
 
 
 @case("with keys, a revocation is passed on, and revoked senders are dropped", SECTION)
-async def _revoked(bench: Bench) -> None:
+async def _revoked(bench: CaseBench) -> None:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
     from ucp.secure.revocation import Revocation

@@ -40,7 +40,7 @@ from harness.field.ingest._file_search import files_of
 from harness.field.ingest._ingest import Flight, IngestResult, Omission, Remark
 from harness.field.ingest._logged_events import SUFFIX as LOGGED_SUFFIX
 from harness.field.ingest._logged_events import EventLine
-from harness.field.ingest._sorting import Sorter
+from harness.field.ingest._sorting import RecordSorter
 from harness.field.ingest._trace_incarnations import TraceReader
 from harness.gc_pause import gc_paused
 from harness.scenario.strict_model import VehicleKey
@@ -262,7 +262,7 @@ def import_records(
     """
     left_out: list[Omission] = []
     adapters = [*adapters]
-    sorter = Sorter(left_out)
+    sorter = RecordSorter(left_out)
     streams: dict[Path, _RecordingReader] = {}
     with TemporaryDirectory(prefix="ucp-import-") as scratch:
         for path in files_of(sources, left_out):
@@ -314,7 +314,7 @@ class _RecordingReader:
         self._listed: list[Omission] = []
         self._rejected = 0
 
-    def read_file(self, path: Path, sorter: Sorter) -> None:
+    def read_file(self, path: Path, sorter: RecordSorter) -> None:
         """Read the next file of the recording."""
         last = 0
         try:
@@ -336,7 +336,7 @@ class _RecordingReader:
                 reader.add_unknown_gap()
         self._earlier_places += last
 
-    def _add_observation(self, observation: Observation, where: int | None, sorter: Sorter) -> None:
+    def _add_observation(self, observation: Observation, where: int | None, sorter: RecordSorter) -> None:
         if isinstance(observation, Unusable):
             self._reject(observation.why, where)
             for agent_id, reader in self._readers.items() if observation.of_a_trace else ():
@@ -382,7 +382,7 @@ class _RecordingReader:
             capture = self._captures[datagram.agent_id] = PcapngFile(path)
         capture.packet(datagram.time_ns, udp_broadcast(sender, PORT, datagram.data), outbound=datagram.sent)
 
-    def end(self, sorter: Sorter) -> None:
+    def end(self, sorter: RecordSorter) -> None:
         """Give the records to the sorter after the last file was read."""
         for agent_id, capture in self._captures.items():
             capture.close()

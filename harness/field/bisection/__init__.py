@@ -7,17 +7,17 @@ a separate process (`_record_core`), or by another agent program over UDP with s
 `_scripted_peers`).
 """
 
-from harness.field.bisection._bisecting import BisectionResult, Trial, bisect
-from harness.field.bisection._playing import UntestableError, Workshop
-from harness.field.bisection.outcome import Outcome, Subject, differences, subject_of
+from harness.field.bisection._bisecting import BisectionResult, CommitTrial, bisect
+from harness.field.bisection._playing import SubjectPlayer, UntestableError
+from harness.field.bisection.outcome import BisectionSubject, Outcome, differences, subject_of
 
 __all__ = [
     "BisectionResult",
+    "BisectionSubject",
+    "CommitTrial",
     "Outcome",
-    "Subject",
-    "Trial",
+    "SubjectPlayer",
     "UntestableError",
-    "Workshop",
     "bisect",
     "differences",
     "subject_of",

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.errors import RunDirectoryError
-from harness.field.bisection._playing import UntestableError, Workshop
+from harness.field.bisection._playing import SubjectPlayer, UntestableError
 from harness.field.bisection.outcome import Outcome, differences
 from harness.report.difference import Difference, compare
-from harness.run.code_state import Commit, History, RepositoryError, SuspectCommits
+from harness.run.code_state import Commit, GitBisection, RepositoryError, SuspectCommits
 
 
 @dataclass(frozen=True)
-class Trial:
+class CommitTrial:
     """The result of testing one commit: unchanged (good), changed (bad), or not testable (skip).
 
     `why` gives the reason.
@@ -36,7 +36,7 @@ class BisectionResult:
     good: Outcome
     bad: Outcome
     first: list[Commit] = field(default_factory=list)
-    tried: list[Trial] = field(default_factory=list)
+    tried: list[CommitTrial] = field(default_factory=list)
     changes: list[str] = field(default_factory=list)
     """Differences between the outcome after the change and that of the good commit."""
     first_difference: Difference | None = None
@@ -54,13 +54,18 @@ class BisectionResult:
 
 
 def bisect(
-    workshop: Workshop, repository: Path, good: str, bad: str, directory: Path, report_progress: Callable[[str], None]
+    workshop: SubjectPlayer,
+    repository: Path,
+    good: str,
+    bad: str,
+    directory: Path,
+    report_progress: Callable[[str], None],
 ) -> BisectionResult:
     """Test commits between `good` and `bad`. The repository is cloned into `directory`, which the caller removes.
 
     `report_progress` receives a line for each commit. Raises HarnessError.
     """
-    history = History.clone(repository, directory / "code")
+    history = GitBisection.clone(repository, directory / "code")
     good_commit, bad_commit = history.resolve(good), history.resolve(bad)
     if good_commit == bad_commit:
         raise RepositoryError(f"--good {good} and --bad {bad} are the same commit, {good_commit[:12]}")
@@ -88,7 +93,7 @@ def bisect(
     return result
 
 
-def _play_required(workshop: Workshop, history: History, commit: str, option: str) -> tuple[Outcome, Path]:
+def _play_required(workshop: SubjectPlayer, history: GitBisection, commit: str, option: str) -> tuple[Outcome, Path]:
     history.check_out(commit)
     try:
         return workshop.play(history.tree)
@@ -99,18 +104,18 @@ def _play_required(workshop: Workshop, history: History, commit: str, option: st
 
 
 def _try(
-    workshop: Workshop, history: History, commit: str, good: Outcome, runs: dict[str, tuple[Outcome, Path]]
-) -> Trial:
+    workshop: SubjectPlayer, history: GitBisection, commit: str, good: Outcome, runs: dict[str, tuple[Outcome, Path]]
+) -> CommitTrial:
     try:
         outcome, run = workshop.play(history.tree)
     except UntestableError as error:
-        return Trial(commit, "skip", f"cannot be tried: {error}")
+        return CommitTrial(commit, "skip", f"cannot be tried: {error}")
     changes = differences(good, outcome)
     if not changes:
         shutil.rmtree(run, ignore_errors=True)
-        return Trial(commit, "good", "as it was")
+        return CommitTrial(commit, "good", "as it was")
     runs[commit] = (outcome, run)
-    return Trial(commit, "bad", changes[0])
+    return CommitTrial(commit, "bad", changes[0])
 
 
 def _first_difference(good_run: Path, run: Path) -> Difference | None:

@@ -94,7 +94,7 @@ class ScriptedDatagram:
 
 
 @dataclass(frozen=True)
-class Script:
+class PeerScript:
     """The datagrams and commands to send at each mission second, and the messages that the agent program should
     send.
     """
@@ -123,7 +123,7 @@ class Script:
         return index < len(self.finished) and self.finished[index] <= at_s + slack_s
 
 
-def script_of(record: Record) -> Script:
+def script_of(record: Record) -> PeerScript:
     """Return the inputs up to the first restart of the agent. Later inputs would need the content of its disk."""
     datagrams: list[ScriptedDatagram] = []
     reconciles: list[float] = []
@@ -154,7 +154,7 @@ def script_of(record: Record) -> Script:
                 elif not isinstance(message, BlockAddRequest):
                     expected.append(ExpectedMessage(run.t, line, run.handler, message))
     datagrams.sort(key=lambda given: given.t)
-    return Script(
+    return PeerScript(
         datagrams,
         sent_question,
         reconciles,
@@ -226,7 +226,9 @@ def play_live(record: Record, command: Sequence[str], directory: Path, *, speedu
 
 
 class _LiveReplay:
-    def __init__(self, record: Record, script: Script, command: Sequence[str], directory: Path, speedup: float) -> None:
+    def __init__(
+        self, record: Record, script: PeerScript, command: Sequence[str], directory: Path, speedup: float
+    ) -> None:
         self._record = record
         self._script = script
         self._command = command
@@ -359,7 +361,7 @@ def _last_line(log: Path) -> str:
 
 
 def _compare(
-    script: Script, received: list[tuple[float, Message]], slack_s: float
+    script: PeerScript, received: list[tuple[float, Message]], slack_s: float
 ) -> Iterator[tuple[float, RecordDifference]]:
     """Yield missing, different and unexpected messages, each with its mission second.
 

@@ -18,7 +18,7 @@ from harness.errors import (
     InterruptedRunError,
 )
 from harness.field.bisection._live_replay import NotStartedError, ReplayFailedError, play_live
-from harness.field.bisection.outcome import AgentResult, Outcome, RecordDifference, Subject, outcome_of_run
+from harness.field.bisection.outcome import AgentResult, BisectionSubject, Outcome, RecordDifference, outcome_of_run
 from harness.field.replay import open_record
 from harness.run.code_state import ROOT, ProcessResult, run_python
 from harness.scenario import Scenario
@@ -35,7 +35,7 @@ class UntestableError(HarnessError):
     """An error: this commit cannot be tested, because its code cannot be started or lacks a feature."""
 
 
-class Workshop:
+class SubjectPlayer:
     """Plays one scenario or record repeatedly. Each play has a new directory in `directory` and at most `limit_s`
     seconds.
 
@@ -45,7 +45,7 @@ class Workshop:
 
     def __init__(
         self,
-        subject: Subject,
+        subject: BisectionSubject,
         directory: Path,
         *,
         limit_s: float,

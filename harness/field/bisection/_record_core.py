@@ -13,7 +13,7 @@ import ucp
 from harness.checker.steps.core_in_use import IN_USE
 from harness.errors import HarnessError
 from harness.field.ingest import ingest_files
-from harness.field.replay import Player, open_record
+from harness.field.replay import RecordPlayer, open_record
 from harness.field.replay.replay_names import ReplayNames
 
 MAX_DIFFERENCES = 10_000
@@ -24,7 +24,7 @@ def differences(path: Path, agent: int | None) -> list[dict[str, Any]]:
     played.
     """
     record = open_record(path, agent)
-    result, names = Player(record, implementation=IN_USE).to_end(), ReplayNames(record)
+    result, names = RecordPlayer(record, implementation=IN_USE).to_end(), ReplayNames(record)
     deviations = sorted(result.deviations, key=lambda deviation: deviation.line)
     return [
         {

@@ -43,7 +43,7 @@ MAX_QUESTION_GAP_S = 6.0
 """Mission seconds without a query after which the agent is no longer in a reconcile."""
 
 
-class Lateness:
+class AgentLateness:
     """The number of mission seconds by which the agent is later than in the record during a reconcile.
 
     `margin_s` is the additional delay of its next timer.
@@ -86,7 +86,7 @@ async def play(script: Path, output: TextIO, clock: MissionClock) -> None:
     own_datagrams: set[bytes] = set()
     last_asked: dict[bytes, float] = {}
     pending_answers: dict[bytes, list[bytes]] = {}
-    lateness = Lateness(MARGIN_WALL_S * clock.speedup)
+    lateness = AgentLateness(MARGIN_WALL_S * clock.speedup)
 
     def send(data: bytes) -> None:
         own_datagrams.add(data)

@@ -177,7 +177,7 @@ YAML = (".yaml", ".yml")
 
 
 @dataclass(frozen=True)
-class Subject:
+class BisectionSubject:
     """The scenario or the records to play. `scenario` is None for the records in `path`. `agent` selects one of
     them.
     """
@@ -196,7 +196,7 @@ class Subject:
         return f"{self.path}, seed {self.seed}"
 
 
-def subject_of(path: Path, seed: int | None, agent: int | None) -> Subject:
+def subject_of(path: Path, seed: int | None, agent: int | None) -> BisectionSubject:
     """Return the scenario or records at `path`.
 
     A YAML file, a library name, or a run directory of virtual time is a scenario. Every other path is a record. Raises
@@ -206,13 +206,13 @@ def subject_of(path: Path, seed: int | None, agent: int | None) -> Subject:
     if path.suffix in YAML or (path.is_file() and _is_scenario(path)):
         scenario = load_scenario(path)
         own = scenario.expect.seeds[0] if scenario.expect else 1
-        subject = Subject(path.resolve(), scenario, own if seed is None else seed)
+        subject = BisectionSubject(path.resolve(), scenario, own if seed is None else seed)
     elif (path / RUN_FILE).is_file() and agent is None and (played := _played(path)) is not None:
-        subject = Subject(path.resolve(), played[0], played[1] if seed is None else seed)
+        subject = BisectionSubject(path.resolve(), played[0], played[1] if seed is None else seed)
     else:
         if not path.exists():
             raise ScenarioError(f"{path}: no such file, directory or scenario")
-        subject = Subject(path.resolve(), None, 0, agent)
+        subject = BisectionSubject(path.resolve(), None, 0, agent)
     if subject.scenario is not None and agent is not None:
         raise ScenarioError("--agent selects a record, but the subject is a scenario: leave it out")
     return subject

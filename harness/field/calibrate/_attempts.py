@@ -18,7 +18,7 @@ from harness.archive.packets.transmissions import join
 from harness.archive.traces import Trace
 from harness.checker.records.contradiction import in_virtual_time
 from harness.errors import CaptureError
-from harness.field.calibrate._delivery_model import Attempt
+from harness.field.calibrate._delivery_model import TransmissionAttempt
 from harness.field.calibrate._positions import Positions
 from harness.field.ingest import Flight
 from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
@@ -29,7 +29,7 @@ ON_AIR_S = 0.005
 _NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitBlock, ChainContainQuery))
 
 
-class _Sent(NamedTuple):
+class _SentMessage(NamedTuple):
     """A message and the vehicles that are known to have received it."""
 
     at_s: float
@@ -39,15 +39,15 @@ class _Sent(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Observed:
+class ObservedTransmissions:
     """All transmissions of messages to receivers, their source, and a sentence for each part that cannot be used."""
 
-    attempts: list[Attempt]
+    attempts: list[TransmissionAttempt]
     source: str
     problems: list[str]
 
 
-def observe(flight: Flight, positions: Positions, epoch_us: int) -> Observed:
+def observe(flight: Flight, positions: Positions, epoch_us: int) -> ObservedTransmissions:
     """Return all transmissions between vehicles with known positions."""
     problems: list[str] = []
     source, sent = "captures", _from_captures(flight, epoch_us, problems)
@@ -64,19 +64,19 @@ def observe(flight: Flight, positions: Positions, epoch_us: int) -> Observed:
                 unknown += 1
                 continue
             delivered = receiver in message.reached
-            attempts.append(Attempt(message.at_s, message.sender, receiver, distance_m, delivered, others))
+            attempts.append(TransmissionAttempt(message.at_s, message.sender, receiver, distance_m, delivered, others))
     if unknown:
         total = unknown + len(attempts)
         problems.append(f"{unknown} of {total} messages are left out, because a position is unknown at their time")
-    return Observed(attempts, source, problems)
+    return ObservedTransmissions(attempts, source, problems)
 
 
-def _others(sent: Sequence[_Sent], times: Sequence[float], message: _Sent) -> int:
+def _others(sent: Sequence[_SentMessage], times: Sequence[float], message: _SentMessage) -> int:
     first, last = bisect_left(times, message.at_s - ON_AIR_S), bisect_right(times, message.at_s + ON_AIR_S)
     return min(3, sum(other.sender != message.sender for other in sent[first : min(last, first + 50)]))
 
 
-def _from_captures(flight: Flight, epoch_us: int, problems: list[str]) -> list[_Sent]:
+def _from_captures(flight: Flight, epoch_us: int, problems: list[str]) -> list[_SentMessage]:
     paths = [*flight.captures.values(), *flight.more_captures]
     if len(paths) < 2:
         return []
@@ -88,7 +88,7 @@ def _from_captures(flight: Flight, epoch_us: int, problems: list[str]) -> list[_
     problems += captures.errors
     shift_s = 0.0 if captures.clock.of_run else (captures.clock.epoch_ns / 1000 - epoch_us) / 1e6
     return [
-        _Sent(
+        _SentMessage(
             transmission.at_s + shift_s,
             transmission.sender,
             frozenset(name for name in transmission.reached if isinstance(name, int)),
@@ -99,7 +99,7 @@ def _from_captures(flight: Flight, epoch_us: int, problems: list[str]) -> list[_
     ]
 
 
-def _from_traces(traces: dict[int, Trace], problems: list[str]) -> Iterator[_Sent]:
+def _from_traces(traces: dict[int, Trace], problems: list[str]) -> Iterator[_SentMessage]:
     for agent_id, trace in traces.items():
         if trace.jumps:
             problems.append(f"agent {agent_id}: its clock jumps, so the messages that it sent after that are left out")
@@ -113,7 +113,7 @@ def _from_traces(traces: dict[int, Trace], problems: list[str]) -> Iterator[_Sen
                     if agent_id == sender or not receiver.is_ready(message.message, run.t):
                         continue
                     (reached if receiver.takes((sender, message.message, message.seq)) else lost).add(agent_id)
-                yield _Sent(run.t, sender, frozenset(reached), frozenset(lost))
+                yield _SentMessage(run.t, sender, frozenset(reached), frozenset(lost))
 
 
 class _Receiver:
@@ -150,6 +150,6 @@ class _Receiver:
         return self._handled[key] >= 0
 
 
-def pairs_of(attempts: Iterable[Attempt]) -> list[frozenset[int]]:
+def pairs_of(attempts: Iterable[TransmissionAttempt]) -> list[frozenset[int]]:
     """Return the pairs of vehicles with transmissions, in the order of their IDs."""
     return sorted({attempt.link for attempt in attempts}, key=sorted)

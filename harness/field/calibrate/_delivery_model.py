@@ -49,7 +49,7 @@ _NORMAL = NormalDist()
 Vector = list[float]
 
 
-class Attempt(NamedTuple):
+class TransmissionAttempt(NamedTuple):
     """The transmission of a message to one receiver, at mission second `at_s`."""
 
     at_s: float
@@ -96,7 +96,7 @@ class Interval(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fit:
+class FittedModel:
     """A fitted model. `intervals` contains a confidence interval for each fitted parameter, by name."""
 
     model: DeliveryModel
@@ -119,7 +119,7 @@ class _Row(NamedTuple):
     link: Hashable
 
 
-def fit(attempts: Sequence[Attempt], *, with_load: bool = True) -> Fit | None:
+def fit(attempts: Sequence[TransmissionAttempt], *, with_load: bool = True) -> FittedModel | None:
     """Fit the model to transmissions. Return None if they do not determine a range and a spread.
 
     That is the case if all or no messages arrived, or if the distances hardly differ.
@@ -139,10 +139,10 @@ def fit(attempts: Sequence[Attempt], *, with_load: bool = True) -> Fit | None:
     scales, freedom, clusters = _cluster_scales(rows, values, free)
     model = _model(values)
     intervals = _intervals(cells, values, likelihood, free, scales, freedom)
-    return Fit(model, intervals, len(attempts), clusters, likelihood, constant)
+    return FittedModel(model, intervals, len(attempts), clusters, likelihood, constant)
 
 
-def _rows(attempts: Iterable[Attempt]) -> list[_Row]:
+def _rows(attempts: Iterable[TransmissionAttempt]) -> list[_Row]:
     counts: dict[tuple[int, int, frozenset[int], int], list[int]] = defaultdict(lambda: [0, 0])
     for attempt in attempts:
         step = round(_STEPS_PER_FOLD * math.log(max(attempt.distance_m, MIN_DISTANCE_M)))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from harness.archive.bounded_file import BoundedFile
-from harness.archive.tracks import TRACKS_FILE, Fix, between, read_tracks
+from harness.archive.tracks import TRACKS_FILE, PositionFix, between, read_tracks
 from harness.errors import FieldError
 from harness.field.flight_logs import FlightLog, flight_log_kind, read_flight_log
 from harness.field.ingest import Flight
@@ -33,12 +33,12 @@ Place = tuple[float, float, float, float]
 class Positions:
     """The paths of the vehicles in metres. `sources` names the source of each path."""
 
-    tracks: dict[int, list[Fix]]
+    tracks: dict[int, list[PositionFix]]
     sources: dict[int, str]
     logs: list[FlightLog] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
-    def at(self, vehicle: int, at_s: float) -> Fix | None:
+    def at(self, vehicle: int, at_s: float) -> PositionFix | None:
         """Return the position of a vehicle at a mission second, or None if it is unknown."""
         track = self.tracks.get(vehicle)
         if not track or not track[0].at_s - _MARGIN_S <= at_s <= track[-1].at_s + _MARGIN_S:
@@ -151,7 +151,7 @@ def _project(positions: Positions, places: dict[int, list[Place]]) -> None:
     east = _METRES_PER_DEGREE * max(0.01, math.cos(math.radians(lat)))
     for vehicle, track in places.items():
         fixes = [
-            Fix(at_s, (north - lat) * _METRES_PER_DEGREE, ((there - lon + 180) % 360 - 180) * east, alt_m)
+            PositionFix(at_s, (north - lat) * _METRES_PER_DEGREE, ((there - lon + 180) % 360 - 180) * east, alt_m)
             for at_s, north, there, alt_m in sorted(track)
         ]
         near = [fix for fix in fixes if math.hypot(fix.north_m, fix.east_m) <= _FARTHEST_M]

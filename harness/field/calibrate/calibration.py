@@ -10,7 +10,14 @@ from typing import Any
 
 from harness.errors import FieldError
 from harness.field.calibrate._attempts import observe, pairs_of
-from harness.field.calibrate._delivery_model import Attempt, DeliveryModel, Fit, Interval, fit, wilson
+from harness.field.calibrate._delivery_model import (
+    DeliveryModel,
+    FittedModel,
+    Interval,
+    TransmissionAttempt,
+    fit,
+    wilson,
+)
 from harness.field.calibrate._positions import Positions, find_positions
 from harness.field.calibrate._signal import SignalFit, fit_signal
 from harness.field.ingest import ingest_files
@@ -26,7 +33,7 @@ _MAX_LOSS = 0.9999
 
 
 @dataclass(frozen=True)
-class Validation:
+class ModelValidation:
     """The test of a model: it is fitted to the beginning of the flight and predicts the end. A constant loss rate is
     the alternative.
 
@@ -52,7 +59,7 @@ class Validation:
 
 
 @dataclass(frozen=True)
-class Share:
+class DeliveryShare:
     """The share of some messages that arrived, with a confidence interval as if they were independent."""
 
     attempts: int
@@ -71,8 +78,8 @@ class LinkDelivery:
 
     one: int
     other: int
-    total: Share
-    over_time: dict[float, Share]
+    total: DeliveryShare
+    over_time: dict[float, DeliveryShare]
 
 
 @dataclass(frozen=True)
@@ -80,11 +87,11 @@ class Calibration:
     """The result of the calibration for one flight."""
 
     roster: list[int]
-    attempts: list[Attempt]
+    attempts: list[TransmissionAttempt]
     source: str
     positions: Positions
-    fit: Fit | None
-    validation: Validation | None
+    fit: FittedModel | None
+    validation: ModelValidation | None
     signal: SignalFit | None
     links: list[LinkDelivery]
     problems: list[str]
@@ -202,7 +209,7 @@ class Calibration:
         }
 
 
-def _share_json(share: Share) -> dict[str, Any]:
+def _share_json(share: DeliveryShare) -> dict[str, Any]:
     return {
         "messages": share.attempts,
         "delivered": share.delivered,
@@ -259,7 +266,7 @@ def calibrate(paths: Sequence[Path]) -> Calibration:
     )
 
 
-def validate(attempts: Sequence[Attempt]) -> Validation | None:
+def validate(attempts: Sequence[TransmissionAttempt]) -> ModelValidation | None:
     """Fit the model to the beginning of the flight and predict the end. Return None if the beginning does not determine
     it.
     """
@@ -276,7 +283,7 @@ def validate(attempts: Sequence[Attempt]) -> Validation | None:
     for probability, attempt in zip(predicted, unseen, strict=True):
         bins[min(int(probability * _BINS), _BINS - 1)].append((probability, attempt.delivered))
     outcomes = [attempt.delivered for attempt in unseen]
-    return Validation(
+    return ModelValidation(
         attempts=len(unseen),
         brier=_brier(predicted, outcomes),
         constant_brier=_brier([constant] * len(unseen), outcomes),
@@ -300,14 +307,14 @@ def _log_score(predicted: Sequence[float], outcomes: Sequence[bool]) -> float:
     return -sum(math.log(p if d else 1 - p) for p, d in zip(bounded, outcomes, strict=True)) / len(outcomes)
 
 
-def _links(attempts: Sequence[Attempt]) -> list[LinkDelivery]:
-    of_link: dict[frozenset[int], list[Attempt]] = defaultdict(list)
+def _links(attempts: Sequence[TransmissionAttempt]) -> list[LinkDelivery]:
+    of_link: dict[frozenset[int], list[TransmissionAttempt]] = defaultdict(list)
     for attempt in attempts:
         of_link[attempt.link].append(attempt)
     links = []
     for pair in pairs_of(attempts):
         one, other = sorted(pair)
-        blocks: dict[float, list[Attempt]] = defaultdict(list)
+        blocks: dict[float, list[TransmissionAttempt]] = defaultdict(list)
         for attempt in of_link[pair]:
             blocks[attempt.at_s // BLOCK_S * BLOCK_S].append(attempt)
         over_time = {at_s: share_of(inside) for at_s, inside in sorted(blocks.items())}
@@ -315,11 +322,11 @@ def _links(attempts: Sequence[Attempt]) -> list[LinkDelivery]:
     return links
 
 
-def share_of(attempts: Sequence[Attempt]) -> Share:
+def share_of(attempts: Sequence[TransmissionAttempt]) -> DeliveryShare:
     """Return the share of these messages that arrived. There must be at least one message."""
     delivered = sum(attempt.delivered for attempt in attempts)
     mean_m = sum(attempt.distance_m for attempt in attempts) / len(attempts)
-    return Share(len(attempts), delivered, mean_m, wilson(delivered, len(attempts)))
+    return DeliveryShare(len(attempts), delivered, mean_m, wilson(delivered, len(attempts)))
 
 
 def model_of(radio: LogDistance, loss: float = 0.0) -> DeliveryModel:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from harness.field.calibrate._delivery_model import Attempt
+from harness.field.calibrate._delivery_model import TransmissionAttempt
 from harness.field.calibrate.calibration import Calibration, share_of
 from harness.present import svg
 from harness.present.colours import inks
@@ -48,18 +48,18 @@ def _picture(heading: str, ids: str, panels: Sequence[Markup]) -> Markup:
     return Markup(document)  # noqa: S704 - the parts escape all texts
 
 
-def _bins(attempts: Sequence[Attempt]) -> list[list[Attempt]]:
-    bins: dict[int, list[Attempt]] = defaultdict(list)
+def _bins(attempts: Sequence[TransmissionAttempt]) -> list[list[TransmissionAttempt]]:
+    bins: dict[int, list[TransmissionAttempt]] = defaultdict(list)
     for attempt in attempts:
         bins[math.floor(_BINS_PER_FOLD * math.log(max(attempt.distance_m, 1.0)))].append(attempt)
     return [bins[key] for key in sorted(bins)]
 
 
-def _areas(count: int) -> list[svg.Area]:
+def _areas(count: int) -> list[svg.ChartArea]:
     return svg.grid(count, count, 60, _PANEL_HEIGHT)
 
 
-def _distance_axis(calibration: Calibration, area: svg.Area) -> Axis:
+def _distance_axis(calibration: Calibration, area: svg.ChartArea) -> Axis:
     distances = [max(attempt.distance_m, 1.0) for attempt in calibration.attempts]
     return svg.log_axis(min(distances), max(max(distances), min(distances) * 1.1), area.across)
 
@@ -130,7 +130,7 @@ def _predictions(calibration: Calibration) -> Markup:
 
 def _over_time(calibration: Calibration) -> Markup:
     area = _areas(1)[0]
-    blocks: dict[float, list[Attempt]] = defaultdict(list)
+    blocks: dict[float, list[TransmissionAttempt]] = defaultdict(list)
     for attempt in calibration.attempts:
         blocks[attempt.at_s // 60 * 60].append(attempt)
     across = svg.linear_axis(min(blocks), max(blocks) + 60, area.across)

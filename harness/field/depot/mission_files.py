@@ -85,7 +85,7 @@ class MissionFileError(HarnessError):
 
 
 @dataclass(frozen=True)
-class Plan:
+class MissionPlan:
     """The plan of a mission before it is written. `settings` and `events` override values of the scenario.
 
     The address of a vehicle is given in `addresses`, or is the address in `subnet` with its ID as the number. Without a
@@ -163,7 +163,7 @@ class Plan:
         return str(self.subnet[agent_id])
 
 
-def write(plan: Plan, directory: Path, *, overwrite: bool = False) -> list[Path]:
+def write(plan: MissionPlan, directory: Path, *, overwrite: bool = False) -> list[Path]:
     """Write the mission files and the manifest. Return their paths. The manifest is last.
 
     Raises MissionFileError, or MachineError on a disk error. Raises RunDirectoryError if a file exists and `overwrite`

@@ -15,7 +15,7 @@ MAX_REPEATED = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Reordered:
+class ReorderedPart:
     """A part of a trace that was repaired: its first and last position before the repair, and the reason."""
 
     first: int
@@ -23,7 +23,7 @@ class Reordered:
     why: str
 
 
-def in_order(runs: Sequence[HandlerRun]) -> tuple[list[int], list[Reordered]]:
+def in_order(runs: Sequence[HandlerRun]) -> tuple[list[int], list[ReorderedPart]]:
     """Return the positions of the handler runs to keep, in the right order, and the parts that were repaired."""
     places = [*_repeated(runs)]
     repeated = {position for place in places for position in range(place.first, place.last + 1)}
@@ -34,14 +34,14 @@ def in_order(runs: Sequence[HandlerRun]) -> tuple[list[int], list[Reordered]]:
             first, second = order[number : number + 2]
             order[number : number + 2] = second, first
             places.append(
-                Reordered(first, second, "these lines are in the wrong order; they are read in the right one")
+                ReorderedPart(first, second, "these lines are in the wrong order; they are read in the right one")
             )
             number += 1
         number += 1
     return order, sorted(places, key=lambda place: place.first)
 
 
-def _repeated(runs: Sequence[HandlerRun]) -> Iterator[Reordered]:
+def _repeated(runs: Sequence[HandlerRun]) -> Iterator[ReorderedPart]:
     """Yield the parts that repeat the part directly before them."""
     last_at: dict[tuple[object, ...], int] = {}
     position = 0
@@ -56,7 +56,7 @@ def _repeated(runs: Sequence[HandlerRun]) -> Iterator[Reordered]:
                 len(part) == length
                 and (_happens_once(part) or runs[position - 1].t > run.t or _triggers_next(runs, position + length))
             ):
-                yield Reordered(position, position + length - 1, "these lines are there twice; they are read once")
+                yield ReorderedPart(position, position + length - 1, "these lines are there twice; they are read once")
                 position += length
                 continue
         last_at[key] = position

@@ -48,13 +48,13 @@ def ingest_files(paths: Iterable[Path], opener: "Opener | None" = None) -> Inges
     reported in `left_out` of the result.
     """
     left_out: list[Omission] = []
-    sorter = Sorter(left_out, opener)
+    sorter = RecordSorter(left_out, opener)
     for path in files_of(paths, left_out):
         sorter.add_file(path)
     return sorter.result()
 
 
-class Sorter:
+class RecordSorter:
     """Collects records from files, and sorts them by flight.
 
     It reads files of the harness, and accepts the records that adapters read from other files.

@@ -52,7 +52,7 @@ class KnownState:
     why: str
 
 
-class Bridge:
+class InferredInputPath:
     """The guessed inputs that lead an agent to a known state, one after another. `reached` is true after success."""
 
     def __init__(self, agent: Agent, known: KnownState) -> None:

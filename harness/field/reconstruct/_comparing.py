@@ -15,8 +15,8 @@ from harness.field.reconstruct._other_records import OtherRecords
 from harness.field.reconstruct._rehearsal import (
     Incarnations,
     ProtocolDeviation,
-    Rehearsal,
-    Tolerance,
+    SoloSimulation,
+    ToleratedDeviations,
     rehearse,
     same_sent,
 )
@@ -57,7 +57,7 @@ PlayedStep = tuple[float, int | None, HandlerRun]
 
 
 def first_difference(
-    table: Timetable, rehearsals: Mapping[int, Rehearsal], simulated: Simulated
+    table: Timetable, rehearsals: Mapping[int, SoloSimulation], simulated: Simulated
 ) -> FirstDifference | None:
     """Return the earliest difference in mission time, or None if all steps with an effect are equal."""
     differences = []
@@ -118,14 +118,14 @@ RecordedInputs = Sequence[Sequence[Input]]
 """The recorded inputs of each incarnation."""
 
 
-class SoloRehearsals:
+class SoloSimulations:
     """Simulates each agent alone with its recorded inputs.
 
     `rehearsals` has each agent that can be played, and `why` the reasons for incomplete ones.
     """
 
     def __init__(self, flight: Flight, other_records: OtherRecords) -> None:
-        self.rehearsals: dict[int, Rehearsal] = {}
+        self.rehearsals: dict[int, SoloSimulation] = {}
         self.why: dict[int, str] = {}
         self._flight = flight
         self._other_records = other_records
@@ -153,7 +153,7 @@ class SoloRehearsals:
         if rehearsal is not None and (rehearsal.played or rehearsal.deviation is None):
             self.rehearsals[agent_id] = rehearsal
 
-    def _by_trace(self, header: CheckedHeader) -> Rehearsal:
+    def _by_trace(self, header: CheckedHeader) -> SoloSimulation:
         agent_id = header.agent_id
         incarnations, problem = inputs_by_incarnation(self._flight.traces[agent_id], header, self._other_records)
         whole = rehearse(header, incarnations)
@@ -175,13 +175,13 @@ class SoloRehearsals:
             return whole
         return self._play_around_lost_lines(header, incarnations, judged, whole)
 
-    def _leads_to_export(self, rehearsal: Rehearsal) -> bool:
+    def _leads_to_export(self, rehearsal: SoloSimulation) -> bool:
         export = self._flight.exports.get(rehearsal.agent_id)
         return export is None or rehearsal.chain == list(export.chain_of_block_hashes)
 
     def _explain_deviations(
-        self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: Rehearsal
-    ) -> Rehearsal:
+        self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: SoloSimulation
+    ) -> SoloSimulation:
         """Explain the deviations of an agent by a known error, if possible. Otherwise simulate it up to the first
         deviation.
         """
@@ -203,11 +203,15 @@ class SoloRehearsals:
         return in_parts
 
     def _play_around_lost_lines(
-        self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: Rehearsal
-    ) -> Rehearsal:
+        self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: SoloSimulation
+    ) -> SoloSimulation:
         """Simulate an agent without deviations. Inputs on lost lines are replaced by guessed inputs if possible."""
         agent_id = header.agent_id
-        early = rehearse(header, incarnations, tolerance=Tolerance(early_timers=True)) if whole.deviation else whole
+        early = (
+            rehearse(header, incarnations, tolerance=ToleratedDeviations(early_timers=True))
+            if whole.deviation
+            else whole
+        )
         if early.deviation is None and self._leads_to_export(early):
             self._remarks.append(EARLY_TIMERS.format(agent_id=agent_id))
             return early
@@ -222,7 +226,7 @@ class SoloRehearsals:
         self.why[agent_id] = f"is played up to trace line {last}, and the lost inputs cannot be inferred: {why}"
         return best
 
-    def _note_lost(self, rehearsal: Rehearsal, judged: JudgedTrace) -> None:
+    def _note_lost(self, rehearsal: SoloSimulation, judged: JudgedTrace) -> None:
         if rehearsal.stopped is not None:
             self.why[rehearsal.agent_id] = f"is played in part, and lost inputs cannot be inferred: {rehearsal.stopped}"
         elif rehearsal.inferred:
@@ -232,7 +236,7 @@ class SoloRehearsals:
                 f"because lines of its trace are not on record: {why}"
             )
 
-    def _by_capture(self, header: CheckedHeader, by_trace: Rehearsal | None) -> Rehearsal | None:
+    def _by_capture(self, header: CheckedHeader, by_trace: SoloSimulation | None) -> SoloSimulation | None:
         """Return the simulation that explains more inputs: the one by the trace, or one by the packet capture if
         needed.
         """
@@ -253,12 +257,12 @@ class SoloRehearsals:
 
     def _explain_by_quirk(
         self, header: CheckedHeader, incarnations: Incarnations, at: ProtocolDeviation
-    ) -> Rehearsal | None:
+    ) -> SoloSimulation | None:
         """Return a simulation with a known error that explains the whole record, or None.
 
         Quirks of the handlers that ran at the deviation are tried first.
         """
-        explaining: dict[str, Rehearsal] = {}
+        explaining: dict[str, SoloSimulation] = {}
         deterministic = [quirk for quirk in QUIRKS.values() if not quirk.chance]
         for quirk in sorted(deterministic, key=lambda quirk: at.algorithms.isdisjoint(quirk.algorithms)):
             rehearsal = rehearse(header, incarnations, {quirk.name: True})
@@ -281,12 +285,12 @@ class SoloRehearsals:
             )
         return explaining[names[0]]
 
-    def _explain_by_tolerance(self, header: CheckedHeader, incarnations: Incarnations) -> Rehearsal | None:
+    def _explain_by_tolerance(self, header: CheckedHeader, incarnations: Incarnations) -> SoloSimulation | None:
         """Return a simulation that allows ignored messages or early timers, if it gives the recorded chain. Otherwise
         None.
         """
         agent = f"agent {header.agent_id}"
-        ignoring = rehearse(header, incarnations, tolerance=Tolerance(ignoring=True))
+        ignoring = rehearse(header, incarnations, tolerance=ToleratedDeviations(ignoring=True))
         if ignoring.deviation is None:
             first = ignoring.ignored[0]
             count = f"{len(ignoring.ignored)} messages" if len(ignoring.ignored) > 1 else "a message"
@@ -295,7 +299,7 @@ class SoloRehearsals:
                 "the scenario these messages are lost"
             )
             return ignoring
-        early = rehearse(header, incarnations, tolerance=Tolerance(early_timers=True))
+        early = rehearse(header, incarnations, tolerance=ToleratedDeviations(early_timers=True))
         if early.deviation is None:
             self._remarks.append(EARLY_TIMERS.format(agent_id=header.agent_id))
             return early

@@ -136,7 +136,7 @@ def _last_seen(received: Sequence[Sighting], last_s: float, restart_s: float) ->
 
 def _infer_restarted(
     header: CheckedHeader, record: _IncarnationRecord, late_s: float, stored: StoredState, tries: int
-) -> "_Attempt":
+) -> "_InputSequence":
     """Guess the inputs after a restart that happened some time before the first datagram, with or without data on the
     disk.
     """
@@ -145,7 +145,7 @@ def _infer_restarted(
         {first_s, *(sighting.at_s for sighting in record.received), *(at_s for at_s, _ in record.logged_events)}
     )
     starts = [at_s for at_s in times if at_s <= first_s][-MAX_STARTS:][::-1]
-    best: _Attempt | None = None
+    best: _InputSequence | None = None
     for start_s in starts:
         for disk in (None, stored):
             attempt = _infer_incarnation(
@@ -166,14 +166,14 @@ def _infer_incarnation(
     stored: StoredState | None,
     tries: int,
     start_s: float = 0.0,
-) -> "_Attempt":
+) -> "_InputSequence":
     """Return the order of inputs that explains the most datagrams."""
     deferred: dict[int, int] = {}
     pauses: list[Pause] = []
-    best: _Attempt | None = None
+    best: _InputSequence | None = None
     inputs_tried = 0
     for _ in range(tries):
-        attempt = _Attempt(header, record, late_s, deferred, stored, start_s, pauses)
+        attempt = _InputSequence(header, record, late_s, deferred, stored, start_s, pauses)
         attempt.run()
         if attempt.pause is not None and len(pauses) < MAX_PAUSES:
             pauses.append(attempt.pause)
@@ -198,7 +198,7 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
     return False
 
 
-class _Attempt:
+class _InputSequence:
     """One possible order of an agent's inputs between two restarts.
 
     `deferred` maps timers, by number, to their deviation from the likely order.

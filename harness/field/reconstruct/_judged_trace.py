@@ -8,7 +8,7 @@ from harness.checker.steps.deviation import Deviation
 from harness.field.ingest import Flight
 from harness.field.reconstruct._agent_inputs import BootedFromDisk, Input
 from harness.field.reconstruct._bridging import KnownState
-from harness.field.replay import Player, Record
+from harness.field.replay import Record, RecordPlayer
 from harness.field.replay._record_search import IngestedRecords
 from harness.field.replay.replay_names import ReplayNames
 from ucp.block import Block
@@ -25,7 +25,7 @@ class JudgedTrace:
         """Compare the trace. Raises FieldError if the trace does not contain inputs."""
         trace = flight.traces[agent_id]
         record = Record(Path(f"agent {agent_id}"), "", trace, IngestedRecords(flight), [])
-        player = Player(record)
+        player = RecordPlayer(record)
         self._known: dict[int, KnownState] = {}
         """Handler run, by identity, after which the state is known again -> the state."""
         self._played: set[int] = set()

@@ -24,7 +24,7 @@ from harness.field.reconstruct._agent_inputs import (
     ReconcileRequested,
     TimerExpired,
 )
-from harness.field.reconstruct._bridging import Bridge, KnownState
+from harness.field.reconstruct._bridging import InferredInputPath, KnownState
 from harness.play.simulation.fate_script import LateTimers, RunningTimer
 from ucp.agent import Agent, drop_reason
 from ucp.block import next_chain_hash
@@ -80,7 +80,7 @@ class PlayedInput:
 
 
 @dataclass
-class Rehearsal:
+class SoloSimulation:
     """The simulation of one agent with its recorded inputs. `played` contains the inputs up to `deviation`, if there is
     one.
 
@@ -107,7 +107,7 @@ class Rehearsal:
 
 
 @dataclass(frozen=True, slots=True)
-class Tolerance:
+class ToleratedDeviations:
     """The kinds of deviations to ignore: timers that expire early, and ignored messages."""
 
     early_timers: bool = False
@@ -122,15 +122,15 @@ def rehearse(
     header: CheckedHeader,
     incarnations: "Incarnations",
     quirks: Quirks | None = None,
-    tolerance: Tolerance | None = None,
-) -> Rehearsal:
+    tolerance: ToleratedDeviations | None = None,
+) -> SoloSimulation:
     """Simulate all recorded inputs up to the first deviation, and return the result."""
-    tolerance = tolerance or Tolerance()
-    rehearsal = Rehearsal(header.agent_id, quirks or {})
+    tolerance = tolerance or ToleratedDeviations()
+    rehearsal = SoloSimulation(header.agent_id, quirks or {})
     stored: StoredState | None = None
     timers = LateTimers()
     for incarnation, inputs in enumerate(incarnations):
-        rehearsed = _IncarnationRehearsal(header, rehearsal, incarnation, timers, tolerance)
+        rehearsed = _IncarnationSimulation(header, rehearsal, incarnation, timers, tolerance)
         for index, recorded_input in enumerate(inputs):
             if isinstance(recorded_input, KnownState):
                 if not rehearsed.bridge(recorded_input):
@@ -151,9 +151,14 @@ def rehearse(
     return rehearsal
 
 
-class _IncarnationRehearsal:
+class _IncarnationSimulation:
     def __init__(
-        self, header: CheckedHeader, rehearsal: Rehearsal, incarnation: int, timers: LateTimers, tolerance: Tolerance
+        self,
+        header: CheckedHeader,
+        rehearsal: SoloSimulation,
+        incarnation: int,
+        timers: LateTimers,
+        tolerance: ToleratedDeviations,
     ) -> None:
         self.agent = Agent(
             header.agent_id,
@@ -179,7 +184,7 @@ class _IncarnationRehearsal:
 
     def bridge(self, known: KnownState) -> bool:
         """Guess and simulate inputs that lead the agent to this state. Return true on success."""
-        bridge = Bridge(self.agent, known)
+        bridge = InferredInputPath(self.agent, known)
         sent: list[Message] = []
         while (cause := bridge.next(sent)) is not None:
             state = self.agent.state

@@ -17,7 +17,7 @@ from heapq import heappop, heappush
 
 from harness.field.reconstruct._agent_inputs import BootedFromDisk, DatagramReceived
 from harness.field.reconstruct._clock_offsets import MAX_RATE, MIN_RATE, ClockLine, estimate
-from harness.field.reconstruct._rehearsal import PlayedInput, Rehearsal, TimerStart
+from harness.field.reconstruct._rehearsal import PlayedInput, SoloSimulation, TimerStart
 from harness.field.replay._peer_messages import Delivery
 
 MIN_GAP_S = 2e-5
@@ -94,7 +94,7 @@ class Timetable:
         return incarnations
 
 
-def timetable(rehearsals: Mapping[int, Rehearsal], ahead_s: Mapping[int, float] = {}) -> Timetable:
+def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, float] = {}) -> Timetable:
     """Return the inputs on one time axis. `ahead_s` relates the clocks of agents to GPS time."""
     senders = _Senders(rehearsals)
     clocks = estimate(rehearsals, senders.deliveries(), ahead_s)
@@ -102,7 +102,7 @@ def timetable(rehearsals: Mapping[int, Rehearsal], ahead_s: Mapping[int, float] 
     return _Planner(rehearsals, senders, clocks).plan()
 
 
-def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, Rehearsal]) -> dict[int, ClockLine]:
+def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSimulation]) -> dict[int, ClockLine]:
     """Return the clocks relative to mission time.
 
     Mission second 0 is the time at which the first clock shows 0. If the first input is earlier, or much later, mission
@@ -123,7 +123,7 @@ def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, Rehears
 class _Senders:
     """The datagrams that each simulated agent sent, and their receivers among the simulated agents."""
 
-    def __init__(self, rehearsals: Mapping[int, Rehearsal]) -> None:
+    def __init__(self, rehearsals: Mapping[int, SoloSimulation]) -> None:
         self._rehearsals = rehearsals
         self.sent: dict[int, list[bytes]] = {agent: [] for agent in rehearsals}
         self._sent_by: dict[int, list[int]] = {agent: [] for agent in rehearsals}
@@ -158,7 +158,9 @@ class _Senders:
 
 
 class _Planner:
-    def __init__(self, rehearsals: Mapping[int, Rehearsal], senders: _Senders, clocks: dict[int, ClockLine]) -> None:
+    def __init__(
+        self, rehearsals: Mapping[int, SoloSimulation], senders: _Senders, clocks: dict[int, ClockLine]
+    ) -> None:
         self._rehearsals = rehearsals
         self._senders = senders
         self._table = Timetable(clocks, sent=senders.sent)

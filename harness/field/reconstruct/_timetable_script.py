@@ -9,7 +9,7 @@ from itertools import pairwise
 
 from harness.field.reconstruct._agent_inputs import DatagramReceived, EventLogged, ReconcileRequested
 from harness.field.reconstruct._known_mission import Mission
-from harness.field.reconstruct._rehearsal import Rehearsal
+from harness.field.reconstruct._rehearsal import SoloSimulation
 from harness.field.reconstruct._timetable import DIGITS, MIN_GAP_S, IncarnationTimes, TimedInput, Timetable
 from harness.scenario.scenario_file import Document
 from harness.scenario.strict_model import format_pairs
@@ -25,7 +25,7 @@ MIN_PAUSE_S = 0.5
 
 
 def scenario_document(
-    mission: Mission, table: Timetable, rehearsals: Mapping[int, Rehearsal], lost: Collection[int], sealed: Sealed
+    mission: Mission, table: Timetable, rehearsals: Mapping[int, SoloSimulation], lost: Collection[int], sealed: Sealed
 ) -> Document:
     """Return the scenario as a document. An agent without simulated inputs does not take part in it.
 
@@ -36,7 +36,7 @@ def scenario_document(
         agent: _all_incarnations(table.incarnations(agent), len(rehearsal.running_at_end))
         for agent, rehearsal in rehearsals.items()
     }
-    strays = _Strays()
+    strays = _StrayDatagrams()
     fates = [*_fates(mission.roster, table, incarnations, strays)]
     entries = [*_entries(mission.roster, table, rehearsals, incarnations, lost)]
     last_s = max([at_s for at_s, _ in entries], default=0.0)
@@ -120,7 +120,7 @@ def _events(table: Timetable, sealed: Sealed) -> list[Document]:
     return sorted(events, key=lambda event: (event["at_s"], event["agent"]))
 
 
-class _Strays:
+class _StrayDatagrams:
     """The datagrams that the scenario must deliver itself, because no agent in it sends them."""
 
     def __init__(self) -> None:
@@ -156,7 +156,10 @@ def _source(datagram: bytes) -> int:
 
 
 def _fates(
-    roster: Iterable[int], table: Timetable, incarnations: Mapping[int, Sequence[IncarnationTimes]], strays: _Strays
+    roster: Iterable[int],
+    table: Timetable,
+    incarnations: Mapping[int, Sequence[IncarnationTimes]],
+    strays: _StrayDatagrams,
 ) -> Iterator[Document]:
     """Yield the arrivals of all datagrams.
 
@@ -190,7 +193,7 @@ def _can_be_sent(timed_input: TimedInput, table: Timetable, start_times: Sequenc
 def _entries(
     roster: Iterable[int],
     table: Timetable,
-    rehearsals: Mapping[int, Rehearsal],
+    rehearsals: Mapping[int, SoloSimulation],
     incarnations: Mapping[int, Sequence[IncarnationTimes]],
     lost: Collection[int],
 ) -> Iterator[tuple[float, Document]]:

@@ -12,10 +12,10 @@ from harness.checker.judgement import agents
 from harness.checker.signatures import TrustedKeys, vouch
 from harness.errors import FieldError, MachineError
 from harness.field.ingest import Flight
-from harness.field.reconstruct._comparing import FirstDifference, SoloRehearsals, first_difference
+from harness.field.reconstruct._comparing import FirstDifference, SoloSimulations, first_difference
 from harness.field.reconstruct._known_mission import NO_INPUTS, known_mission
 from harness.field.reconstruct._other_records import OtherRecords
-from harness.field.reconstruct._rehearsal import Rehearsal
+from harness.field.reconstruct._rehearsal import SoloSimulation
 from harness.field.reconstruct._timetable import Timetable, timetable
 from harness.field.reconstruct._timetable_script import scenario_document
 from harness.run.simulate import MemoryRecorder, Simulated, simulate_in_memory
@@ -137,7 +137,7 @@ def reconstruct(
     remarks: list[str] = []
     other_records = OtherRecords(flight, opener, depot)
     mission, headers = known_mission(flight, other_records, name, remarks)
-    solo = SoloRehearsals(flight, other_records)
+    solo = SoloSimulations(flight, other_records)
     rehearsals, why = solo.rehearsals, solo.why
     for agent_id, header in headers.items():
         report_progress(f"agent {agent_id} alone")
@@ -198,7 +198,7 @@ def _check_signatures(flight: Flight, keys: "PublicKeys | None", remarks: list[s
 
 
 def _compare_chains(
-    flight: Flight, rehearsals: Mapping[int, Rehearsal], simulated: Simulated, why: dict[int, str]
+    flight: Flight, rehearsals: Mapping[int, SoloSimulation], simulated: Simulated, why: dict[int, str]
 ) -> None:
     for agent_id, rehearsal in rehearsals.items():
         if agent_id in why:
@@ -212,7 +212,7 @@ def _compare_chains(
             why[agent_id] = _export_differs(export, rehearsal, flight)
 
 
-def _export_differs(export: Export, rehearsal: Rehearsal, flight: Flight) -> str:
+def _export_differs(export: Export, rehearsal: SoloSimulation, flight: Flight) -> str:
     trace = flight.traces.get(export.agent_id)
     if trace is None:
         return f"has another chain in its export ({len(export.chain)} blocks) than its recorded inputs lead to"

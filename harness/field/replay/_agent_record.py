@@ -27,7 +27,7 @@ from ucp.trigger import MessageTrigger
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class RecordEntry:
     """A line of the record. Line numbers and restarts count from 1.
 
     `gap` describes missing lines directly before it, such as "2 lines are damaged", else None.
@@ -200,7 +200,7 @@ class Record:
         return sorted(entry.content.t for entry in self.entries)
 
 
-def _entries(trace: Trace) -> Iterator[Entry]:
+def _entries(trace: Trace) -> Iterator[RecordEntry]:
     """Yield the lines of a trace in order."""
     missing = {gap.position: _missing(gap.lines) for gap in trace.gaps}
     missing |= dict.fromkeys(trace.jumps, "the agent's clock was set")
@@ -209,11 +209,11 @@ def _entries(trace: Trace) -> Iterator[Entry]:
     for incarnation, numbered_runs in enumerate(trace.incarnations(), 1):
         for line, run in numbered_runs:
             while asides and asides[0][0] <= position:
-                yield Entry(asides[0][1][0], incarnation, asides.popleft()[1][1])
-            yield Entry(line, incarnation, run, missing.get(position))
+                yield RecordEntry(asides[0][1][0], incarnation, asides.popleft()[1][1])
+            yield RecordEntry(line, incarnation, run, missing.get(position))
             position += 1
     for _, (line, aside) in asides:
-        yield Entry(line, len(trace.starts) + 1, aside)
+        yield RecordEntry(line, len(trace.starts) + 1, aside)
 
 
 def _missing(lines: int) -> str:

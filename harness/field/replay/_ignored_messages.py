@@ -14,7 +14,7 @@ from typing import Protocol
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.deviation import Deviation
 from harness.field._vehicle_captures import Sighting
-from harness.field.replay._agent_record import Entry, Record
+from harness.field.replay._agent_record import Record, RecordEntry
 from ucp.messages import MalformedDatagramError, Message, decode
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
@@ -80,7 +80,7 @@ def _without_line(record: Record) -> Iterator[tuple[int, Sighting]]:
             yield position, sighting
 
 
-def _received(entry: Entry) -> MessageTrigger | None:
+def _received(entry: RecordEntry) -> MessageTrigger | None:
     match entry.content:
         case HandlerRun(trigger=MessageTrigger() as trigger):
             return trigger

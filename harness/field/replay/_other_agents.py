@@ -11,7 +11,7 @@ from harness.archive.traces import Trace
 from harness.field.reconstruct._clock_offsets import ClockLine, estimate
 from harness.field.replay._agent_record import Record
 from harness.field.replay._peer_messages import PeerMessages
-from harness.field.replay._player import Player
+from harness.field.replay._player import RecordPlayer
 from harness.present.text import shown
 from ucp.clock import MICROSECONDS
 from ucp.trace import HandlerRun
@@ -39,7 +39,7 @@ class OtherAgents:
         others = {agent_id: trace for agent_id, trace in record.flight.traces.items() if agent_id != record.agent_id}
         return {agent_id: _OtherAgent(record, trace) for agent_id, trace in others.items()}
 
-    def at(self, player: Player) -> Iterator[Text]:
+    def at(self, player: RecordPlayer) -> Iterator[Text]:
         """Yield the steps of each agent at this moment, its state, and its relation to the current step."""
         entry = player.entry
         now = entry.content.t if entry else 0.0

@@ -15,12 +15,12 @@ from harness.checker.reference.algorithms import ON_TIMER
 from harness.checker.reference.state import State
 from harness.checker.steps import end_of_record, wrongly_dropped
 from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.follower import Follower, OptionalParts
+from harness.checker.steps.follower import Follower, OptionalTraceFields
 from harness.checker.steps.implementation import REFERENCE, Implementation
 from harness.checker.steps.single_line import LINES_AFTER, damage_that_explains
-from harness.field.replay._agent_record import Entry, Record
+from harness.field.replay._agent_record import Record, RecordEntry
 from harness.field.replay._ignored_messages import ignored_messages
-from harness.field.replay._resumption import ClockSet, Resumption
+from harness.field.replay._resumption import ClockChangeDetector, ResumptionSearch
 from harness.field.replay.replay_names import RecordedBlocks
 from ucp.messages import Message
 from ucp.trace import HandlerRun
@@ -76,7 +76,7 @@ class _Checkpoint:
     result: ReplayResult
 
 
-class Player:
+class RecordPlayer:
     """A player of a record. `position` is the number of played entries, and `result` their result.
 
     `until_s` is the last mission second to play. `implementation` plays the record: the reference, which judges agents,
@@ -92,11 +92,11 @@ class Player:
         self.entries = entries if until_s is None else entries[: _later_than(entries, until_s)]
         self.position = 0
         self.result = ReplayResult()
-        self._parts = OptionalParts.of(record.trace)
+        self._parts = OptionalTraceFields.of(record.trace)
         self._unknown = unknown_names(record.trace.runs)
         self._blocks = RecordedBlocks(record)
-        self._clock_set = ClockSet(record)
-        self._resumption = Resumption(record, self._blocks)
+        self._clock_set = ClockChangeDetector(record)
+        self._resumption = ResumptionSearch(record, self._blocks)
         self.resumed_at: int | None = None
         """The position after the last entry at which the state became known again. None if there was none."""
         self._follower, self._incarnation = self._new_follower(), 1
@@ -113,7 +113,7 @@ class Player:
         return self._follower.lost
 
     @property
-    def entry(self) -> Entry | None:
+    def entry(self) -> RecordEntry | None:
         """The entry that was played last, or None."""
         return self.entries[self.position - 1] if self.position else None
 
@@ -137,7 +137,7 @@ class Player:
             return here
         return here + self._follower.foresee(upcoming.line, upcoming.content)
 
-    def forward(self, *, into_debugger: bool = False) -> Entry:
+    def forward(self, *, into_debugger: bool = False) -> RecordEntry:
         """Play the next entry. With `into_debugger`, call `breakpoint()` directly before its handler runs."""
         entry = self.entries[self.position]
         if isinstance(entry.content, HandlerRun):
@@ -195,12 +195,12 @@ class Player:
             result.lost.append(sentence)
             result.unjudged += 1
 
-    def at(self, position: int) -> "Player":
+    def at(self, position: int) -> "RecordPlayer":
         """Go to a position, and return this player."""
         self.to(position)
         return self
 
-    def _earlier(self) -> "Player":
+    def _earlier(self) -> "RecordPlayer":
         """Return a copy of this player at the beginning."""
         earlier = copy(self)
         earlier.to(0, replay=True)
@@ -214,7 +214,7 @@ class Player:
         """Return the name of the handler of a message."""
         return str(self._implementation.on_message[type(message)].name)
 
-    def _follow(self, entry: Entry, run: HandlerRun) -> None:
+    def _follow(self, entry: RecordEntry, run: HandlerRun) -> None:
         follower, result = self._follower, self.result
         if entry.gap is not None and follower.lost is None:
             follower.lost = (
@@ -283,7 +283,7 @@ class Player:
         return Follower(self.record.header, self._parts, self._blocks, self.record.was_paused, self._implementation)
 
 
-class _DoubtingPlayer(Player):
+class _DoubtingPlayer(RecordPlayer):
     """A player that tries to explain each deviation by damage to a single line."""
 
     def __init__(self, record: Record) -> None:
@@ -317,7 +317,7 @@ def _short(block_hash: str) -> str:
     return block_hash[:12]
 
 
-def _later_than(entries: Iterable[Entry], until_s: float) -> int:
+def _later_than(entries: Iterable[RecordEntry], until_s: float) -> int:
     """Return the number of entries before the first entry that is later than `until_s`."""
     count = 0
     for entry in entries:

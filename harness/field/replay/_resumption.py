@@ -16,7 +16,7 @@ from statistics import median
 from harness.archive.traces import Trace
 from harness.checker.recorded_inputs import NotOnRecordError, event_of
 from harness.checker.steps.follower import Follower
-from harness.field.replay._agent_record import Entry, Record
+from harness.field.replay._agent_record import Record, RecordEntry
 from harness.field.replay._peer_messages import PeerMessages
 from harness.field.replay.replay_names import RecordedBlocks
 from ucp.block import HASH_BYTES, Block, InceptionBlock, next_chain_hash
@@ -28,7 +28,7 @@ _ChainSteps = dict[bytes, tuple[bytes, str]]
 """Chain hash -> the chain hash before it, and the block between both."""
 
 
-class Resumption:
+class ResumptionSearch:
     """The chains in all records of the flight, and the agent states that follow from them."""
 
     def __init__(self, record: Record, blocks: RecordedBlocks) -> None:
@@ -126,7 +126,7 @@ class Resumption:
         """Return the sequence number of the next message after an entry, or 0 if there is none."""
         return next((run.sent[0].seq for _, run in self._following_runs(position) if run.sent), 0)
 
-    def _following_runs(self, position: int) -> Iterator[tuple[Entry, HandlerRun]]:
+    def _following_runs(self, position: int) -> Iterator[tuple[RecordEntry, HandlerRun]]:
         """Yield the following entries up to a gap or a restart."""
         incarnation = self._record.entries[position].incarnation
         for entry in islice(self._record.entries, position + 1, None):
@@ -152,7 +152,7 @@ MIN_SHIFT_S = 1.0
 """Minimum change of a clock that is detected."""
 
 
-class ClockSet:
+class ClockChangeDetector:
     """A detector of changes of the agent's clock. It reads the records of the other agents when it is first used."""
 
     def __init__(self, record: Record) -> None:

@@ -8,8 +8,8 @@ from rich.text import Text
 
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.deviation import Deviation
-from harness.field.replay._agent_record import Entry
-from harness.field.replay._player import Player
+from harness.field.replay._agent_record import RecordEntry
+from harness.field.replay._player import RecordPlayer
 from harness.field.replay.breakpoints import source_of
 from harness.field.replay.replay_names import SHOWN, ReplayNames
 from harness.present.text import shown
@@ -26,13 +26,13 @@ BLOCKS_SHOWN = 8
 class StepText:
     """The texts for the record of a player. `names` contains the names of its blocks."""
 
-    def __init__(self, player: Player, names: ReplayNames) -> None:
+    def __init__(self, player: RecordPlayer, names: ReplayNames) -> None:
         self._player = player
         self._names = names
 
     # A step
 
-    def line(self, number: int, entry: Entry) -> Text:
+    def line(self, number: int, entry: RecordEntry) -> Text:
         """Return the line for entry number `number` (from 1), such as "212 604.278 s A18
         receive_response_block_for_hash: committed".
         """

@@ -9,15 +9,15 @@ from pathlib import Path
 
 from harness.checker.recorded_inputs import decoded
 from harness.errors import FieldError
-from harness.field.replay._agent_record import Entry
-from harness.field.replay._player import Player
+from harness.field.replay._agent_record import RecordEntry
+from harness.field.replay._player import RecordPlayer
 from harness.field.replay.replay_names import ReplayNames, is_block
 from ucp.agent import HANDLERS
 from ucp.messages import MalformedDatagramError, block_named
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
 
-Breakpoint = Callable[[Entry], bool]
+Breakpoint = Callable[[RecordEntry], bool]
 """A condition that selects entries."""
 
 _BY_ALGORITHM = {str(handler.algorithm): name for name, handler in HANDLERS.items()}
@@ -45,7 +45,7 @@ def parse_breakpoint(text: str, names: ReplayNames) -> Breakpoint:
     )
 
 
-def next_stop(player: Player, stops_at: Breakpoint, backward: bool = False) -> int | None:
+def next_stop(player: RecordPlayer, stops_at: Breakpoint, backward: bool = False) -> int | None:
     """Return the position after the next entry that matches, or after the previous one with `backward`. None if none
     matches.
     """
@@ -53,7 +53,7 @@ def next_stop(player: Player, stops_at: Breakpoint, backward: bool = False) -> i
     return next((number + 1 for number in numbers if stops_at(player.entries[number])), None)
 
 
-def blocks_of(entry: Entry) -> set[str]:
+def blocks_of(entry: RecordEntry) -> set[str]:
     """Return the hashes of the blocks that an entry changes, receives or sends."""
     content = entry.content
     if isinstance(content, CommandEntry):

@@ -16,7 +16,7 @@ from harness.checker.steps.deviation import Deviation
 from harness.errors import FieldError
 from harness.field.ingest import Flight
 from harness.field.replay._agent_record import Record
-from harness.field.replay._player import Player
+from harness.field.replay._player import RecordPlayer
 from harness.field.replay._record_search import IngestedRecords
 
 
@@ -57,7 +57,7 @@ def _judge_steps(evidence: Evidence, flight: Flight) -> Judgement:
     judged, unjudged, lost = 0, 0, list[str]()
     for agent_id, trace in flight.traces.items():
         try:
-            result = Player(Record(Path(), "", trace, IngestedRecords(flight), [])).to_end()
+            result = RecordPlayer(Record(Path(), "", trace, IngestedRecords(flight), [])).to_end()
         except FieldError as error:
             lost.append(f"the trace of agent {agent_id} cannot be judged: {str(error).removeprefix('.: ')}")
             continue

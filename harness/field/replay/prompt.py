@@ -10,9 +10,9 @@ from rich.console import Console, RenderableType
 
 from harness.checker.steps.core_in_use import IN_USE
 from harness.errors import FieldError
-from harness.field.replay._agent_record import Entry
+from harness.field.replay._agent_record import RecordEntry
 from harness.field.replay._other_agents import OtherAgents
-from harness.field.replay._player import Player
+from harness.field.replay._player import RecordPlayer
 from harness.field.replay._step_text import StepText
 from harness.field.replay.breakpoints import Breakpoint, next_stop, parse_breakpoint
 from harness.field.replay.replay_names import ReplayNames
@@ -35,7 +35,7 @@ SHORT_FORMS = {
 }
 
 
-class Prompt(cmd.Cmd):
+class ReplayPrompt(cmd.Cmd):
     """A command line that reads commands until the input ends or the user enters `quit`. Then `quit` is true.
 
     `breaks` are the places at which `continue` stops, in addition to differences.
@@ -43,7 +43,7 @@ class Prompt(cmd.Cmd):
 
     identchars = cmd.Cmd.identchars + "-"
 
-    def __init__(self, player: Player, names: ReplayNames, console: Console, breaks: Sequence[str]) -> None:
+    def __init__(self, player: RecordPlayer, names: ReplayNames, console: Console, breaks: Sequence[str]) -> None:
         self._terminal = sys.stdin.isatty()
         super().__init__()
         self.use_rawinput = self._terminal
@@ -168,7 +168,7 @@ class Prompt(cmd.Cmd):
         player = self._player
         if not player.position:
             raise FieldError("nothing is played yet: enter next, then debug")
-        in_use = Player(player.record, implementation=IN_USE)
+        in_use = RecordPlayer(player.record, implementation=IN_USE)
         in_use.to(player.position - 1)
         with suppress(BdbQuit):
             in_use.forward(into_debugger=True)
@@ -249,12 +249,12 @@ class Prompt(cmd.Cmd):
                 self._print_message("no difference after this step")
         self._show()
 
-    def _stops_at(self, entry: Entry) -> bool:
+    def _stops_at(self, entry: RecordEntry) -> bool:
         """Return true if `continue` must stop at the last entry."""
         positions = self._player.result.positions
         return positions[-1:] == [self._player.position] or self._breaks_at(entry)
 
-    def _breaks_at(self, entry: Entry) -> bool:
+    def _breaks_at(self, entry: RecordEntry) -> bool:
         return any(at(entry) for at in self._breakpoints.values())
 
     def _show(self) -> None:

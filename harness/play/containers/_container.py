@@ -14,8 +14,8 @@ import docker
 import docker.errors
 from docker.types import LogConfig, Mount, Ulimit
 
-from harness.play.containers._images import Image
-from harness.play.containers.docker_engine import Engine
+from harness.play.containers._images import ContainerImage
+from harness.play.containers.docker_engine import DockerEngine
 from harness.scenario.agent_options import DockerOptions
 from netem.lab import in_words
 
@@ -28,7 +28,7 @@ _KILLED_BY_SIGNAL = 128  # exit status of a shell or of docker-init after a sign
 _NO_SUCH_PROGRAM = 127
 
 
-class Output:
+class ContainerOutput:
     """Copies the output of a container from the stream of `docker attach` to two files.
 
     The stream consists of frames: number of the output, 3 unused bytes, length (u32, big-endian), content (Docker
@@ -88,7 +88,9 @@ class Output:
 class Container:
     """A container that runs one program. The lab calls `has_ended` when the container ends."""
 
-    def __init__(self, engine: Engine, identity: str, name: str, output: Output, memory_mib: int | None) -> None:
+    def __init__(
+        self, engine: DockerEngine, identity: str, name: str, output: ContainerOutput, memory_mib: int | None
+    ) -> None:
         self._engine = engine
         self.identity = identity
         self.name = name
@@ -180,7 +182,7 @@ INIT = 1
 
 def recipe(
     api: docker.APIClient,
-    image: Image,
+    image: ContainerImage,
     argv: Sequence[str],
     kept: Sequence[Path],
     network_mode: str,

@@ -23,16 +23,16 @@ import docker.errors
 
 from harness.archive.directory import RunDirectory
 from harness.play.containers import _images, ownership
-from harness.play.containers._container import Container, Output, recipe
-from harness.play.containers._images import Image
-from harness.play.containers.docker_engine import CLEAN, DockerError, Engine, Events
+from harness.play.containers._container import Container, ContainerOutput, recipe
+from harness.play.containers._images import ContainerImage
+from harness.play.containers.docker_engine import CLEAN, DockerEngine, DockerError, DockerEvents
 from harness.play.containers.ownership import remove
 from harness.play.process._run_lab import Role
 from harness.play.process.process_preflight import network_needs
 from harness.scenario import Scenario
 from harness.scenario.agent_options import DockerOptions
 from netem.conditions import NetworkConditions
-from netem.engine import Applied
+from netem.engine import AppliedConditions
 from netem.errors import SpawnError
 from netem.lab import Lab
 
@@ -43,14 +43,14 @@ LOOK_EVERY_S = 5.0
 class ContainerLab:
     """A virtual network whose programs run in containers. Its errors are DockerError and those of netem."""
 
-    def __init__(self, engine: Engine, rundir: RunDirectory, scenario: Scenario) -> None:
+    def __init__(self, engine: DockerEngine, rundir: RunDirectory, scenario: Scenario) -> None:
         self._engine = engine
         self._rundir = rundir
         self._docker = scenario.docker
         self._name = ownership.run_name(rundir.path)
         self._in_named = set(_images.agents_in_named(scenario))
-        self._ours: Image | None = None
-        self._named: Image | None = None
+        self._ours: ContainerImage | None = None
+        self._named: ContainerImage | None = None
         self._holders: dict[str, int] = {}
         """Container ID of a holder -> vehicle."""
         self._containers: dict[str, Container] = {}
@@ -58,7 +58,7 @@ class ContainerLab:
         self._incarnations: Counter[tuple[int, str]] = Counter()
         self._networks: set[int] = set()
         """Inode numbers of the vehicles' network namespaces."""
-        self._events: Events | None = None
+        self._events: DockerEvents | None = None
         self.network: Lab
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._closed = False
@@ -69,7 +69,7 @@ class ContainerLab:
 
         Raises DockerError, and the errors of netem.lab.Lab.open.
         """
-        engine = await asyncio.to_thread(Engine.connect)
+        engine = await asyncio.to_thread(DockerEngine.connect)
         lab = cls(engine, rundir, scenario)
         try:
             await lab._choose_images(scenario, say)
@@ -94,7 +94,7 @@ class ContainerLab:
                 raise DockerError("the build of the image was interrupted")
             loop.call_soon_threadsafe(say, word)
 
-        def choose() -> tuple[Image | None, Image | None]:
+        def choose() -> tuple[ContainerImage | None, ContainerImage | None]:
             named = None if requested.image is None else _images.named(self._engine, requested.image)
             if named is not None and scenario.vehicles.kind == "none" and self._in_named == set(scenario.roster):
                 return None, named
@@ -109,7 +109,7 @@ class ContainerLab:
     async def _hold_networks(self, scenario: Scenario) -> None:
         label = f"{ownership.RUN}={self._name}"
         self._events = await self._engine.in_thread(
-            Events, self._engine, label, self._on_event, asyncio.get_running_loop()
+            DockerEvents, self._engine, label, self._on_event, asyncio.get_running_loop()
         )
         image = await self._engine.in_thread(_images.from_host, self._engine)
         results = await asyncio.gather(
@@ -118,7 +118,7 @@ class ContainerLab:
         for error in filter(None, results):
             raise error
 
-    async def _hold(self, vehicle: int, image: Image) -> None:
+    async def _hold(self, vehicle: int, image: ContainerImage) -> None:
         name, identity = await self._create(vehicle, "network", image, _images.idle_command(), "none", DockerOptions())
         self._holders[identity] = vehicle
         await self._start(name, identity)
@@ -183,7 +183,9 @@ class ContainerLab:
             environment=image.environment(env),
         )
         stream = await self._engine.ask(f"attach to {name}", self._attach, identity)
-        container = Container(self._engine, identity, name, Output(stream, stdout, stderr), self._docker.memory_mib)
+        container = Container(
+            self._engine, identity, name, ContainerOutput(stream, stdout, stderr), self._docker.memory_mib
+        )
         self._containers[identity] = container
         await self._start(name, identity)
         return container
@@ -194,10 +196,10 @@ class ContainerLab:
     async def connect(self, vehicle: int, port: int, *, timeout_s: float) -> socket:
         return await self.network.connect(vehicle, port, timeout_s=timeout_s)
 
-    async def apply(self, conditions: NetworkConditions) -> Applied:
+    async def apply(self, conditions: NetworkConditions) -> AppliedConditions:
         return await self.network.apply(conditions)
 
-    async def read(self) -> Applied:
+    async def read(self) -> AppliedConditions:
         return await self.network.read()
 
     async def watch(self) -> None:
@@ -234,7 +236,7 @@ class ContainerLab:
         self,
         vehicle: int,
         role: str,
-        image: Image,
+        image: ContainerImage,
         argv: Sequence[str],
         network: str,
         limits: DockerOptions,

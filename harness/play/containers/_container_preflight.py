@@ -5,14 +5,14 @@ import shutil
 from pathlib import Path
 
 from harness.play.containers import _images
-from harness.play.containers.docker_engine import DockerError, Engine
+from harness.play.containers.docker_engine import DockerEngine, DockerError
 from harness.play.variant import variant_in_use
 from harness.scenario import Scenario
 
 
 def check_docker(scenario: Scenario) -> None:
     """Raise DockerError if Docker cannot be used here, or if the requested image is missing."""
-    engine = Engine.connect()
+    engine = DockerEngine.connect()
     try:
         require_root()
         if scenario.docker.image is not None:

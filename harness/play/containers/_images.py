@@ -22,7 +22,7 @@ from pathlib import Path
 import docker.errors
 
 from harness.play.containers import ownership
-from harness.play.containers.docker_engine import DockerError, Engine
+from harness.play.containers.docker_engine import DockerEngine, DockerError
 from harness.scenario import Scenario
 
 HOST_IMAGE = "ucp-harness-host:empty"
@@ -33,7 +33,7 @@ INSTEAD = "use this machine's files (--image-from-host, `docker.image_from_host`
 
 
 @dataclass(frozen=True)
-class Image:
+class ContainerImage:
     """A Docker image. `python` is its interpreter, and `mounted` lists directories of this machine that it can read.
 
     Nothing is mounted into a `foreign` image, because paths refer to files in the image.
@@ -61,7 +61,7 @@ class Image:
         return outermost([*self.mounted, *([] if self.foreign else map(_with_environment, files))])
 
 
-def from_host(engine: Engine) -> Image:
+def from_host(engine: DockerEngine) -> ContainerImage:
     """Return an image that uses the programs of this machine, and create it if necessary. Raises DockerError."""
     if not _exists(engine, HOST_IMAGE):
         repository, tag = HOST_IMAGE.split(":")
@@ -76,8 +76,8 @@ def from_host(engine: Engine) -> Image:
     return host_image()
 
 
-def host_image() -> Image:
-    return Image(HOST_IMAGE, sys.executable, tuple(outermost(_host_directories())))
+def host_image() -> ContainerImage:
+    return ContainerImage(HOST_IMAGE, sys.executable, tuple(outermost(_host_directories())))
 
 
 def is_shared(program: Path) -> bool:
@@ -86,11 +86,11 @@ def is_shared(program: Path) -> bool:
     return all(any(path.is_relative_to(outer) for outer in mounted) for path in (program, program.resolve()))
 
 
-def named(engine: Engine, name: str) -> Image:
+def named(engine: DockerEngine, name: str) -> ContainerImage:
     """Return the image with this name. Raises DockerError if it is missing."""
     if not _exists(engine, name):
         raise DockerError(f"this machine has no image {name}: docker pull {name}, or build it")
-    return Image(name, "python3", foreign=True)
+    return ContainerImage(name, "python3", foreign=True)
 
 
 def agents_in_named(scenario: Scenario) -> Iterable[int]:
@@ -102,13 +102,13 @@ def agents_in_named(scenario: Scenario) -> Iterable[int]:
     return scenario.foreign if isinstance(scenario.agent_command, dict) else scenario.roster
 
 
-def project(engine: Engine, say: Callable[[str], object]) -> Image:
+def project(engine: DockerEngine, say: Callable[[str], object]) -> ContainerImage:
     """Return the image of this project. If it is missing, build it and report each step. Raises DockerError."""
     name = project_name()
     if not _exists(engine, name):
         say("building the image")
         _build(engine, name, say)
-    return Image(name, "python3")
+    return ContainerImage(name, "python3")
 
 
 def project_name() -> str:
@@ -125,7 +125,7 @@ def build_arguments() -> dict[str, str]:
     return arguments
 
 
-def _build(engine: Engine, name: str, say: Callable[[str], object]) -> None:
+def _build(engine: DockerEngine, name: str, say: Callable[[str], object]) -> None:
     steps = engine.do(
         "build the image",
         engine.api.build,
@@ -176,7 +176,7 @@ def _with_environment(program: Path) -> Path:
     return environment if (environment / "pyvenv.cfg").is_file() else program
 
 
-def _exists(engine: Engine, name: str) -> bool:
+def _exists(engine: DockerEngine, name: str) -> bool:
     try:
         engine.do(f"look for the image {name}", engine.api.inspect_image, name)
     except docker.errors.APIError as error:

@@ -17,7 +17,7 @@ from harness.play._vehicle_keys import FRESH, FRESH_BYTES, MissionKeys, mission_
 from harness.play.containers import _images, ownership
 from harness.play.containers._container_backend import DockerBackend
 from harness.play.containers._container_preflight import check_debuggers
-from harness.play.containers._images import Image
+from harness.play.containers._images import ContainerImage
 from harness.play.process.agent_mission import mission_file
 from harness.scenario import Scenario
 from netem import addresses
@@ -155,7 +155,7 @@ def _services(
             services[name] |= {"environment": dict(launch.env)} if launch.env else {}
             network = {"network_mode": f"service:{name}", "depends_on": [name]}
         argv = [*DockerBackend().agent_command(scenario, vehicle), mission]
-        image = Image(str(docker), "python3", foreign=True) if vehicle in in_named else ours
+        image = ContainerImage(str(docker), "python3", foreign=True) if vehicle in in_named else ours
         services[f"agent-{vehicle}"] = _service(scenario, image, argv, "agents", folder) | network
         services[f"agent-{vehicle}"] |= {} if vehicle in in_named else build
         services[f"agent-{vehicle}"] |= {"secrets": [_bundle(vehicle)]} if keys else {}
@@ -166,7 +166,7 @@ def _services(
     return services
 
 
-def _our_image(scenario: Scenario, folder: Path) -> tuple[Image, dict[str, Any]]:
+def _our_image(scenario: Scenario, folder: Path) -> tuple[ContainerImage, dict[str, Any]]:
     """Return the image of this project, and the build section of the Compose file."""
     context = folder / "image"
     context.mkdir()
@@ -178,10 +178,12 @@ def _our_image(scenario: Scenario, folder: Path) -> tuple[Image, dict[str, Any]]
         (context / name).parent.mkdir(parents=True, exist_ok=True)
         (context / name).write_bytes(content)
     build = {"context": f"./{folder.name}/image", "network": "host", "args": _images.build_arguments()}
-    return Image(_images.project_name(), "python3"), {"build": build}
+    return ContainerImage(_images.project_name(), "python3"), {"build": build}
 
 
-def _service(scenario: Scenario, image: Image, argv: list[str], directory: str, folder: Path) -> dict[str, Any]:
+def _service(
+    scenario: Scenario, image: ContainerImage, argv: list[str], directory: str, folder: Path
+) -> dict[str, Any]:
     command = image.command(argv)
     docker = scenario.docker
     service: dict[str, Any] = {

@@ -37,7 +37,7 @@ class DockerError(MachineError, LabError):
     """An error: Docker is missing, or refuses a request."""
 
 
-class Engine:
+class DockerEngine:
     """The connection to Docker. Call its SDK object `api` only through the method `do`, or `ask` in asynchronous
     code.
     """
@@ -49,7 +49,7 @@ class Engine:
         self._failure: DockerError | None = None
 
     @classmethod
-    def connect(cls) -> "Engine":
+    def connect(cls) -> "DockerEngine":
         """Connect to Docker on this machine. Raises DockerError."""
         host = os.environ.get("DOCKER_HOST") or DEFAULT_HOST
         if not host.startswith("unix://"):
@@ -113,11 +113,15 @@ class Engine:
         self.api.close()
 
 
-class Events:
+class DockerEvents:
     """Follows Docker's messages about containers with a certain label, in order."""
 
     def __init__(
-        self, engine: Engine, label: str, on_event: Callable[[dict[str, Any]], None], loop: asyncio.AbstractEventLoop
+        self,
+        engine: DockerEngine,
+        label: str,
+        on_event: Callable[[dict[str, Any]], None],
+        loop: asyncio.AbstractEventLoop,
     ) -> None:
         """Start to follow Docker's messages. Each one is given to `on_event`.
 

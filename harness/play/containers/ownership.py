@@ -12,7 +12,7 @@ from pathlib import Path
 
 import docker.errors
 
-from harness.play.containers.docker_engine import DockerError, Engine
+from harness.play.containers.docker_engine import DockerEngine, DockerError
 
 RUN = "ucp-harness.run.run"
 VEHICLE = "ucp-harness.vehicle"
@@ -63,16 +63,16 @@ def _start_time(pid: int) -> str | None:
 
 
 @dataclass
-class Cleaned:
+class CleanupResult:
     """The names of the removed containers, and of the containers that active runs still use."""
 
     removed: list[str] = field(default_factory=list)
     still: list[str] = field(default_factory=list)
 
 
-def clean(engine: Engine) -> Cleaned:
+def clean(engine: DockerEngine) -> CleanupResult:
     """Remove the containers of all ended runs, and leave all others. Raises DockerError."""
-    cleaned = Cleaned()
+    cleaned = CleanupResult()
     for container in engine.do("list containers", engine.api.containers, all=True, filters={"label": RUN}):
         name = container["Names"][0].removeprefix("/")
         if is_alive(container["Labels"].get(OWNER, "")):
@@ -83,7 +83,7 @@ def clean(engine: Engine) -> Cleaned:
     return cleaned
 
 
-def remove(engine: Engine, identity: str, name: str) -> None:
+def remove(engine: DockerEngine, identity: str, name: str) -> None:
     """Kill a container and remove it with its volumes. Raises DockerError."""
     try:
         engine.do(f"remove {name}", engine.api.remove_container, identity, v=True, force=True)

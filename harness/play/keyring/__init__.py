@@ -3,6 +3,6 @@
 `ucp.secure` describes how a vehicle uses its bundle.
 """
 
-from harness.play.keyring.key_directory import Home, KeysError, load_depot_key
+from harness.play.keyring.key_directory import KeyDirectory, KeysError, load_depot_key
 
-__all__ = ["Home", "KeysError", "load_depot_key"]
+__all__ = ["KeyDirectory", "KeysError", "load_depot_key"]

@@ -47,7 +47,7 @@ class KeysError(HarnessError):
 
 
 @dataclass(frozen=True)
-class Home:
+class KeyDirectory:
     """A directory with the keys of a mission. Methods that read raise KeysError, and methods that write raise
     MachineError.
     """
@@ -55,7 +55,7 @@ class Home:
     directory: Path
 
     @classmethod
-    def new(cls, directory: Path, roster: Iterable[int], *, seals: bool, epoch_s: float) -> "Home":
+    def new(cls, directory: Path, roster: Iterable[int], *, seals: bool, epoch_s: float) -> "KeyDirectory":
         """Create keys in a new directory. If `seals` is true, they include a key pair for encrypted event data."""
         keys = KeySet.derived(os.urandom(KEY_BYTES), roster, seals=seals, epoch_s=epoch_s)
         home, mission = cls(directory), keys.public.mission.hex()
@@ -240,7 +240,7 @@ def listed(agents: Iterable[int]) -> str:
     return f"agents {shown}" if others else f"agent {shown}"
 
 
-class Authority:
+class RevocationAuthority:
     """The authority that excludes vehicles. It signs lists of all vehicles excluded so far. `last` is the newest list.
 
     Without a `private_key`, only `last` is available. New revocations are not stored, because a mission must not change
@@ -253,12 +253,12 @@ class Authority:
         self._last = last
 
     @classmethod
-    def of(cls, keys: KeySet) -> "Authority":
+    def of(cls, keys: KeySet) -> "RevocationAuthority":
         """Return the authority for newly created keys."""
         return cls(keys.public, keys.authority)
 
     @classmethod
-    def in_directory(cls, home: Home, public: PublicKeys) -> "Authority":
+    def in_directory(cls, home: KeyDirectory, public: PublicKeys) -> "RevocationAuthority":
         """Return the authority of a key directory. The directory may lack its private key, its list, or both.
 
         Raises KeysError.

@@ -17,7 +17,7 @@ from netem import lab_doctor, uml
 from netem.errors import NetemError, UmlError
 from netem.estimates import Estimate, ReceivedStream
 from netem.lab import EngineName
-from netem.measure import EngineMeasurement, Observer, Study, measure, studies
+from netem.measure import EngineMeasurement, NetworkStudy, Observer, measure, studies
 from netem.observers import in_lab
 from sitl.ardupilot import ArduPilot
 from sitl.vehicle import VehicleError
@@ -66,11 +66,11 @@ def _user_mode_linux() -> Requirement:
 
 def _docker() -> Requirement:
     from harness.play.containers._container_preflight import require_root
-    from harness.play.containers.docker_engine import DockerError, Engine
+    from harness.play.containers.docker_engine import DockerEngine, DockerError
 
     use = "--backend docker: vehicles and agents in containers"
     try:
-        engine = Engine.connect()
+        engine = DockerEngine.connect()
         version = engine.api.version()["Version"]
         engine.close()
         require_root()
@@ -112,7 +112,7 @@ def measure_engines(requirements: Iterable[Requirement], say: Callable[[str], No
 def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -> Observer:
     """Return an observer of measurements that also reports which measurement is running."""
 
-    def observe_and_report(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
+    def observe_and_report(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         asked = len(study.questions)
         say(f"{engine}: {packets} packets for {asked} question{'' if asked == 1 else 's'}")
         return observe(study, packets)

@@ -27,7 +27,7 @@ from netem.channel import PRESETS
 from netem.conditions import NetworkConditions
 from netem.errors import NetemError
 from netem.radio import Place
-from netem.relay import Heard, Relay
+from netem.relay import ReceivedBroadcast, Relay
 from ucp.clock import MissionClock
 from ucp.control import Command, CommandError, ControlServer
 from ucp.loop import Loop, Timer
@@ -75,8 +75,8 @@ class ChannelNode:
         self._channel: LiveChannel | None = None
         self._relay: Relay | None = None
         self._roster: tuple[int, ...] = ()
-        self._lateness = Lateness()
-        self._answers = AnswerTimes()
+        self._lateness = DeliveryLateness()
+        self._answers = AnswerTimeMeter()
         self._timer: Timer | None = None
         self._loop = Loop(selector=selectors.SelectSelector())
         self._journal = journal.open("a", encoding="utf-8")
@@ -123,7 +123,7 @@ class ChannelNode:
         if (next_s := channel.next_s) != NEVER:
             self._timer = self._loop.call_later(clock.wall_s(next_s - clock.now()), self._turn)
 
-    def _take(self, channel: LiveChannel, heard: Heard, at_s: float) -> None:
+    def _take(self, channel: LiveChannel, heard: ReceivedBroadcast, at_s: float) -> None:
         data = heard.udp_data(self._port)
         if data is None:
             channel.pass_by(at_s, heard.vehicle, heard.frame)
@@ -131,7 +131,7 @@ class ChannelNode:
             self._answers.sent(heard, data, at_s)
             channel.send(at_s, heard.vehicle, heard.frame, len(data), _sequence(data, heard.vehicle))
 
-    def _deliver_to_all(self, relay: Relay, heard: Heard) -> None:
+    def _deliver_to_all(self, relay: Relay, heard: ReceivedBroadcast) -> None:
         """Deliver a broadcast of the rogue node (a sender outside the swarm) at once, without use of the channel."""
         for vehicle in self._roster:
             relay.deliver(vehicle, heard.frame)
@@ -194,7 +194,7 @@ class ChannelNode:
         return self._channel
 
 
-class Lateness:
+class DeliveryLateness:
     """Measure how late the channel delivered frames, in mission seconds."""
 
     def __init__(self) -> None:
@@ -231,7 +231,7 @@ class Lateness:
         }
 
 
-class AnswerTimes:
+class AnswerTimeMeter:
     """Measure the time from the delivery of a query to the agent's answer, in mission seconds.
 
     In virtual time, an agent answers at once, and `processing_s` follows. A process first waits for a processor. If
@@ -245,7 +245,7 @@ class AnswerTimes:
         self._asked_s: dict[tuple[int, int], float] = {}
         """(Vehicle, type code of an answer) -> when the vehicle got the latest question."""
 
-    def sent(self, heard: Heard, data: bytes, at_s: float) -> None:
+    def sent(self, heard: ReceivedBroadcast, data: bytes, at_s: float) -> None:
         """Record that a vehicle sent this datagram."""
         code = data[TYPE_AT] if len(data) > TYPE_AT else None
         if code in ANSWER_TO:

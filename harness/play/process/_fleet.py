@@ -10,7 +10,7 @@ from harness.errors import ScenarioError
 from harness.play._radio_range import track_of
 from harness.play.process._run_lab import MissionLab
 from harness.play.process._vehicle_process import VehicleProcess
-from harness.play.process._watchers import Watchers
+from harness.play.process._watchers import MissionTasks
 from harness.scenario import Scenario
 from netem.radio import Place
 from sitl.address import Address
@@ -37,7 +37,7 @@ class Fleet:
         kinds: Mapping[int, VehicleKind],
         rundir: RunDirectory,
         clock: MissionClock,
-        watchers: Watchers,
+        watchers: MissionTasks,
     ) -> None:
         self._scenario = scenario
         self._kinds = kinds

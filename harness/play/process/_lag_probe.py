@@ -32,7 +32,7 @@ MICROSECONDS = 1e6
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
-class Counters:
+class KernelCounters:
     """Counters of the kernel. Each method returns the number of seconds of wall time since it was last called."""
 
     def __init__(self, networks: dict[int, str]) -> None:
@@ -87,7 +87,7 @@ def _busy_ns(thread: str) -> int:
     return int(ran) + int(waited)
 
 
-def measure(file: TextIO, started: float, speedup: float, counters: Counters, ended: threading.Event) -> None:
+def measure(file: TextIO, started: float, speedup: float, counters: KernelCounters, ended: threading.Event) -> None:
     """Measure until `ended` is set, and write a line for each interval. `started` is the monotonic time of mission
     second 0.
     """
@@ -118,7 +118,7 @@ def measure(file: TextIO, started: float, speedup: float, counters: Counters, en
 def main(path: str) -> None:
     request = json.loads(sys.stdin.readline())
     started = time.monotonic() - (time.time() - request["epoch_us"] / MICROSECONDS)
-    counters = Counters({int(inode): agent for inode, agent in request["networks"].items()})
+    counters = KernelCounters({int(inode): agent for inode, agent in request["networks"].items()})
     with Path(path).open("a", encoding="ascii") as file:
         ended = threading.Event()
         measuring = threading.Thread(target=measure, args=(file, started, request["speedup"], counters, ended))

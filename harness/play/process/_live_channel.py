@@ -28,7 +28,7 @@ class _Message:
     """The number of the message, if it is one of an agent."""
 
 
-class Delivery(NamedTuple):
+class FrameDelivery(NamedTuple):
     """A frame that reaches a vehicle at mission second `at_s`."""
 
     at_s: float
@@ -48,7 +48,7 @@ class LiveChannel:
         self._number = {vehicle: number for number, vehicle in enumerate(roster)}
         self._traffic: ChannelTraffic[_Message] = ChannelTraffic(self._roster, radio, processing_s, seed, journal)
         self._medium = Medium(self._roster, seed, AT_ONCE)
-        self._due: list[Delivery] = []
+        self._due: list[FrameDelivery] = []
         self._order = count()
         self._played_s = 0.0
 
@@ -72,7 +72,7 @@ class LiveChannel:
         everyone = (1 << len(self._roster)) - 1
         self._copy(at_s, self._medium.draw(sender, at_s, len(frame)), everyone, frame)
 
-    def advance(self, now: float) -> list[Delivery]:
+    def advance(self, now: float) -> list[FrameDelivery]:
         """Play all events up to the time `now`, and return the deliveries that are due, in order."""
         self._play(now)
         deliveries = []
@@ -111,4 +111,4 @@ class LiveChannel:
         """
         for receiver in numbers(receivers):
             for delay_s in draws.copies_to(receiver):
-                heappush(self._due, Delivery(at_s + delay_s, next(self._order), self._roster[receiver], frame))
+                heappush(self._due, FrameDelivery(at_s + delay_s, next(self._order), self._roster[receiver], frame))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
-from harness.play._pace import Pace
+from harness.play._pace import VirtualTimePace
 from harness.play.backend import Backend
 from harness.play.mission import Swarm
 from harness.play.progress import Progress
@@ -62,7 +62,7 @@ class ProcessBackend(Backend):
         *,
         interactive: bool = False,
         delivers_all: bool = False,
-        pace: Pace | None = None,
+        pace: VirtualTimePace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
         from harness.play.process._program_run import ProgramRun
         from harness.play.process.vehicle_kinds import choose_vehicles

@@ -25,16 +25,16 @@ from harness.play.process._fleet import Fleet
 from harness.play.process._lag_meter import LagMeter
 from harness.play.process._rogue_process import RogueProcess
 from harness.play.process._run_lab import MissionLab, OpenLab
-from harness.play.process._watchers import Watchers, open_unless_interrupted
+from harness.play.process._watchers import MissionTasks, open_unless_interrupted
 from harness.play.process.process_preflight import add_rogue_listener
-from harness.play.progress import Progress, Snapshot
+from harness.play.progress import Progress, SwarmSnapshot
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, NetworkChange, TimedInjection, describe, silent_injections
 from harness.scenario.fates import Fate
 from harness.scenario.faults import Fault
 from netem.capture import LiveCapture
 from netem.conditions import NetworkConditions
-from netem.engine import Applied
+from netem.engine import AppliedConditions
 from netem.errors import LabUnavailable, LiveCaptureError, NetemError
 from netem.lab import UdpCounters
 from sitl.circumstances import Circumstance
@@ -97,7 +97,7 @@ class ProgramRun:
         self._capture: LiveCapture | None = None
         self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()
-        self._watchers = Watchers()
+        self._watchers = MissionTasks()
         self._fleet = Fleet(scenario, kinds, rundir, self.clock, self._watchers)
         self._lag: LagMeter | None = None
         self._udp_before_start: Mapping[int, UdpCounters] = {}
@@ -338,7 +338,7 @@ class ProgramRun:
             record |= {"asked": asked.to_json(), "applied": self._without_rogue(applied)}
         self.rundir.append_network(record)
 
-    def _without_rogue(self, applied: Applied) -> dict[str, Any]:
+    def _without_rogue(self, applied: AppliedConditions) -> dict[str, Any]:
         """Return the network conditions and packet counters as JSON, without those of the rogue node."""
         figures = applied.to_json()
         if self._rogue is not None:
@@ -527,7 +527,7 @@ class ProgramRun:
     def _show(self, stage: str) -> None:
         self.stage = stage
         self.progress.show(
-            Snapshot(
+            SwarmSnapshot(
                 stage,
                 self.clock.now(),
                 self.scenario.duration_s,

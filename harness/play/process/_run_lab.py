@@ -12,7 +12,7 @@ from typing import Literal, Protocol, Self
 from harness.archive.directory import RunDirectory
 from harness.scenario import Scenario
 from netem.conditions import NetworkConditions
-from netem.engine import Applied
+from netem.engine import AppliedConditions
 from netem.lab import Lab as NetworkLab
 
 Role = Literal["agent", "vehicle"]
@@ -80,9 +80,9 @@ class MissionLab(Protocol):
 
     async def connect(self, vehicle: int, port: int, *, timeout_s: float) -> socket: ...
 
-    async def apply(self, conditions: NetworkConditions) -> Applied: ...
+    async def apply(self, conditions: NetworkConditions) -> AppliedConditions: ...
 
-    async def read(self) -> Applied: ...
+    async def read(self) -> AppliedConditions: ...
 
     async def watch(self) -> None:
         """Wait until the network fails by itself, then raise NetemError."""

@@ -11,7 +11,7 @@ from harness.errors import AgentFailedError, HarnessError, InterruptedRunError
 T = TypeVar("T")
 
 
-class Watchers:
+class MissionTasks:
     """A group of tasks that run beside a mission.
 
     An exception in a task ends the mission. A task ends with the mission at the latest, and earlier through `stop`.

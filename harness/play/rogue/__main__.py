@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from harness.archive.directory import ROGUE_CONTROL, ROGUE_FILE
 from harness.play.rogue._journal import Journal
-from harness.play.rogue._rogue import Rogue
+from harness.play.rogue._rogue import RogueLogic
 from harness.scenario.injection import MODELS, Lie
 from netem.frames import udp_broadcast
 from ucp.clock import MissionClock
@@ -38,7 +38,7 @@ class RogueNode:
     """The process of the rogue node, in the run directory. Raises OSError if a socket or a file cannot be opened."""
 
     def __init__(self, directory: Path) -> None:
-        self._rogue: Rogue | None = None
+        self._rogue: RogueLogic | None = None
         self._clock = MissionClock(1.0)
         self._timer: Timer | None = None
         self._loop = Loop()
@@ -107,7 +107,7 @@ class RogueNode:
         self._clock = MissionClock(request["speedup"])
         self._clock.start(epoch_us)
         captured = request.get("captured")
-        self._rogue = Rogue(
+        self._rogue = RogueLogic(
             request["roster"], request["seed"], epoch_us, _load_keys(Path(captured)) if captured else None
         )
         return {}

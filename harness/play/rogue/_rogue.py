@@ -86,7 +86,7 @@ class _ReceivedDatagram:
 
 
 @dataclass(slots=True)
-class _Window:
+class _ActiveInjection:
     """An injection of messages that lasts until `until`. A flood sends its next message at `next_at`."""
 
     number: int
@@ -95,7 +95,7 @@ class _Window:
     next_at: float
 
 
-class Rogue:
+class RogueLogic:
     """The state of the rogue node: received messages, active injections, and datagrams to send.
 
     `epoch_us` is mission second 0 on the agents' clocks, in microseconds. `captured` are the keys of a captured
@@ -124,7 +124,7 @@ class Rogue:
         self._known_blocks = KnownBlocks(initial_data, epoch_us)
         self._queries: dict[tuple[int, str], Request] = {}
         """(sender, type of a query) -> identification of the last sealed query, for an answer."""
-        self._windows: list[_Window] = []
+        self._windows: list[_ActiveInjection] = []
         self._waiting: list[tuple[float, int, RogueDatagram]] = []
         self._outbox: list[RogueDatagram] = []
         self._made = 0
@@ -174,7 +174,7 @@ class Rogue:
         elif isinstance(injection, Lie):
             self._lie(number, injection, now)
         else:
-            self._windows.append(_Window(number, injection, now + injection.lasts_s, now))
+            self._windows.append(_ActiveInjection(number, injection, now + injection.lasts_s, now))
             self.handle_timer(now)
 
     def next_timer(self) -> float | None:
@@ -197,7 +197,7 @@ class Rogue:
 
     # Reactions to received datagrams
 
-    def _react(self, window: _Window, received: "_ReceivedDatagram", now: float) -> None:
+    def _react(self, window: _ActiveInjection, received: "_ReceivedDatagram", now: float) -> None:
         injection, sender, datagram = window.injection, received.sender, received.datagram
         if isinstance(injection, Forgery):
             answer = None if received.message is None else self._answer(injection, received.message)
@@ -259,7 +259,7 @@ class Rogue:
         self._top_chain_hash = next_chain_hash(self._top_chain_hash, block.block_hash)
         self._forge(number, "forge", forge.sender, _crafted.forged_commit(block, self._top_chain_hash), now)
 
-    def _flood(self, window: _Window, flood: Flood, now: float) -> None:
+    def _flood(self, window: _ActiveInjection, flood: Flood, now: float) -> None:
         messages = round(flood.for_s * flood.per_s)
         for _ in range(FLOOD_BATCH):
             if self.sent[window.number] == messages or now >= window.until:

@@ -18,7 +18,7 @@ from harness.play.backend import agent_seed
 from harness.play.core_version import edited_files
 from harness.play.mission import SoughtRun
 from harness.play.simulation._crash import core_crash
-from harness.play.simulation._recurrence import Recurrence
+from harness.play.simulation._recurrence import RecurrenceSearch
 from harness.play.simulation._simulated_agent import DiskContents, OwnAgent, VirtualAgent
 from harness.play.simulation.air import DueEvent, MessageInFlight, ScheduledInput, StrayDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, LateTimers, NameOf
@@ -117,7 +117,7 @@ class EventLoop:
         """True if the sought run ended `run` while other inputs of the same instant may remain."""
         self._recent_runs: list[tuple[int, HandlerRun]] | None = None
         """Handler runs that the last change of the timeline caused. None after `run`."""
-        self._recurrence: Recurrence | None = None
+        self._recurrence: RecurrenceSearch | None = None
         """The search for a cycle, while the swarm settles."""
 
     def _shared_channel(self) -> ChannelTraffic[MessageInFlight | StrayDatagram] | None:

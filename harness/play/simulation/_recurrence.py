@@ -42,7 +42,7 @@ class AgentAtRest:
     """Mission second at which the agent's own next timer ends. None if no timer runs."""
 
 
-class Recurrence:
+class RecurrenceSearch:
     """The search for a repeated state of the swarm. The simulation calls `check` whenever no message is on its way.
 
     `delays`: minimum and maximum delay of a message, in seconds.

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from harness.play.rogue._journal import Journal
-from harness.play.rogue._rogue import Rogue
+from harness.play.rogue._rogue import RogueLogic
 from harness.play.simulation.air import StrayDatagram, VirtualAir
 from harness.scenario.changes import TimedInjection
 from netem.medium import LATENCY
@@ -33,7 +33,7 @@ class VirtualRogue:
         captured: "CapturedKeys | None" = None,
         initial_data: bytes = b"",
     ) -> None:
-        self._rogue = Rogue(roster, seed, captured=captured, initial_data=initial_data)
+        self._rogue = RogueLogic(roster, seed, captured=captured, initial_data=initial_data)
         self._roster = roster
         self._air = air
         self._number = number

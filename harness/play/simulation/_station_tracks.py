@@ -15,7 +15,7 @@ from harness.errors import ScenarioError
 from harness.scenario import Scenario
 from sitl.address import Address
 from sitl.ground_station import GroundStation
-from sitl.serial_channel import Channel
+from sitl.serial_channel import ClientChannel
 from sitl.shown_vehicle import ShownVehicle
 from sitl.streams import heartbeat
 from sitl.system_ids import system_ids
@@ -32,7 +32,7 @@ READ_BYTES = 65_536
 @dataclass
 class _Connection:
     vehicle: ShownVehicle
-    channel: Channel
+    channel: ClientChannel
     sock: socket.socket
     sent_at: float = 0.0
 
@@ -62,7 +62,7 @@ class StationTracks:
             vehicle = ShownVehicle(numbers[vehicle_id], home, epoch_us, vehicle_type, tracks[vehicle_id])
             ours, theirs = socket.socketpair()
             ours.setblocking(False)
-            shown._connections[vehicle_id] = _Connection(vehicle, Channel(vehicle), ours)
+            shown._connections[vehicle_id] = _Connection(vehicle, ClientChannel(vehicle), ours)
             await station.attach(vehicle_id, vehicle.sysid, theirs)
         return shown
 

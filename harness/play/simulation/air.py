@@ -111,7 +111,7 @@ class StrayDatagram:
     sequence: None = None
 
 
-class _Copies:
+class _BroadcastCopies:
     """The copies of a broadcast that arrive. Each is a pair of receiver and delay in seconds."""
 
     def __init__(self, copies: list[tuple[int, float]]) -> None:
@@ -125,7 +125,7 @@ class _Copies:
         return self._copies
 
 
-_UNKNOWN = _Copies([])
+_UNKNOWN = _BroadcastCopies([])
 """A placeholder for the copies of a message on a shared channel. They are known at the end of its frame."""
 
 ScheduledInput = tuple[float, int, int, MessageInFlight | DueEvent | StrayDatagram | None]
@@ -312,7 +312,7 @@ class VirtualAir:
             return
         message.sent_at = transmission.began_at
         if self._script.listens:
-            message.draws = _Copies([copy for copy in draws.to_all() if received >> copy[0] & 1])
+            message.draws = _BroadcastCopies([copy for copy in draws.to_all() if received >> copy[0] & 1])
             if self._apply_fates(at, sender, message):
                 return
         if message.rank - self._discarded_at > DISCARD_EVERY:

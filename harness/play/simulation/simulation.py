@@ -19,7 +19,7 @@ from harness.play.agent_control import Status
 from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.rogue.rogue_line import OF_NO_INJECTION, line_of
 from harness.play.simulation._event_loop import ANY_INCARNATION, EventLoop
-from harness.play.simulation._recurrence import CHECK_AFTER_S, AgentAtRest, Recurrence
+from harness.play.simulation._recurrence import CHECK_AFTER_S, AgentAtRest, RecurrenceSearch
 from harness.play.simulation._simulated_agent import DiskContents
 from harness.play.simulation.air import NEVER, StrayDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, NameOf
@@ -35,7 +35,7 @@ from sitl.track import Track
 from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
-    from harness.play._pace import Pace
+    from harness.play._pace import VirtualTimePace
     from harness.play.simulation.foreign._answer import AgentLacksError
     from harness.play.simulation.foreign._foreign_agent import IncarnationRecord
     from harness.play.simulation.foreign._virtual_program import ProgramPool
@@ -45,14 +45,14 @@ PROGRESS_S = 20.0
 """Mission seconds between two calls of `on_progress`."""
 
 
-class _AnyRun(SoughtRun):
+class _AnyHandlerRun(SoughtRun):
     """A description that matches any handler run."""
 
     def matches(self, agent_id: int, run: HandlerRun) -> bool:
         return True
 
 
-ANY_RUN = _AnyRun("any")
+ANY_RUN = _AnyHandlerRun("any")
 
 
 class Simulation(EventLoop):
@@ -67,7 +67,7 @@ class Simulation(EventLoop):
         deliver_all: bool = False,
         interactive: bool = False,
         on_progress: Callable[["Simulation"], Awaitable[None]] | None = None,
-        pace: "Pace | None" = None,
+        pace: "VirtualTimePace | None" = None,
         fate_script: Callable[[Sequence[Fate], Sequence[int], NameOf], FateScript] = FateScript,
         air: Callable[..., VirtualAir] = VirtualAir,
         programs: "ProgramPool | None" = None,
@@ -158,7 +158,7 @@ class Simulation(EventLoop):
             if self._breathe is not None:
                 await self._breathe(self)
 
-    async def _run_at(self, pace: "Pace", furthest: float) -> None:
+    async def _run_at(self, pace: "VirtualTimePace", furthest: float) -> None:
         """Play the simulation like `run`, but stop at the time that the requested speed allows."""
         allowed_s = await pace.allowed_until(self._now)
         if allowed_s is None:
@@ -261,7 +261,7 @@ class Simulation(EventLoop):
             self.played.cycle = Cycle(since_s=round(self._now, 3), proven=True, agents=agents)
         return not hanging and all(incarnation.waiting is None for incarnation in self.living())
 
-    def _new_recurrence(self) -> Recurrence | None:
+    def _new_recurrence(self) -> RecurrenceSearch | None:
         """Return a search for an endless cycle, or None if the future depends on random numbers or on further
         inputs.
         """
@@ -271,9 +271,9 @@ class Simulation(EventLoop):
         spread = self.scenario.settings.answer_spread_s > 0  # the waiting times of answers differ in each cycle
         if self._generating or moving or unknown or delays is None or self._channel is not None or spread:
             return None
-        return Recurrence(delays)
+        return RecurrenceSearch(delays)
 
-    async def _run_until_recurrence(self, mission_s: float, recurrence: Recurrence) -> bool:
+    async def _run_until_recurrence(self, mission_s: float, recurrence: RecurrenceSearch) -> bool:
         """Run until `mission_s`, or until the swarm repeats a cycle forever. Return true if it does."""
         self._recurrence = recurrence
         while self._now < mission_s:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from harness.archive.directory import RunDirectory
 from harness.errors import AgentFailedError, InterruptedRunError, MachineError, ScenarioError
 from harness.play._ground_station_check import refuse_unreachable_ground_station
-from harness.play._pace import Pace
+from harness.play._pace import VirtualTimePace
 from harness.play._vehicle_keys import require_key_packages
 from harness.play.backend import Backend
-from harness.play.progress import Progress, Snapshot
+from harness.play.progress import Progress, SwarmSnapshot
 from harness.play.simulation.air import VirtualAir
 from harness.play.simulation.foreign._answer import AgentLacksError
 from harness.play.simulation.run_files import DiskRecorder
@@ -68,7 +68,7 @@ class SimulationBackend(Backend):
         *,
         interactive: bool = False,
         delivers_all: bool = False,
-        pace: Pace | None = None,
+        pace: VirtualTimePace | None = None,
     ) -> AsyncIterator[Simulation]:
         station: StationTracks | None = None
 
@@ -85,7 +85,7 @@ class SimulationBackend(Backend):
             capture = _captures(rundir, scenario) if scenario.capture else None
             air = capture.air if capture else VirtualAir
             if scenario.gcs and pace is None:
-                pace = Pace(scenario.speedup)  # an operator could not follow unlimited time
+                pace = VirtualTimePace(scenario.speedup)  # an operator could not follow unlimited time
             simulation = Simulation(
                 scenario,
                 seed,
@@ -204,6 +204,8 @@ def _captures(rundir: RunDirectory, scenario: Scenario) -> "VirtualCapture":
         raise MachineError(f"{error.strerror}: {error.filename}") from None
 
 
-def _snapshot(simulation: Simulation) -> Snapshot:
+def _snapshot(simulation: Simulation) -> SwarmSnapshot:
     statuses = {incarnation.agent.agent_id: incarnation.agent.status() for incarnation in simulation.living()}
-    return Snapshot(simulation.stage, simulation.now(), simulation.scenario.duration_s, simulation.network, statuses)
+    return SwarmSnapshot(
+        simulation.stage, simulation.now(), simulation.scenario.duration_s, simulation.network, statuses
+    )

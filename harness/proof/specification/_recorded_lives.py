@@ -18,7 +18,7 @@ from harness.archive.vocabulary import (
     unknown_names,
 )
 from harness.checker.recorded_inputs import decoded, event_of, sealed_of, stored_blocks
-from harness.checker.steps.follower import COUNTING, OptionalParts
+from harness.checker.steps.follower import COUNTING, OptionalTraceFields
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.agent import HANDLERS, ON_TIMER, drop_reason
 from ucp.block import LATEST_US, Block, InceptionBlock, next_chain_hash
@@ -108,7 +108,7 @@ def lives(trace: Trace, header: CheckedHeader, chains: ChainNumbers, *, ended: b
 
     `ended` is true if the agent reached the end of its mission, so that its last steps are recorded.
     """
-    parts = OptionalParts.of(trace)
+    parts = OptionalTraceFields.of(trace)
     count = len(trace.starts) + 1
     for number, runs in enumerate(trace.incarnations(), 1):
         is_last = number == count
@@ -132,7 +132,7 @@ def lives(trace: Trace, header: CheckedHeader, chains: ChainNumbers, *, ended: b
 class _IncarnationEncoder:
     """Encodes the steps of one agent between two restarts."""
 
-    def __init__(self, header: CheckedHeader, parts: OptionalParts, chains: ChainNumbers) -> None:
+    def __init__(self, header: CheckedHeader, parts: OptionalTraceFields, chains: ChainNumbers) -> None:
         self._header = header
         self._parts = parts
         self._chains = chains

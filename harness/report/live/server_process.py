@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from harness.errors import HarnessError, MachineError, extra
 from harness.play.interventions import Interventions
-from harness.play.progress import Progress, Snapshot
+from harness.play.progress import Progress, SwarmSnapshot
 
 STATE_EVERY_S = 0.1
 LAST_LOOK_S = 60.0
@@ -60,7 +60,7 @@ class LivePage:
         self._ended = threading.Event()
         self._outgoing: queue.Queue[list[Any] | None] = queue.Queue(MAX_OUTGOING)
         self._readers: int | None = None
-        self._snapshot: Snapshot | None = None
+        self._snapshot: SwarmSnapshot | None = None
         self._writer, self._reader = _thread(self._write_lines), _thread(self._read_requests)
         self._state_sender = _thread(self._send_state)
         self.problem: str | None = None
@@ -70,7 +70,7 @@ class LivePage:
         """Return a progress display that forwards everything to `progress` and also updates the page."""
         return _ProgressTee(progress, self)
 
-    def set_snapshot(self, snapshot: Snapshot) -> None:
+    def set_snapshot(self, snapshot: SwarmSnapshot) -> None:
         self._snapshot = snapshot
 
     def run_is_over(self) -> bool:
@@ -183,7 +183,7 @@ class _ProgressTee:
     def __init__(self, progress: Progress, live_page: LivePage) -> None:
         self._progress, self._page = progress, live_page
 
-    def show(self, snapshot: Snapshot) -> None:
+    def show(self, snapshot: SwarmSnapshot) -> None:
         self._page.set_snapshot(snapshot)
         self._progress.show(snapshot)
 

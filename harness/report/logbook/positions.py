@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 from harness.archive.exports import ExportedBlock
 from harness.archive.run_record import RunRecord
-from harness.archive.tracks import Fix, Tracks
+from harness.archive.tracks import PositionFix, Tracks
 from harness.report.logbook.book import Logbook
 from sitl.vehicle import Home
 from ucp.events import LoggableEvent, MalformedEventsError
@@ -123,11 +123,11 @@ def recorded_tracks(record: RunRecord, recorded: Tracks) -> list[Track]:
     return [_track(vehicle, fixes, home) for vehicle, fixes in recorded.by_vehicle.items()]
 
 
-def _track(vehicle: int, fixes: Sequence[Fix], home: Home) -> Track:
+def _track(vehicle: int, fixes: Sequence[PositionFix], home: Home) -> Track:
     return Track(vehicle, [], [(round(fix.at_s * 1e6), _rounded_position(fix, home)) for fix in fixes])
 
 
-def _rounded_position(fix: Fix, home: Home) -> RoundedPosition:
+def _rounded_position(fix: PositionFix, home: Home) -> RoundedPosition:
     position = home.offset(fix.north_m, fix.east_m)
     return RoundedPosition(
         round(position.lat_deg * 1e7), round(position.lon_deg * 1e7), round((position.alt_m + fix.up_m) * 1e3)

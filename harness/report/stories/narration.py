@@ -13,8 +13,8 @@ from math import floor, inf, isfinite
 
 from harness.archive.history import has_possible_time
 from harness.archive.traces import Trace
-from harness.report.stories.story_file import Section
-from harness.report.stories.story_names import ANSWERS, INCEPTION, LocalChain, Names, message_text
+from harness.report.stories.story_file import StorySection
+from harness.report.stories.story_names import ANSWERS, INCEPTION, LocalChain, StoryNames, message_text
 from ucp.agent import HANDLERS
 from ucp.trace import HandlerRun, SentMessage
 from ucp.trigger import LocalTrigger, MessageTrigger, TimerTrigger
@@ -25,14 +25,14 @@ as punctual. A slow machine is late more often the faster it plays a mission."""
 
 
 @dataclass
-class Action:
+class AgentReaction:
     """An action of an agent: a handler run that an input triggered, with all handler runs that followed from it."""
 
     agent_id: int
     position: int
     """Index in the agent's trace."""
     runs: list[HandlerRun]
-    cause: "Action | None" = None
+    cause: "AgentReaction | None" = None
     """The action that sent the triggering message, if there was one."""
     receivers: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
     """Receivers of each sent message, by sequence number."""
@@ -82,13 +82,13 @@ class Narrator:
     def __init__(self, traces: Mapping[int, Trace], roster: Sequence[int]) -> None:
         self._traces = traces
         self._roster = roster
-        self._names = Names(traces)
+        self._names = StoryNames(traces)
         self._actions = sorted(
             (action for action in _actions_with_causes(traces) if not action.answers_another_agent),
             key=lambda action: (action.instant, action.distance, action.agent_id, action.sender or 0, action.position),
         )
 
-    def answer(self, section: Section, *, first: bool = False) -> list[str]:
+    def answer(self, section: StorySection, *, first: bool = False) -> list[str]:
         """Return the lines for one section. The first section also includes earlier actions."""
         from_s = 0 if first else section.from_s
         actions = [
@@ -99,9 +99,9 @@ class Narrator:
             lines += [f"at {instant} s", *self._instant([*of_instant])]
         return [*lines, *(self._chains(section.until_s) if section.shows_chains else [])]
 
-    def _instant(self, actions: Sequence[Action]) -> Iterator[str]:
+    def _instant(self, actions: Sequence[AgentReaction]) -> Iterator[str]:
         """Yield the lines for one moment. Agents with equal actions share their lines."""
-        equal: dict[tuple[int, int, object], list[Action]] = {}
+        equal: dict[tuple[int, int, object], list[AgentReaction]] = {}
         for action in actions:
             key = action.distance, action.agent_id, self._kind(action)
             if action.has_effect and any(other.has_effect for other in equal.get(key, ())):
@@ -113,7 +113,7 @@ class Narrator:
         for (_, lines), agents in together.items():
             yield from (f"  {_listed(agents):<10}{line}" for line in lines)
 
-    def _kind(self, action: Action) -> object:
+    def _kind(self, action: AgentReaction) -> object:
         """Return a key. Actions of one agent with equal keys are merged, because they concern the same answer.
 
         Which of several equal answers arrives first, and therefore counts, is random.
@@ -124,7 +124,7 @@ class Narrator:
         sent = action.cause.message(action.answer.sequence)
         return run.handler, message_text(sent, self._names) if sent else run.branch
 
-    def _lines(self, equal: Sequence[Action]) -> Iterator[str]:
+    def _lines(self, equal: Sequence[AgentReaction]) -> Iterator[str]:
         """Yield a line for each handler run: algorithm, name, branch, changes and messages.
 
         For merged answers, the first line lists all branches in order.
@@ -150,7 +150,7 @@ class Narrator:
         name = self._names.block(block)
         return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
 
-    def _missing_receivers(self, action: Action, sent: SentMessage) -> str:
+    def _missing_receivers(self, action: AgentReaction, sent: SentMessage) -> str:
         """Return a note about the agents that did not receive the message.
 
         An answer only matters to the agent that asked.
@@ -178,10 +178,10 @@ class Narrator:
         return ["chains", *_tree({agent_id: [INCEPTION, *chain] for agent_id, chain in chains.items()}, "  ")]
 
 
-def _actions_with_causes(traces: Mapping[int, Trace]) -> list[Action]:
+def _actions_with_causes(traces: Mapping[int, Trace]) -> list[AgentReaction]:
     """Return all actions, each with the action that caused it."""
     actions = [action for agent_id, trace in traces.items() for action in _actions(agent_id, trace)]
-    sent: dict[tuple[int, int], list[Action]] = defaultdict(list)
+    sent: dict[tuple[int, int], list[AgentReaction]] = defaultdict(list)
     for action in actions:
         for run in action.runs:
             for message in run.sent:
@@ -204,7 +204,7 @@ def _actions_with_causes(traces: Mapping[int, Trace]) -> list[Action]:
     return actions
 
 
-def _set_cause(action: Action, sent: Mapping[tuple[int, int], Sequence[Action]]) -> None:
+def _set_cause(action: AgentReaction, sent: Mapping[tuple[int, int], Sequence[AgentReaction]]) -> None:
     """Set the cause of an action that a message triggered."""
     run = action.runs[0]
     if not isinstance(run.trigger, MessageTrigger):
@@ -218,9 +218,9 @@ def _set_cause(action: Action, sent: Mapping[tuple[int, int], Sequence[Action]])
             action.at_s, action.distance = cause.at_s, cause.distance + 1
 
 
-def _actions(agent_id: int, trace: Trace) -> Iterator[Action]:
+def _actions(agent_id: int, trace: Trace) -> Iterator[AgentReaction]:
     """Yield the actions in a trace. Local events belong to the action that triggered them."""
-    action: Action | None = None
+    action: AgentReaction | None = None
     for position, run in enumerate(trace.runs):
         if not has_possible_time(run):
             continue
@@ -229,7 +229,7 @@ def _actions(agent_id: int, trace: Trace) -> Iterator[Action]:
             continue
         if action is not None:
             yield action
-        action = Action(agent_id, position, [run])
+        action = AgentReaction(agent_id, position, [run])
     if action is not None:
         yield action
 

@@ -36,7 +36,7 @@ SPEEDUP = 10.0
 
 
 @dataclass(frozen=True)
-class Section:
+class StorySection:
     """The place for the reactions after line `line` (from 0), for mission seconds from `from_s` to `until_s`."""
 
     line: int
@@ -53,7 +53,7 @@ class Story:
     text: str
     lines: Sequence[str]
     scenario: Scenario
-    sections: Sequence[Section]
+    sections: Sequence[StorySection]
 
     @property
     def in_virtual_time(self) -> Scenario:
@@ -156,14 +156,14 @@ def _gap(lines: Sequence[str]) -> list[str]:
     return [""] if _SENTENCE.fullmatch(lines[-1]) else []
 
 
-def _sections(sentences: Sequence[tuple[int, int, bool]]) -> list[Section]:
+def _sections(sentences: Sequence[tuple[int, int, bool]]) -> list[StorySection]:
     """Return one section for each second, placed after the last sentence of that second."""
     last = {
         at_s: (line, any(chains for _, other_s, chains in sentences if other_s == at_s)) for line, at_s, _ in sentences
     }
     seconds = [*last]
     return [
-        Section(line, at_s, until_s, chains)
+        StorySection(line, at_s, until_s, chains)
         for (at_s, (line, chains)), until_s in zip(last.items(), [*seconds[1:], None], strict=True)
     ]
 

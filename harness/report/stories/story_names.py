@@ -58,7 +58,7 @@ def _digest(block_hash: str) -> bytes:
         return b""
 
 
-class Names:
+class StoryNames:
     """Names of blocks as in the figures of the thesis. A chain is named by its blocks."""
 
     def __init__(self, traces: Mapping[int, Trace]) -> None:
@@ -139,7 +139,7 @@ _FORMATS: dict[type[Message], Callable[[Any, NameSource], str]] = {
 }
 
 
-def message_text(sent: SentMessage, names: Names) -> str:
+def message_text(sent: SentMessage, names: StoryNames) -> str:
     """Return the text of a message in a trace."""
     if sent.datagram is None:
         return f"{sent.message} (not recorded)"

@@ -12,7 +12,7 @@ from harness.errors import VIOLATED, HarnessError, InterruptedRunError, Unsuppor
 from harness.gc_pause import gc_paused
 from harness.play.backends import BACKENDS
 from harness.play.mission import RunOutcome
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.proof.coverage import CoverageWatcher, ReachedStates, reached_in
 from harness.proof.coverage.reached import simulate_watched
 from harness.run.run import run
@@ -118,7 +118,7 @@ class Player:
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # remains of an interrupted run
         try:
-            finished = run(scenario, task.seed, directory, Silent(), task.point.backend)
+            finished = run(scenario, task.seed, directory, SilentProgress(), task.point.backend)
         except HarnessError as error:  # errors that every run would have were found by `refuse`
             raise RunFailedError(f"{error}; see {directory}") from None
         if finished.played.outcome == "interrupted":

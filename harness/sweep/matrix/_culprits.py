@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 
 from harness.archive.archive import RunArchive
 from harness.errors import HarnessError
-from harness.field.bisection import Subject, UntestableError, Workshop
-from harness.run.code_state import History, SuspectCommits
+from harness.field.bisection import BisectionSubject, SubjectPlayer, UntestableError
+from harness.run.code_state import GitBisection, SuspectCommits
 from harness.run.provenance import MODIFIED, ROOT
 from harness.sweep.matrix._comparison import Change, Culprit, CulpritCommit
 from harness.sweep.matrix._estimate import BY_NAME, Metric
@@ -84,11 +84,11 @@ class _Search:
             raise HarnessError("the baseline or tonight's code is not a commit of a repository, so no commit is named")
         self._culprit, self._deadline, self._report_progress = culprit, deadline, report_progress
         self._metric: Metric = BY_NAME[culprit.metric]
-        self._history = History.clone(ROOT, directory / "code")
+        self._history = GitBisection.clone(ROOT, directory / "code")
         plays = directory / "plays"
         plays.mkdir()
-        subject = Subject(plays, tonight.matrix.scenario_at(culprit.point), culprit.seed)
-        self._workshop = Workshop(subject, plays, limit_s=LIMIT_S)
+        subject = BisectionSubject(plays, tonight.matrix.scenario_at(culprit.point), culprit.seed)
+        self._workshop = SubjectPlayer(subject, plays, limit_s=LIMIT_S)
         self._figures: dict[str, float | None] = {}
 
     def run(self) -> None:

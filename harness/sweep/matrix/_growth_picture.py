@@ -13,7 +13,7 @@ from markupsafe import Markup
 from harness.backend_names import BackendName
 from harness.present import svg
 from harness.present import text as words
-from harness.present.svg import Area, Axis
+from harness.present.svg import Axis, ChartArea
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import Estimate
 from harness.sweep.matrix._growth import Growth
@@ -201,7 +201,7 @@ def _name(matrix: Matrix, losses: Sequence[float], place: LineKey) -> str:
     )
 
 
-def _panel(record: MatrixRecord, panel: Panel, area: Area) -> Markup:
+def _panel(record: MatrixRecord, panel: Panel, area: ChartArea) -> Markup:
     lines = _lines(record, panel)
     across, up = _across(panel, lines, area), _up(panel, lines, area)
     frame = svg.frame(
@@ -251,7 +251,7 @@ def _ends(panel: Panel, line: PanelLine) -> list[tuple[float, float]]:
     return [(x, line.law.factor * x**power) for x in (min(xs), max(xs))]
 
 
-def _across(panel: Panel, lines: Sequence[PanelLine], area: Area) -> Axis:
+def _across(panel: Panel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
     """Return the horizontal axis. For numbers of agents, its ticks are these numbers if there is enough space."""
     xs = sorted({x for line in lines for cell in line.cells if (x := _x(panel, cell))}) or [1.0, 10.0]
     if panel.over == "blocks":
@@ -264,7 +264,7 @@ def _across(panel: Panel, lines: Sequence[PanelLine], area: Area) -> Axis:
     return replace(axis, ticks=ticks)
 
 
-def _up(panel: Panel, lines: Sequence[PanelLine], area: Area) -> Axis:
+def _up(panel: Panel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
     if panel.shares:
         return svg.share_axis(area.up)
     ys = [y for line in lines for cell in line.cells if (y := _y(panel, cell))]

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from harness.play.backends import in_virtual_time
 from harness.present import svg, text
-from harness.present.svg import Area, Axis, n
+from harness.present.svg import Axis, ChartArea, n
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import BY_NAME, Estimate
 from harness.sweep.matrix.matrix_record import MatrixRecord
@@ -60,7 +60,7 @@ class PlacedPanel:
 
     id: str
     panel: Panel
-    area: Area
+    area: ChartArea
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,14 +200,14 @@ def curve(number: int, dots: Sequence[Dot], across: Axis, up: Axis) -> tuple[Mar
     return Markup("").join(parts), points
 
 
-def _loss_axis(losses: Sequence[float], area: Area) -> Axis:
+def _loss_axis(losses: Sequence[float], area: ChartArea) -> Axis:
     first, last = min(losses, default=0.0), max(losses, default=1.0)
     if first == last:
         first, last = max(0.0, first - 0.05), min(1.0, last + 0.05)
     return svg.linear_axis(first, last, area.across)
 
 
-def _value_axis(panel: Panel, cells: Sequence[Cell], area: Area) -> Axis:
+def _value_axis(panel: Panel, cells: Sequence[Cell], area: ChartArea) -> Axis:
     """Return a vertical axis from 0 to the first tick above all means and nearly all confidence intervals."""
     if panel.shares:
         return svg.share_axis(area.up)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.errors import MachineError
-from harness.present.junit import Case, to_xml
+from harness.present.junit import JunitCase, to_xml
 from harness.scenario.verdict_names import ALL_CHECKS, CHARACTERISTICS, FURTHER_CHECKS
 from harness.sweep.matrix._cell import Cell, Run
 from harness.sweep.matrix._cell_scenarios import write_scenarios
@@ -46,20 +46,20 @@ def to_junit(record: MatrixRecord) -> str:
     return to_xml(record.matrix.name, "matrix", record.started_at, record.wall_s, _cases(record))
 
 
-def _cases(record: MatrixRecord) -> Iterator[Case]:
+def _cases(record: MatrixRecord) -> Iterator[JunitCase]:
     cells = {cell.point: cell for cell in record.cells}
     for point in record.matrix.points:
         name, cell = name_of(record.matrix, point), cells.get(point)
         if wrong := list(troubles(record, cell)) if cell else []:
-            yield Case(name, wrong)
+            yield JunitCase(name, wrong)
         elif lacking := list(unsupported(record, cell)) if cell else []:
-            yield Case(name, skipped="; ".join(lacking))
+            yield JunitCase(name, skipped="; ".join(lacking))
         elif cell is None or cell.runs < len(record.matrix.seed_list):
             ended = cell.runs if cell else 0
             why = "the time was used up" if record.outcome == "completed" else "interrupted"
-            yield Case(name, skipped=f"{why}: {ended} of {len(record.matrix.seed_list)} runs had ended")
+            yield JunitCase(name, skipped=f"{why}: {ended} of {len(record.matrix.seed_list)} runs had ended")
         else:
-            yield Case(name)
+            yield JunitCase(name)
 
 
 def write(finished: Finished, directory: Path, nights: Nights | None = None) -> None:

@@ -9,7 +9,7 @@ from harness.errors import HarnessError
 from harness.field.depot.collected_exports import collect_exports
 from harness.field.depot.consolidation import consolidate
 from harness.field.depot.mission_comparison import compare
-from harness.field.depot.mission_files import Plan, write
+from harness.field.depot.mission_files import MissionPlan, write
 from harness.field.depot.record_outputs import in_words, lines, table, tracks
 from tests.fuzz.finding import sound
 from tests.fuzz.targets.home import sound_run
@@ -56,6 +56,6 @@ def _consolidate(paths: list[Path]) -> None:
 def seeds(flown: Path) -> Iterator[bytes]:
     yield (flown / "agents" / "1.chain.json").read_bytes()
     with TemporaryDirectory() as directory:
-        for path in write(Plan(scenario(agents=3), b"fuzz"), Path(directory)):
+        for path in write(MissionPlan(scenario(agents=3), b"fuzz"), Path(directory)):
             if path.name in _NAMES.values():
                 yield path.read_bytes()

@@ -20,7 +20,7 @@ from harness.field.adapters.csv_adapter import CsvAdapter
 from harness.field.adapters.imported_records import FILE, ImportRecord
 from harness.field.adapters.rosbag_adapter import RosBag
 from harness.field.ingest import IngestResult, ingest_files
-from harness.field.replay import Player, open_record
+from harness.field.replay import RecordPlayer, open_record
 from tests.fuzz.finding import require, sound
 from tests.harness.field.flights import flown
 
@@ -150,7 +150,7 @@ def _import(path: Path, out: Path) -> bool:
 def _replay(path: Path) -> None:
     try:
         record = open_record(path)
-        Player(record).to_end()
+        RecordPlayer(record).to_end()
     except HarnessError as error:
         sound(str(error))
         return

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness.play.keyring.inspection import in_words, inspect
-from harness.play.keyring.key_directory import Home, KeysError, load_depot_key
+from harness.play.keyring.key_directory import KeyDirectory, KeysError, load_depot_key
 from tests.fuzz.finding import require, sound
 from ucp.secure.bundle import load_bundle, write_bundle
 from ucp.secure.keyfile import KeyFileError
@@ -24,7 +24,7 @@ def _home() -> Path:
     """Return a directory with the keys of three vehicles, one of which is excluded."""
     home = Path(_GOOD.name) / "home"
     if not home.exists():
-        made = Home.new(home, [1, 7, 28], seals=True, epoch_s=600.0)
+        made = KeyDirectory.new(home, [1, 7, 28], seals=True, epoch_s=600.0)
         made.write_bundles(home, [7])
         made.revoke([28])
     return home
@@ -42,7 +42,7 @@ def run(data: bytes) -> None:
 
 def _read(home: Path, path: Path) -> None:
     """Read a key file in the same way as all commands."""
-    kept = Home(home)
+    kept = KeyDirectory(home)
     for read in (lambda: inspect(path), lambda: kept.bundles(), lambda: kept.revoke([1]), lambda: load_depot_key(home)):
         try:
             told = read()

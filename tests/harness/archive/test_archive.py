@@ -14,7 +14,7 @@ from harness import checker
 from harness.archive import archive as archive_module
 from harness.archive.archive import RunArchive
 from harness.errors import HarnessError, RunDirectoryError
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.report import logbook, read_source, write_report
 from harness.report.difference import compare
 from harness.run.run import run
@@ -31,7 +31,7 @@ FILES = [
 def intact_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Play a run of three agents in virtual time."""
     asked = scenario(agents=3, duration_s=300, network={"loss": 0.3})
-    return run(asked, 3, tmp_path_factory.mktemp("whole") / "run", Silent(), backend="sim").directory
+    return run(asked, 3, tmp_path_factory.mktemp("whole") / "run", SilentProgress(), backend="sim").directory
 
 
 def delete(path: Path, _: float) -> None:

@@ -12,7 +12,7 @@ from harness.archive.replication import Replication, replication_of
 from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Header, Trace
 from harness.checker.uniform_chain import common_prefix
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
@@ -225,7 +225,7 @@ def test_block_on_a_lost_disk_is_no_copy(disk: Any, copies: list[int]) -> None:
 
 
 def test_skimmed_large_traces_give_the_same_history(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ran = run(scenario(**ROUGH), 5, tmp_path / "run", Silent(), backend="sim")
+    ran = run(scenario(**ROUGH), 5, tmp_path / "run", SilentProgress(), backend="sim")
     all_of_it = RunArchive(ran.directory)
     whole = all_of_it.traces
     assert not all_of_it.large
@@ -245,7 +245,7 @@ def test_skimmed_large_traces_give_the_same_history(tmp_path: Path, monkeypatch:
 
 
 def test_invalid_or_foreign_trace_is_left_out_and_reported(tmp_path: Path) -> None:
-    ran = run(scenario(agents=3, duration_s=60), 1, tmp_path / "run", Silent(), backend="sim")
+    ran = run(scenario(agents=3, duration_s=60), 1, tmp_path / "run", SilentProgress(), backend="sim")
     agents = ran.directory / "agents"
     (agents / "8.trace.jsonl").write_text("[" * 100_000)
     (agents / "9.trace.jsonl").write_bytes((agents / "1.trace.jsonl").read_bytes())

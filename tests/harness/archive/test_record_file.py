@@ -11,7 +11,7 @@ from harness import checker
 from harness.archive.archive import RunArchive
 from harness.archive.record_file import DamagedRecordError, RecordFile, read_record, validate_leniently
 from harness.archive.run_record import RunRecord
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.mission import edit
 from tests.harness.virtual import scenario
@@ -22,7 +22,7 @@ from ucp.plain_file import MAX_JSON_WEIGHT
 def intact_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Play a run in virtual time in which a vehicle is lost."""
     asked = scenario(agents=3, duration_s=300, timeline=[{"at_s": 100, "kill": [3]}])
-    return run(asked, 3, tmp_path_factory.mktemp("whole") / "run", Silent(), backend="sim").directory
+    return run(asked, 3, tmp_path_factory.mktemp("whole") / "run", SilentProgress(), backend="sim").directory
 
 
 def edited(intact_run: Path, tmp_path: Path, change: Any) -> RecordFile:

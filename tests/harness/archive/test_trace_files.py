@@ -13,7 +13,7 @@ from harness.archive import trace_files
 from harness.archive.archive import RunArchive
 from harness.archive.trace_files import pack_traces
 from harness.field.depot.mission_comparison import compare
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.command import harness
 from tests.harness.report.live.runs import film
@@ -33,7 +33,7 @@ def names(directory: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run(ASKED, 1, tmp_path_factory.mktemp("plain") / "run", Silent(), "sim").directory
+    return run(ASKED, 1, tmp_path_factory.mktemp("plain") / "run", SilentProgress(), "sim").directory
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def packed(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 def test_run_packs_only_large_traces(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert names(plain) == NAMES
     monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 100_000)
-    large = run(ASKED, 1, tmp_path / "run", Silent(), "sim").directory
+    large = run(ASKED, 1, tmp_path / "run", SilentProgress(), "sim").directory
     assert names(large) == [f"{name}.gz" for name in NAMES]
     for name in NAMES:
         assert gzip.decompress((large / "agents" / f"{name}.gz").read_bytes()) == (plain / "agents" / name).read_bytes()

@@ -8,7 +8,7 @@ import pytest
 
 from harness.archive import bounded_file
 from harness.archive.directory import TRACKS_FILE
-from harness.archive.tracks import Fix, read_tracks
+from harness.archive.tracks import PositionFix, read_tracks
 
 GOOD = {"at_s": 1.0, "places": {"1": [10.0, 20.0, 5.0], "2": [-1, 0, 0]}}
 
@@ -22,17 +22,20 @@ def tracks_file(directory: Path, *lines: str | dict[str, Any]) -> Path:
 def test_fixes_are_sorted_by_time(tmp_path: Path) -> None:
     later = {"at_s": 2.0, "places": {"1": [12.0, 24.0, 5.0]}}
     tracks = read_tracks(tracks_file(tmp_path, later, GOOD), [1, 2, 3])
-    assert tracks.by_vehicle == {1: [Fix(1.0, 10.0, 20.0, 5.0), Fix(2.0, 12.0, 24.0, 5.0)], 2: [Fix(1.0, -1.0, 0.0)]}
+    assert tracks.by_vehicle == {
+        1: [PositionFix(1.0, 10.0, 20.0, 5.0), PositionFix(2.0, 12.0, 24.0, 5.0)],
+        2: [PositionFix(1.0, -1.0, 0.0)],
+    }
     assert tracks.problems == []
 
 
 def test_position_is_interpolated_between_fixes_only(tmp_path: Path) -> None:
     later = {"at_s": 3.0, "places": {"1": [20.0, 0.0, 5.0]}}
     tracks = read_tracks(tracks_file(tmp_path, GOOD, later), [1, 2])
-    assert tracks.at(1, 1.5) == Fix(1.5, 12.5, 15.0, 5.0)
-    assert tracks.at(1, 0.0) == Fix(0.0, 10.0, 20.0, 5.0)
-    assert tracks.at(1, 3.0) == Fix(3.0, 20.0, 0.0, 5.0)
-    assert tracks.at(1, 9.0) == Fix(9.0, 20.0, 0.0, 5.0)
+    assert tracks.at(1, 1.5) == PositionFix(1.5, 12.5, 15.0, 5.0)
+    assert tracks.at(1, 0.0) == PositionFix(0.0, 10.0, 20.0, 5.0)
+    assert tracks.at(1, 3.0) == PositionFix(3.0, 20.0, 0.0, 5.0)
+    assert tracks.at(1, 9.0) == PositionFix(9.0, 20.0, 0.0, 5.0)
 
 
 def test_missing_file_has_no_tracks(tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ from harness.archive.traces import Trace
 from harness.archive.vocabulary import MESSAGES, OPERATIONS, TIMERS, VOTES
 from harness.checker import Evidence, check
 from harness.checker.survival import in_words, survival
-from harness.field.replay import Player, open_record
-from harness.play.progress import Silent
+from harness.field.replay import RecordPlayer, open_record
+from harness.play.progress import SilentProgress
 from harness.report._run_page import write_report
 from harness.run.run import run
 from harness.run.simulate import simulate
@@ -215,7 +215,7 @@ def test_losses_are_unknown_if_completed_blocks_are_unknown(honest: Evidence) ->
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a run in which agent 1 uses undefined names for its voting timer, a branch, and a completed block."""
     path = tmp_path_factory.mktemp("run") / "run"
-    assert not run(scenario(**EVENTFUL), 3, path, Silent(), "sim").result.bad
+    assert not run(scenario(**EVENTFUL), 3, path, SilentProgress(), "sim").result.bad
     for agent, old, new in (
         (1, '{"timer":"voting"}', '{"timer":"vote"}'),
         (3, '"branch":"building"', '"branch":"builds"'),
@@ -237,7 +237,7 @@ def test_report_names_the_steps_that_it_omits(directory: Path) -> None:
 
 @pytest.mark.parametrize(("agent", "because"), [(1, "unknown timer name 'vote'"), (3, "unknown branch 'builds' of")])
 def test_replay_reports_no_violation_for_an_unknown_name(directory: Path, agent: int, because: str) -> None:
-    found = Player(open_record(directory / "agents" / f"{agent}.trace.jsonl")).to_end()
+    found = RecordPlayer(open_record(directory / "agents" / f"{agent}.trace.jsonl")).to_end()
     assert not found.deviations
     assert found.steps
     assert found.unjudged

@@ -10,7 +10,7 @@ import pytest
 
 from harness.archive.archive import RunArchive
 from harness.checker import Result, check, gather
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.mission import edit
 from tests.harness.virtual import scenario
@@ -58,7 +58,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         events=OFTEN,
         timeline=[{"at_s": 60, "kill": [3]}, {"at_s": 80, "restart": [3]}],
     )
-    return run(asked, 1, tmp_path_factory.mktemp("whole") / "run", Silent(), backend="sim", delivers_all=True).directory
+    return run(
+        asked, 1, tmp_path_factory.mktemp("whole") / "run", SilentProgress(), backend="sim", delivers_all=True
+    ).directory
 
 
 def judged(directory: Path, tmp_path: Path, agent: int, more: int, unread: int = 0, others: int = 0) -> Result:
@@ -93,7 +95,7 @@ def test_agent_that_discards_every_tenth_datagram_is_found(tmp_path: Path) -> No
             {"at_s": 40, "restart": [4]},
         ],
     )
-    found = run(asked, 1, tmp_path / "run", Silent(), backend="process").result
+    found = run(asked, 1, tmp_path / "run", SilentProgress(), backend="process").result
     records = found.beside["records"]
     assert records.verdict == "contradict"
     assert {finding.agent_id for finding in records.evidence} == {2}
@@ -125,7 +127,7 @@ def test_agent_that_stops_reading_is_found(tmp_path: Path) -> None:
         agent_command={2: [sys.executable, str(program)]},
         timeline=[{"at_s": 30, "kill": [3]}, {"at_s": 50, "restart": [3]}],
     )
-    records = run(asked, 1, tmp_path / "run", Silent(), backend="process").result.beside["records"]
+    records = run(asked, 1, tmp_path / "run", SilentProgress(), backend="process").result.beside["records"]
     assert records.verdict == "contradict"
     assert {finding.agent_id for finding in records.evidence} == {2}
     assert "were left unread in its socket" in records.evidence[0].detail

@@ -15,7 +15,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.lag import LAG_FILE, LagLine, MeasuredLag
 from harness.checker import check, gather
 from harness.checker.judgement import Judgement
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import Run, run
 from tests.harness.mission import edit, edit_lines
 from tests.harness.virtual import scenario
@@ -37,7 +37,7 @@ sys.exit(node.main(sys.argv[1:]))
 def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Play a run whose headers state a voting timer of 10 s, while agents vote for half a second longer."""
     asked = scenario(agents=3, duration_s=150, events=OFTEN, settings={"vote_timeout_s": 10 + LATE_S})
-    directory = run(asked, 1, tmp_path_factory.mktemp("late") / "run", Silent(), backend="sim").directory
+    directory = run(asked, 1, tmp_path_factory.mktemp("late") / "run", SilentProgress(), backend="sim").directory
 
     def claim_ten_seconds(lines: list[dict[str, Any]]) -> None:
         lines[0]["settings"]["vote_timeout_s"] = 10.0
@@ -127,7 +127,7 @@ def busy_machine() -> Iterator[None]:
 
 def played(tmp_path: Path, **keys: Any) -> Run:
     asked = scenario(agents=3, duration_s=80, speedup=20, vehicles={"kind": "none"}, events=OFTEN, **keys)
-    return run(asked, 1, tmp_path / "run", Silent(), backend="process")
+    return run(asked, 1, tmp_path / "run", SilentProgress(), backend="process")
 
 
 @pytest.mark.lab

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from harness.archive.archive import RunArchive
 from harness.checker import Result, check, gather
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.virtual import scenario
 from ucp.block import next_chain_hash
@@ -40,7 +40,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ],
         final_reconcile=True,
     )
-    return run(asked, 3, tmp_path_factory.mktemp("whole") / "run", Silent(), backend="sim").directory
+    return run(asked, 3, tmp_path_factory.mktemp("whole") / "run", SilentProgress(), backend="sim").directory
 
 
 @pytest.fixture
@@ -232,7 +232,7 @@ def test_missing_fault_is_found(directory: Path) -> None:
 
 def test_trace_of_another_run_is_found(directory: Path, tmp_path: Path) -> None:
     asked = scenario(agents=3, duration_s=300, events={"source": "random", "mean_s": 5})
-    other = run(asked, 4, tmp_path / "other", Silent(), backend="sim").directory
+    other = run(asked, 4, tmp_path / "other", SilentProgress(), backend="sim").directory
     shutil.copy(trace(other, 2), trace(directory, 2))
     result = judged(directory)
     assert "1" in contradicted(result)
@@ -241,7 +241,7 @@ def test_trace_of_another_run_is_found(directory: Path, tmp_path: Path) -> None:
 
 def test_appended_trace_of_another_run_is_not_read(directory: Path, tmp_path: Path) -> None:
     asked = scenario(agents=3, duration_s=100)
-    other = run(asked, 4, tmp_path / "other", Silent(), backend="sim").directory
+    other = run(asked, 4, tmp_path / "other", SilentProgress(), backend="sim").directory
     lines = len(trace(directory, 2).read_bytes().splitlines())
     with trace(directory, 2).open("ab") as file:
         file.write(trace(other, 2).read_bytes())
@@ -277,7 +277,7 @@ def test_file_of_a_gigabyte_is_not_read(directory: Path, name: str) -> None:
 
 def test_captures_show_messages_that_a_trace_lacks(tmp_path: Path) -> None:
     asked = scenario(agents=3, duration_s=200, capture=True, events={"source": "random", "mean_s": 5})
-    directory = run(asked, 1, tmp_path / "run", Silent(), backend="sim").directory
+    directory = run(asked, 1, tmp_path / "run", SilentProgress(), backend="sim").directory
     assert judged(directory).beside["records"].verdict == "agree"
     (directory / "run.json").unlink()  # it also contains the number of sent messages
 
@@ -390,7 +390,7 @@ def test_counters_of_the_kernel_are_compared_with_traces(
     tmp_path: Path, passed: int, lost: int, sentence: str | None
 ) -> None:
     asked = scenario(agents=3, duration_s=200, events={"source": "random", "mean_s": 5})
-    directory = run(asked, 1, tmp_path / "run", Silent(), backend="sim").directory
+    directory = run(asked, 1, tmp_path / "run", SilentProgress(), backend="sim").directory
     sent = {agent: sum(len(step.get("sent", ())) for step in lines(trace(directory, agent))) for agent in (1, 2, 3)}
 
     def count(document: Document) -> None:

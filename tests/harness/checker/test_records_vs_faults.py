@@ -13,7 +13,7 @@ import pytest
 
 from harness.archive.archive import RunArchive
 from harness.checker import check, gather
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.virtual import scenario
 
@@ -39,7 +39,7 @@ def unaltered(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ],
         final_reconcile=True,
     )
-    return run(asked, 3, tmp_path_factory.mktemp("unaltered") / "run", Silent(), backend="sim").directory
+    return run(asked, 3, tmp_path_factory.mktemp("unaltered") / "run", SilentProgress(), backend="sim").directory
 
 
 @pytest.fixture

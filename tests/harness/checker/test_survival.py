@@ -11,7 +11,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.run_record import Loss, Survival
 from harness.checker import Evidence, gather
 from harness.checker.survival import in_words, survival
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import simulate
 from harness.scenario import load_scenario
@@ -128,7 +128,7 @@ def test_survival_is_described_in_words() -> None:
 
 def test_attrition_scenario_shows_survival_also_from_its_directory(tmp_path: Path) -> None:
     one = load_scenario(ATTRITION)
-    finished = run(one, 2, tmp_path / "run", Silent(), "sim")
+    finished = run(one, 2, tmp_path / "run", SilentProgress(), "sim")
     assert finished.exit_status == 0
     assert [(loss.what, loss.vehicles) for loss in finished.survival.losses] == [
         ("kill", [2]),

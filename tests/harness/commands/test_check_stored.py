@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run import provenance
 from harness.run.code_state import ROOT
 from harness.run.run import run
@@ -22,7 +22,7 @@ from tests.harness.virtual import scenario
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     asked = scenario(agents=3, duration_s=100, events={"source": "random", "mean_s": 5})
-    return run(asked, 1, tmp_path_factory.mktemp("stored") / "run", Silent(), backend="sim").directory
+    return run(asked, 1, tmp_path_factory.mktemp("stored") / "run", SilentProgress(), backend="sim").directory
 
 
 @pytest.fixture

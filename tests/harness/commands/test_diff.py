@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from harness.errors import RunDirectoryError
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.report.difference import AgentDifference, ChainDifference, KeyDifference, compare
 from harness.report.difference._run_difference import differing_keys
 from harness.run.run import run
@@ -26,7 +26,7 @@ SAME = AgentDifference(None, None)
 
 def fly(out: Path, seed: int = 1, **keys: Any) -> Path:
     """Play a run in virtual time. By default, three agents run for five minutes."""
-    run(scenario(**{"agents": 3, "duration_s": 300, **keys}), seed, out, Silent(), "sim")
+    run(scenario(**{"agents": 3, "duration_s": 300, **keys}), seed, out, SilentProgress(), "sim")
     return out
 
 
@@ -56,8 +56,8 @@ def test_runs_of_the_same_seed_are_identical(a: Path, tmp_path: Path) -> None:
 def test_diff_finds_the_one_lost_commit(tmp_path: Path) -> None:
     lossy = load_scenario(LOST_LAST_COMMIT)
     without, with_it = tmp_path / "a", tmp_path / "b"
-    run(lossy, 1, without, Silent(), "sim")
-    run(lossy.model_copy(update={"fates": []}), 1, with_it, Silent(), "sim")
+    run(lossy, 1, without, SilentProgress(), "sim")
+    run(lossy.model_copy(update={"fates": []}), 1, with_it, SilentProgress(), "sim")
     found = compare(without, with_it)
     assert (found.verdict, found.first) == ("differ", 2)
     assert [(one.key, one.b) for one in found.keys] == [("fates", [])]

@@ -11,7 +11,7 @@ from harness import checker, cli
 from harness.archive.archive import RunArchive
 from harness.errors import InterruptedRunError
 from harness.play import progress
-from harness.play.progress import ProgressLines, Silent
+from harness.play.progress import ProgressLines, SilentProgress
 from harness.run.run import run
 from tests.harness.command import sentences
 from tests.harness.virtual import scenario
@@ -19,7 +19,7 @@ from tests.harness.virtual import scenario
 SWARM = scenario(agents=3, duration_s=100)
 
 
-class Judged(Silent):
+class Judged(SilentProgress):
     """A display that records the steps of the checker. It can press Ctrl-C at one of them."""
 
     def __init__(self, interrupted_at: str | None = None) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.command import Running, harness, sentences, write_scenario
 from tests.harness.mission import edit
@@ -20,7 +20,7 @@ WRITTEN = ("report.html", "report.md", "junit.xml", "chains.svg")
 @pytest.fixture
 def run_dir(tmp_path: Path) -> Path:
     out = tmp_path / "run"
-    run(scenario(agents=3, duration_s=300), 1, out, Silent(), "sim")
+    run(scenario(agents=3, duration_s=300), 1, out, SilentProgress(), "sim")
     return out
 
 

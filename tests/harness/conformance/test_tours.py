@@ -4,7 +4,7 @@ import asyncio
 import time
 
 from harness.conformance._agent_under_test import AgentUnderTest
-from harness.conformance._alphabet import Input
+from harness.conformance._alphabet import AgentInput
 from harness.conformance._observation import Observation, RecordedDatagram
 from harness.conformance._state_space import VARIANTS, SettingsVariant, advance, explore, key_of, state_of
 from harness.conformance._suite import VectorSuite
@@ -32,7 +32,7 @@ class AgentOnLateMachine(AgentUnderTest):
         self._alone = alone
         self._now = 0.0
 
-    async def _step(self, given: Input) -> Observation | None:
+    async def _step(self, given: AgentInput) -> Observation | None:
         before = state_of(self.model)
         advanced = advance(self.model, given, self._now)
         if advanced is None:

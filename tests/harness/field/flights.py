@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.virtual import scenario
 
@@ -11,7 +11,7 @@ from tests.harness.virtual import scenario
 def flown(directory: Path, seed: int = 1, **keys: Any) -> Path:
     """Write the directory of a run of a few minutes. `keys` are additional keys of the scenario."""
     mission = {"agents": 3, "duration_s": 400, "network": {"loss": 0.2}, **keys}
-    return run(scenario(**mission), seed, directory, Silent(), "sim").directory
+    return run(scenario(**mission), seed, directory, SilentProgress(), "sim").directory
 
 
 def trace_of(directory: Path, agent: int) -> Path:

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.calibrating import calibrated, covered
 from harness.errors import FieldError
-from harness.field.calibrate._delivery_model import Attempt, DeliveryModel, fit, student
+from harness.field.calibrate._delivery_model import DeliveryModel, TransmissionAttempt, fit, student
 from harness.field.calibrate.calibration import Calibration, calibrate, model_of, validate
 from harness.scenario import Scenario
 from harness.scenario.load import load_scenario
@@ -22,7 +22,9 @@ TRUTH = DeliveryModel(range_m=400.0, spread=0.4, floor=0.05)
 EPOCH_US = 1_790_000_000_000_000
 
 
-def attempts(seed: int, number: int = 1500, truth: DeliveryModel = TRUTH, lasting: int = 1) -> list[Attempt]:
+def attempts(
+    seed: int, number: int = 1500, truth: DeliveryModel = TRUTH, lasting: int = 1
+) -> list[TransmissionAttempt]:
     """Draw random transmissions over six links. `lasting` messages of a link share their shadowing."""
     rng, drawn = Random(seed), []
     for block in range(number // lasting):
@@ -30,7 +32,7 @@ def attempts(seed: int, number: int = 1500, truth: DeliveryModel = TRUTH, lastin
         distance_m = math.exp(rng.uniform(math.log(50), math.log(1500)))
         for _ in range(lasting):
             arrives = truth.spread * deviation < math.log(truth.range_m / distance_m) and rng.random() > truth.floor
-            drawn.append(Attempt(block * lasting * 1200 / number, 0, 1 + link, distance_m, arrives))
+            drawn.append(TransmissionAttempt(block * lasting * 1200 / number, 0, 1 + link, distance_m, arrives))
             deviation = deviation if lasting > 1 else rng.gauss(0, 1)
     return drawn
 

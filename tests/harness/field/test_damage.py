@@ -17,7 +17,7 @@ from harness.checker.lost_lines import lost_lines
 from harness.checker.missing_incarnations import may_be_of_missing_incarnation
 from harness.checker.steps.trace_header import checked
 from harness.field.ingest import ingest_files
-from harness.field.replay import Player, open_record
+from harness.field.replay import RecordPlayer, open_record
 from harness.field.replay.field_evidence import field_evidence
 from tests.harness.field.flights import flown, trace_of
 from tests.harness.virtual import scenario
@@ -141,7 +141,7 @@ def test_replay_of_trace_without_any_one_line_finds_no_deviation(run: Path) -> N
     path = trace_of(run, 1)
     lines = len(path.read_bytes().splitlines())
     for number in range(2, min(lines, 60), 3):
-        found = Player(open_record(_without(path, number))).to_end()
+        found = RecordPlayer(open_record(_without(path, number))).to_end()
         assert [deviation.sentence(str) for deviation in found.deviations] == [], number
 
 
@@ -168,7 +168,7 @@ def test_lost_timer_callback_is_named_before_its_effects(run: Path, tmp_path: Pa
     agent.add_event(LoggableEvent(100, 1, bytes(200)), number + header.settings.vote_timeout_s + 0.5)
     lines = [trace.header.to_line(), *(entry.to_line() for entry in agent.trace())]
     (tmp_path / "1.trace.jsonl").write_text("".join(lines))
-    found = Player(open_record(tmp_path)).to_end()
+    found = RecordPlayer(open_record(tmp_path)).to_end()
     assert found.first is not None
     assert "Algorithm 5, vote_timer_expiration: it did not run, although the voting timer was due at" in (
         found.first.sentence(str)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.field.replay import Player, open_record
+from harness.field.replay import RecordPlayer, open_record
 from tests.harness.command import DEADLINE_S
 from tests.harness.field.dap import Ide
 from tests.harness.field.flights import flown, trace_of
@@ -30,7 +30,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def expected(record: Path) -> tuple[float, int]:
     """Return the mission second at which the agent first reaches the line, and the length of its chain then."""
-    player = Player(open_record(record))
+    player = RecordPlayer(open_record(record))
     while not player.at_end:
         entry = player.forward()
         if getattr(entry.content, "branch", "") in ("block", "tie: block"):

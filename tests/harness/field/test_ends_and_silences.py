@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from benchmarks.field_damage import bring_home
-from harness.field.replay import Player, ReplayResult, open_record
+from harness.field.replay import RecordPlayer, ReplayResult, open_record
 from harness.run.simulate import simulate
 from tests.harness.command import harness
 from tests.harness.virtual import scenario
@@ -57,7 +57,7 @@ def test_agent_that_dies_in_a_handler_does_not_end_the_run(monkeypatch: pytest.M
 
 
 def _end_of_record(home: Path) -> ReplayResult:
-    result = Player(open_record(home, DEAD)).to_end()
+    result = RecordPlayer(open_record(home, DEAD)).to_end()
     assert result.deviations == []
     assert result.unjudged == len(result.lost) == 1
     return result
@@ -93,7 +93,7 @@ def test_replay_names_the_timer_at_which_the_record_ends(crashed: Path) -> None:
     (home / "1.trace.jsonl").write_text("".join([header, *lines[: asked + 1]]))
     header, *lines = (home / "2.trace.jsonl").read_text().splitlines(keepends=True)
     (home / "2.trace.jsonl").write_text("".join([header, *lines[len(lines) // 2 :]]))
-    sentence = Player(open_record(home, 1)).to_end().lost[-1]
+    sentence = RecordPlayer(open_record(home, 1)).to_end().lost[-1]
     assert "before Algorithm 5, vote_timer_expiration, of the voting timer due at t=" in sentence
 
 
@@ -105,10 +105,10 @@ def test_silently_ignored_messages_are_found_in_a_capture(monkeypatch: pytest.Mo
             right(agent, sender, sequence, message, now, datagram)
 
     bring_home(scenario(**FLIGHT), 1, "sim", tmp_path / "run", tmp_path / "right")
-    assert Player(open_record(tmp_path / "right", 2)).to_end().deviations == []
+    assert RecordPlayer(open_record(tmp_path / "right", 2)).to_end().deviations == []
     monkeypatch.setattr(Agent, "receive_message", receive)
     bring_home(scenario(**FLIGHT), 1, "sim", tmp_path / "wrong", tmp_path / "home")
-    first = Player(open_record(tmp_path / "home", 2)).to_end().first
+    first = RecordPlayer(open_record(tmp_path / "home", 2)).to_end().first
     assert first is not None
     assert first.handler == "receive_request_add_block"
     assert re.search(
@@ -118,4 +118,4 @@ def test_silently_ignored_messages_are_found_in_a_capture(monkeypatch: pytest.Mo
     ), first.what
     for capture in (tmp_path / "home").glob("*.pcapng"):
         capture.unlink()
-    assert Player(open_record(tmp_path / "home", 2)).to_end().deviations == []
+    assert RecordPlayer(open_record(tmp_path / "home", 2)).to_end().deviations == []

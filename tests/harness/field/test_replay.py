@@ -13,7 +13,7 @@ from harness import checker
 from harness.archive.archive import RunArchive
 from harness.checker import steps
 from harness.errors import FieldError
-from harness.field.replay import Player, open_record
+from harness.field.replay import RecordPlayer, open_record
 from harness.field.replay import _player as player_module
 from harness.field.replay.breakpoints import next_stop, parse_breakpoint, source_of
 from harness.field.replay.replay_names import ReplayNames
@@ -37,7 +37,7 @@ def wrong_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return flown(tmp_path_factory.mktemp("wrong") / "run", quirks={"stale_chain_hash": True}, duration_s=900)
 
 
-def state_of(player: Player) -> Any:
+def state_of(player: RecordPlayer) -> Any:
     """Return the state of the reference and the result so far, for comparison."""
     state = {name: value for name, value in vars(player.state).items() if "timer" not in name and name != "running"}
     state["chain"] = (player.state.chain.top_chain_hash, list(player.state.chain))
@@ -77,7 +77,7 @@ def test_agent_switched_off_during_a_vote_has_no_difference(tmp_path: Path) -> N
 def test_replay_finds_the_same_deviations_as_the_checker(quirk: str, tmp_path: Path) -> None:
     directory = flown(tmp_path / "run", quirks={quirk: True}, duration_s=900, network={"loss": 0.4})
     judgement = steps.check(checker.gather(RunArchive(directory)))
-    players = {agent: Player(open_record(directory, agent)) for agent in (1, 2, 3)}
+    players = {agent: RecordPlayer(open_record(directory, agent)) for agent in (1, 2, 3)}
     deviations = [deviation for player in players.values() for deviation in player.to_end().deviations]
     first = min(deviations, key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
     assert judgement.evidence[0].agent_id == first.agent_id
@@ -122,7 +122,7 @@ def test_going_back_restores_the_exact_state(
 ) -> None:
     monkeypatch.setattr(player_module, "CHECKPOINT_STEPS", 50)
     record = open_record(request.getfixturevalue(mission), 2)
-    player = Player(record)
+    player = RecordPlayer(record)
     seen = [state_of(player)]
     while not player.at_end:
         player.forward()
@@ -135,16 +135,16 @@ def test_going_back_restores_the_exact_state(
 
 def test_until_option_limits_the_played_entries(wrong_run: Path) -> None:
     record = open_record(wrong_run, 2)
-    first = Player(record).to_end().first
+    first = RecordPlayer(record).to_end().first
     assert first is not None
-    before = Player(record, first.t - 0.001)
+    before = RecordPlayer(record, first.t - 0.001)
     assert before.to_end().deviations == []
     assert before.entries[-1].content.t < first.t <= record.entries[len(before.entries)].content.t
 
 
 def test_breakpoints_are_lines_handlers_algorithms_or_blocks(correct_run: Path) -> None:
     record = open_record(correct_run, 1)
-    player, names = Player(record), ReplayNames(record)
+    player, names = RecordPlayer(record), ReplayNames(record)
     by_name = next_stop(player, parse_breakpoint("vote_timer_expiration", names))
     assert by_name == next_stop(player, parse_breakpoint("A5", names))
     assert by_name is not None

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from harness.field.replay import Player, open_record
+from harness.field.replay import RecordPlayer, open_record
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
 
@@ -89,7 +89,7 @@ def test_difference_after_a_gap_is_found(traces_only: Path) -> None:
         damage(30)(lines)
 
     change(traces_only / "2.trace.jsonl", disapprove)
-    found = Player(open_record(traces_only, 2)).to_end()
+    found = RecordPlayer(open_record(traces_only, 2)).to_end()
     assert found.unjudged and found.lost
     assert [(deviation.line, deviation.handler) for deviation in found.deviations] == [
         (line, "receive_request_add_block")
@@ -97,15 +97,15 @@ def test_difference_after_a_gap_is_found(traces_only: Path) -> None:
 
 
 def test_compressed_duplicate_and_unrelated_files_change_nothing(traces_only: Path) -> None:
-    whole = Player(open_record(traces_only, 2)).to_end().steps
+    whole = RecordPlayer(open_record(traces_only, 2)).to_end().steps
     content = (traces_only / "2.trace.jsonl").read_bytes()
     (traces_only / "2.trace.jsonl").unlink()
     (traces_only / "two.gz").write_bytes(gzip.compress(content))
     (traces_only / "copy of two.jsonl").write_bytes(content)
     (traces_only / "holiday.jpg").write_bytes(b"\xff\xd8\xff\xe0 no trace")
-    found = Player(open_record(traces_only, 2)).to_end()
+    found = RecordPlayer(open_record(traces_only, 2)).to_end()
     assert (found.steps, found.deviations) == (whole, [])
-    assert Player(open_record(traces_only / "two.gz")).to_end().steps == whole
+    assert RecordPlayer(open_record(traces_only / "two.gz")).to_end().steps == whole
 
 
 def test_truncated_record_is_played_up_to_its_end(traces_only: Path) -> None:
@@ -157,7 +157,7 @@ def test_changed_clock_causes_no_deviation(by_s: float, traces_only: Path) -> No
         entry["t"] = round(entry["t"] + by_s, 6)
         lines[number] = json.dumps(entry, separators=(",", ":"))
     path.write_text("\n".join(lines) + "\n")
-    found = Player(open_record(traces_only, 2)).to_end()
+    found = RecordPlayer(open_record(traces_only, 2)).to_end()
     assert found.deviations == []
     assert found.unjudged
     assert "clock was set" in found.lost[0]
@@ -189,7 +189,7 @@ def test_irregular_sequence_numbers_are_no_missing_lines(traces_only: Path) -> N
             datagram[8:12] = sequence.to_bytes(4, "big")
             sent |= {"seq": sequence, "datagram": base64.b64encode(datagram).decode()}
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    found = Player(open_record(traces_only, 2)).to_end()
+    found = RecordPlayer(open_record(traces_only, 2)).to_end()
     assert found.deviations
     assert found.unjudged == 0
     assert "with sequence number" in found.deviations[0].difference(str)

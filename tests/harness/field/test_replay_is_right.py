@@ -8,8 +8,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harness.field.replay import Player, open_record
-from harness.play.progress import Silent
+from harness.field.replay import RecordPlayer, open_record
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.field.flights import flown
 from tests.harness.virtual import scenario
@@ -50,7 +50,7 @@ def assert_no_difference(directory: Path) -> None:
             (Path(alone) / trace.name).write_bytes(trace.read_bytes())
             for path in (trace, Path(alone) / trace.name):
                 record = open_record(path)
-                found = Player(record).to_end()
+                found = RecordPlayer(record).to_end()
                 sentences = [deviation.sentence(lambda block: block[:8]) for deviation in found.deviations]
                 assert (sentences, found.unjudged, found.steps) == ([], 0, len(record.trace.runs)), path
 
@@ -97,10 +97,10 @@ MISSION: dict[str, Any] = {
 
 @pytest.mark.lab
 def test_replay_finds_no_difference_with_processes(tmp_path: Path) -> None:
-    assert_no_difference(run(scenario(**MISSION), 1, tmp_path / "run", Silent(), "process").directory)
+    assert_no_difference(run(scenario(**MISSION), 1, tmp_path / "run", SilentProgress(), "process").directory)
 
 
 @pytest.mark.docker
 def test_replay_finds_no_difference_in_containers(tmp_path: Path) -> None:
     mission = {**MISSION, "docker": {"image_from_host": True}}
-    assert_no_difference(run(scenario(**mission), 1, tmp_path / "run", Silent(), "docker").directory)
+    assert_no_difference(run(scenario(**mission), 1, tmp_path / "run", SilentProgress(), "docker").directory)

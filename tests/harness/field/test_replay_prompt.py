@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.field.replay import Player, open_record
+from harness.field.replay import RecordPlayer, open_record
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.field.flights import flown, trace_of
 
@@ -37,7 +37,7 @@ def output_of(wrong_run: Path, *commands: str, options: tuple[str, ...] = ("--st
 
 
 def first_difference(wrong_run: Path) -> int:
-    first = Player(open_record(wrong_run, 2)).to_end().first
+    first = RecordPlayer(open_record(wrong_run, 2)).to_end().first
     assert first is not None
     return first.line
 

@@ -13,7 +13,7 @@ from harness.errors import ScenarioError
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
 from harness.play.mission import RunOutcome, Swarm
-from harness.play.progress import Progress, Silent
+from harness.play.progress import Progress, SilentProgress
 from harness.run.run import run
 from harness.scenario import Scenario
 from harness.scenario.changes import Change
@@ -115,7 +115,9 @@ def test_name_shows_whether_a_run_was_in_virtual_time() -> None:
 
 @pytest.mark.usefixtures("perfect_air")
 def test_backend_in_the_table_plays_a_scenario(tmp_path: Path) -> None:
-    finished = run(scenario(agents=3, duration_s=600, final_reconcile=True), 1, tmp_path / "run", Silent(), "docker")
+    finished = run(
+        scenario(agents=3, duration_s=600, final_reconcile=True), 1, tmp_path / "run", SilentProgress(), "docker"
+    )
     assert (finished.exit_status, finished.played.engine) == (0, "perfect air")
     assert {number: one.verdict for number, one in finished.result.characteristics.items()} == dict.fromkeys(
         "123456", "holds"
@@ -127,7 +129,7 @@ def test_backend_in_the_table_plays_a_scenario(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("perfect_air")
 def test_refused_scenario_leaves_no_run_directory(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="needs an air that is not perfect"):
-        run(scenario(network={"loss": 0.1}), 1, tmp_path / "run", Silent(), "docker")
+        run(scenario(network={"loss": 0.1}), 1, tmp_path / "run", SilentProgress(), "docker")
     assert not (tmp_path / "run").exists()
 
 

@@ -16,7 +16,7 @@ from harness.play.machine.capabilities import Requirement
 from netem.conditions import NetworkConditions
 from netem.errors import LabError
 from netem.estimates import Lateness, ReceivedStream, lost
-from netem.measure import Observer, Question, Study
+from netem.measure import MeasuredQuantity, NetworkStudy, Observer
 
 WORKS = [
     Requirement("netem", False, False, "unknown"),
@@ -24,14 +24,14 @@ WORKS = [
     Requirement("engine", True, True, "nftables"),
 ]
 NOTHING_WORKS = [Requirement("engine", False, True, "nothing works", "install nftables")]
-STUDY = Study(NetworkConditions(), (Question(1, 4, "loss 0.15", "lost", 0.15, lost),))
+STUDY = NetworkStudy(NetworkConditions(), (MeasuredQuantity(1, 4, "loss 0.15", "lost", 0.15, lost),))
 
 
 def losing(*shares: float) -> Observer:
     """Return a measuring function that reports these loss rates, one after another."""
     streams = iter(shares)
 
-    def observe(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
+    def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         first = round(next(streams) * packets)
         lateness = Lateness([0.0001] * packets, [0.0002] * 10)
         return {(1, 4): ReceivedStream([0.0] * packets, [(number, 0.1) for number in range(first, packets)], lateness)}
@@ -113,7 +113,7 @@ def test_missing_engine_gives_status_3(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_machine_that_is_too_busy_is_one_sentence_and_status_3(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def too_busy(study: Study, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
+    def too_busy(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         raise LabError("A receive buffer overflowed")
 
     fake(monkeypatch, too_busy)

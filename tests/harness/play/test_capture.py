@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from harness.archive.run_record import CapturedFrames
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.report.facts import gaps
 from harness.run.run import run
 from netem.frames import udp_broadcast
@@ -57,7 +57,7 @@ def files(out: Path) -> dict[str, bytes]:
 
 def test_capture_in_virtual_time_changes_nothing_else(tmp_path: Path) -> None:
     for name, capture in (("without", False), ("with", True)):
-        finished = run(scenario(**RUN, capture=capture), 5, tmp_path / name, Silent(), "sim")
+        finished = run(scenario(**RUN, capture=capture), 5, tmp_path / name, SilentProgress(), "sim")
         assert finished.played.outcome == "completed", finished.played.outcome_detail
     assert files(tmp_path / "without") == files(tmp_path / "with") != {}
     without, with_capture = record(tmp_path / "without"), record(tmp_path / "with")
@@ -68,7 +68,7 @@ def test_capture_in_virtual_time_changes_nothing_else(tmp_path: Path) -> None:
 
 
 def test_virtual_captures_have_sent_and_received_frames(tmp_path: Path) -> None:
-    run(scenario(**RUN, capture=True), 5, tmp_path / "run", Silent(), "sim")
+    run(scenario(**RUN, capture=True), 5, tmp_path / "run", SilentProgress(), "sim")
     found = captured(tmp_path / "run")
     recorded = record(tmp_path / "run")
     assert sorted(found) == [1, 2, 3]
@@ -98,7 +98,7 @@ def test_virtual_captures_have_sent_and_received_frames(tmp_path: Path) -> None:
 
 def test_scripted_loss_is_only_in_the_virtual_capture_of_the_sender(tmp_path: Path) -> None:
     fates = [{"message": "Commit Block", "receiver": 2, "drop": True}]
-    run(scenario(**{**RUN, "timeline": []}, fates=fates, capture=True), 5, tmp_path / "run", Silent(), "sim")
+    run(scenario(**{**RUN, "timeline": []}, fates=fates, capture=True), 5, tmp_path / "run", SilentProgress(), "sim")
     commits = {
         vehicle: Counter(frame.outbound for frame in seen if isinstance(decode(frame.payload)[2], CommitBlock))
         for vehicle, seen in captured(tmp_path / "run").items()
@@ -175,7 +175,7 @@ def test_report_shows_gaps_of_captures(tmp_path: Path) -> None:
     frames = {vehicle: CapturedFrames.model_validate(counted) for vehicle, counted in counts.items()}
     assert gaps(frames) == ("the capture lacks 4 of 30 frames, of vehicle 7, because this machine was too slow")
     assert gaps({"1": frames["1"]}) is None
-    finished = run(scenario(**RUN, capture=True), 5, tmp_path / "run", Silent(), "sim")
+    finished = run(scenario(**RUN, capture=True), 5, tmp_path / "run", SilentProgress(), "sim")
     path = tmp_path / "run" / "run.json"
     path.write_text(json.dumps({**record(tmp_path / "run"), "capture": counts}))
     assert "the capture lacks 4 of 30 frames" not in finished.report.read_text()

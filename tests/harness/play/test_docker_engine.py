@@ -19,9 +19,9 @@ import requests
 import yaml
 
 from harness.play.containers import _container_preflight, _images, docker_engine, ownership
-from harness.play.containers._container import STDERR, STDOUT, Output
-from harness.play.containers._images import Image
-from harness.play.keyring.key_directory import Home
+from harness.play.containers._container import STDERR, STDOUT, ContainerOutput
+from harness.play.containers._images import ContainerImage
+from harness.play.keyring.key_directory import KeyDirectory
 from harness.scenario import Scenario
 from tests.harness.command import harness, sentences, write_scenario
 from tests.harness.secure.secrets import left_in, told
@@ -58,7 +58,7 @@ def test_stopped_engine_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Monk
     listening(path).close()
     monkeypatch.setenv("DOCKER_HOST", f"unix://{path}")
     with pytest.raises(docker_engine.DockerError, match="is not running: no process listens"):
-        docker_engine.Engine.connect()
+        docker_engine.DockerEngine.connect()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody who may not")
@@ -84,7 +84,7 @@ def test_silent_engine_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("DOCKER_HOST", f"unix://{path}")
     monkeypatch.setattr(docker_engine, "GREETING_LIMIT_S", 1.0)
     with pytest.raises(docker_engine.DockerError, match="does not answer: restart it"):
-        docker_engine.Engine.connect()
+        docker_engine.DockerEngine.connect()
     server.close()
 
 
@@ -95,7 +95,7 @@ def test_silent_engine_gets_no_further_calls() -> None:
         asked.append(1)
         raise TimeoutError
 
-    one = docker_engine.Engine(SimpleNamespace(close=lambda: None))  # type: ignore[arg-type]
+    one = docker_engine.DockerEngine(SimpleNamespace(close=lambda: None))  # type: ignore[arg-type]
     for _ in range(2):
         with pytest.raises(docker_engine.DockerError, match=r"stopped answering \(look\).*`ucp-harness clean`"):
             one.do("look", late)
@@ -109,7 +109,7 @@ def test_full_disk_does_not_count_as_a_stopped_engine() -> None:
         answer.status_code = 500
         raise docker.errors.APIError("500", answer, "write /var/lib/docker/x: no space left on device")
 
-    one = docker_engine.Engine(SimpleNamespace(close=lambda: None))  # type: ignore[arg-type]
+    one = docker_engine.DockerEngine(SimpleNamespace(close=lambda: None))  # type: ignore[arg-type]
     with pytest.raises(docker_engine.DockerError, match=r"disk is full \(create x\)"):
         one.do("create x", refuse)
     assert one.do("look", lambda: "it answers") == "it answers"
@@ -126,7 +126,7 @@ def test_an_image_that_cannot_be_built_is_one_sentence() -> None:
 
     said: list[str] = []
     api = SimpleNamespace(close=lambda: None, inspect_image=inspect, build=lambda **_: iter(steps))
-    one = docker_engine.Engine(api)  # type: ignore[arg-type]
+    one = docker_engine.DockerEngine(api)  # type: ignore[arg-type]
     with pytest.raises(docker_engine.DockerError, match=r"cannot be built \(no such host\): .*--image-from-host"):
         _images.project(one, said.append)
     assert said[1:] == ["building the image: Step 1/9 : ARG BASE"] * 2
@@ -191,7 +191,7 @@ def test_output_of_a_container_goes_to_the_right_file(tmp_path: Path) -> None:
 
     async def read() -> None:
         near, far = socket.socketpair()
-        output = Output(SimpleNamespace(_sock=near, close=near.close), tmp_path / "out", tmp_path / "err")
+        output = ContainerOutput(SimpleNamespace(_sock=near, close=near.close), tmp_path / "out", tmp_path / "err")
         for byte in said:
             far.send(bytes([byte]))
             await asyncio.sleep(0)
@@ -218,7 +218,11 @@ def test_an_image_has_its_own_interpreter_environment_and_files(tmp_path: Path) 
     program.touch()
     argv = [sys.executable, "-m", "ucp.node", str(program), "/no/such"]
     env = {**os.environ, "HOW": "so"}
-    ours, foreign, host = Image("a", "python3"), Image("b", "python3", foreign=True), _images.host_image()
+    ours, foreign, host = (
+        ContainerImage("a", "python3"),
+        ContainerImage("b", "python3", foreign=True),
+        _images.host_image(),
+    )
     assert ours.command(argv)[0] == "python3"
     assert ours.environment(env) == {"HOW": "so"}
     assert (ours.shared(argv), foreign.shared(argv)) == ([program], [])
@@ -260,7 +264,7 @@ def test_compose_file_has_all_vehicles_at_their_addresses(tmp_path: Path) -> Non
 
 
 def test_a_compose_file_shows_each_agent_its_own_bundle_and_holds_no_secret(tmp_path: Path) -> None:
-    home = Home.new(tmp_path / "home", [1, 2], seals=True, epoch_s=600.0)
+    home = KeyDirectory.new(tmp_path / "home", [1, 2], seals=True, epoch_s=600.0)
     home.write_bundles(tmp_path / "bundles")
     keys = {"agents": 2, "vehicles": {"kind": "none"}}
     document = emitted(tmp_path, **keys, security={"keys": str(tmp_path / "bundles"), "seal": True})

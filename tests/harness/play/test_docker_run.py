@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from harness.play.containers import ownership
-from harness.play.keyring.key_directory import Home
+from harness.play.keyring.key_directory import KeyDirectory
 from tests.harness.command import Running, harness, processes, sentences, write_scenario
 from tests.harness.docker import BreakableConnection, containers, foreign_container
 from tests.harness.secure.secrets import left_in, secrets, told
@@ -82,7 +82,7 @@ def test_faults_of_agents_and_vehicles(tmp_path: Path) -> None:
 
 def test_captured_keys_work_in_containers_and_leave_no_secret(tmp_path: Path) -> None:
     """The attacker sends encrypted, forged and repeated datagrams. The test checks what agents drop and accept."""
-    home = Home.new(tmp_path / "home", [1, 2, 3], seals=True, epoch_s=30.0)
+    home = KeyDirectory.new(tmp_path / "home", [1, 2, 3], seals=True, epoch_s=30.0)
     timeline = [
         {"at_s": 40, "forge": {"message": "Commit Block", "sender": 2}},
         {"at_s": 45, "forge": {"message": "Commit Block", "sender": 3}},

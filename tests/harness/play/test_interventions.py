@@ -14,7 +14,7 @@ import pytest
 
 from harness.errors import ScenarioError
 from harness.play.interventions import Interventions
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.play.request_socket import SOCKET
 from harness.run.run import Run, run
 from harness.scenario import Scenario, load_scenario
@@ -41,7 +41,7 @@ def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> R
     with ThreadPoolExecutor(1) as thread:
         clicked = thread.submit(click)
         try:
-            finished = run(asked, 7, out, Silent(), "sim", interventions=interventions)
+            finished = run(asked, 7, out, SilentProgress(), "sim", interventions=interventions)
         finally:
             over.set()
         clicked.result(TIMEOUT_S)
@@ -80,7 +80,7 @@ def test_replay_of_requests_gives_the_same_files(tmp_path: Path) -> None:
     marked = {fault.at_s: fault.what for fault in finished.record.faults if fault.by_hand}
     assert list(marked.values()) == ["partition", "kill", "reboot", "reboot", "heal", "network", "loss"]
     assert [*marked] == at_s
-    again = run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
+    again = run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", SilentProgress(), "sim")
     assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
     assert again.record.agents == finished.record.agents
     assert again.result.to_json() == finished.result.to_json()
@@ -90,7 +90,7 @@ def test_replay_of_requests_gives_the_same_files(tmp_path: Path) -> None:
 def test_run_without_requests_equals_a_normal_run(tmp_path: Path) -> None:
     asked = scenario(duration_s=300, network={"loss": 0.1})
     played(asked, tmp_path / "watched", lambda interventions: None)
-    run(asked, 7, tmp_path / "alone", Silent(), "sim")
+    run(asked, 7, tmp_path / "alone", SilentProgress(), "sim")
     assert files_of(tmp_path / "watched") == files_of(tmp_path / "alone")
     assert not (tmp_path / "watched/replay.yaml").exists()
 
@@ -147,7 +147,7 @@ def test_lasting_request_ends_a_temporary_change(tmp_path: Path) -> None:
     finished = played(asked, tmp_path / "run", click)
     faults = [(fault.at_s, fault.what, fault.detail) for fault in finished.record.faults]
     assert faults[2:] == [(100.0, "heal, undone", "loss 50 %"), (100.001, "loss, undone", "loss 10 %")]
-    run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
+    run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", SilentProgress(), "sim")
     assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
 
 
@@ -166,7 +166,7 @@ def test_replay_with_flying_vehicles_gives_the_same_files(tmp_path: Path) -> Non
                 interventions.ask({"loss": number / 100}).result(TIMEOUT_S)
 
     played(asked, tmp_path / "run", click)
-    run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", Silent(), "sim")
+    run(load_scenario(tmp_path / "run/replay.yaml"), 7, tmp_path / "again", SilentProgress(), "sim")
     assert files_of(tmp_path / "again") == files_of(tmp_path / "run")
     assert (tmp_path / "again/tracks.jsonl").read_bytes() == (tmp_path / "run/tracks.jsonl").read_bytes()
 
@@ -208,7 +208,7 @@ def test_requests_before_and_after_the_run_are_refused(tmp_path: Path) -> None:
     interventions = Interventions(asked, virtual_time=True)
     with pytest.raises(ScenarioError, match="the mission has not started"):
         interventions.ask({"loss": 0.5}).result(0)
-    run(asked, 7, tmp_path / "run", Silent(), "sim", interventions=interventions)
+    run(asked, 7, tmp_path / "run", SilentProgress(), "sim", interventions=interventions)
     with pytest.raises(ScenarioError, match="the run has ended"):
         interventions.ask({"loss": 0.5}).result(0)
     with pytest.raises(ScenarioError, match="has ended"):

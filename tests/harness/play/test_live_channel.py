@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
-from harness.play.process._channel_node import AnswerTimes, Lateness
+from harness.play.process._channel_node import AnswerTimeMeter, DeliveryLateness
 from harness.play.process._live_channel import LiveChannel
 from netem.channel import PRESETS
 from netem.conditions import Delay, LinkConditions, NetworkConditions
 from netem.frames import udp_broadcast
 from netem.radio import Place
-from netem.relay import Heard
+from netem.relay import ReceivedBroadcast
 from ucp.messages import PORT, BlockAddRequest, BlockAddResponse, Message, encode
 
 DATA_BYTES = 47
@@ -120,7 +120,7 @@ def test_message_heard_after_its_time_is_sent_now() -> None:
 
 
 def test_lateness_has_quantiles_and_intervals() -> None:
-    lateness = Lateness()
+    lateness = DeliveryLateness()
     for number in range(100):
         lateness.add(0.5 if number < 50 else 1.5, (0.5 if number < 50 else 1.5) + number / 1000)
     figures = lateness.to_json()["lateness"]
@@ -131,14 +131,14 @@ def test_lateness_has_quantiles_and_intervals() -> None:
     assert figures["by_interval_s"] == [0.049, 0.099]
 
 
-def heard(vehicle: int, message: Message) -> tuple[Heard, bytes]:
+def heard(vehicle: int, message: Message) -> tuple[ReceivedBroadcast, bytes]:
     """Return a broadcast with this message, and its data."""
     data = encode(vehicle, 7, message)
-    return Heard(vehicle, 0, bytes(10) + udp_broadcast(vehicle, PORT, data)), data
+    return ReceivedBroadcast(vehicle, 0, bytes(10) + udp_broadcast(vehicle, PORT, data)), data
 
 
 def test_answer_times_are_measured_from_the_delivery_of_the_question() -> None:
-    times = AnswerTimes()
+    times = AnswerTimeMeter()
     question, asked = heard(1, BlockAddRequest(bytes(32), bytes(32)))
     answer, answered = heard(2, BlockAddResponse(bytes(32), True))
     times.sent(answer, answered, 0.5)

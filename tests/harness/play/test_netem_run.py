@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.scenario import Scenario
 from tests.machine import require
@@ -30,7 +30,7 @@ def test_agents_agree_over_delays_and_bursts_of_loss(tmp_path: Path) -> None:
             "final_reconcile": True,
         }
     )
-    finished = run(scenario, 1, tmp_path / "run", Silent())
+    finished = run(scenario, 1, tmp_path / "run", SilentProgress())
     assert finished.played.outcome == "completed", finished.played.outcome_detail
     assert finished.played.engine == "netem"
     assert finished.exit_status == 0

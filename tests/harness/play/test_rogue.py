@@ -7,7 +7,7 @@ import pytest
 
 from harness.play.rogue import _journal
 from harness.play.rogue._crafted import corrupted, random_message
-from harness.play.rogue._rogue import Rogue, RogueDatagram
+from harness.play.rogue._rogue import RogueDatagram, RogueLogic
 from harness.play.rogue.rogue_line import forged_sequence, injection_of
 from harness.scenario.injection import MAX_FLOOD, MODELS
 from ucp.block import Block, next_chain_hash
@@ -33,21 +33,21 @@ COMMIT = encode(1, 7, CommitBlock(BLOCK, TOP))
 REQUEST = encode(3, 8, BlockAddRequest(BLOCK.block_hash, TOP))
 
 
-def rogue() -> Rogue:
-    return Rogue(ROSTER, seed=1)
+def rogue() -> RogueLogic:
+    return RogueLogic(ROSTER, seed=1)
 
 
-def begin(one: Rogue, what: str, now: float = 100.0, number: int = 1, **keys: Any) -> list[RogueDatagram]:
+def begin(one: RogueLogic, what: str, now: float = 100.0, number: int = 1, **keys: Any) -> list[RogueDatagram]:
     one.begin(number, MODELS[what].model_validate(keys), now)
     return one.to_send()
 
 
-def receive(one: Rogue, datagram: bytes, now: float) -> list[RogueDatagram]:
+def receive(one: RogueLogic, datagram: bytes, now: float) -> list[RogueDatagram]:
     one.receive(datagram, now)
     return one.to_send()
 
 
-def wait(one: Rogue, until: float) -> list[tuple[float, RogueDatagram]]:
+def wait(one: RogueLogic, until: float) -> list[tuple[float, RogueDatagram]]:
     """Return the datagrams that the rogue node sends until this time, with their times."""
     sent = []
     while (at := one.next_timer()) is not None and at <= until:

@@ -15,7 +15,7 @@ from harness.archive.record_file import validate_leniently
 from harness.archive.run_record import InjectedMessages, RunRecord
 from harness.errors import ScenarioError
 from harness.play.process.process_preflight import add_rogue_listener
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.play.rogue.rogue_line import injection_of
 from harness.report._rogue_section import section
 from harness.run.run import Run, run
@@ -37,7 +37,7 @@ def injecting(*timeline: dict[str, Any], **keys: Any) -> Scenario:
 
 
 def played(tmp_path: Path, *timeline: dict[str, Any], **keys: Any) -> Run:
-    return run(injecting(*timeline, **keys), 1, tmp_path / "run", Silent(), "sim")
+    return run(injecting(*timeline, **keys), 1, tmp_path / "run", SilentProgress(), "sim")
 
 
 def violated(finished: Run) -> set[str]:
@@ -152,7 +152,7 @@ def test_rogue_node_reaches_all_groups_and_is_no_vehicle(tmp_path: Path) -> None
     apart = {"at_s": 190, "partition": [[1, 2], [3, 4, 5]]}
     chatty = {"duration_s": 260, "speedup": 20, "events": {"source": "random", "mean_s": 20}}
     replay = {"at_s": 180, "replay": {"message": "Commit Block"}}
-    finished = run(injecting(replay, apart, FORGE, **chatty, capture=True), 1, tmp_path / "run", Silent())
+    finished = run(injecting(replay, apart, FORGE, **chatty, capture=True), 1, tmp_path / "run", SilentProgress())
     assert finished.played.outcome == "completed", finished.played.outcome_detail
     replay_told, forge_told = finished.rogue
     assert (sum(replay_told.messages[0].handled.values()), replay_told.messages[0].changed) == (4, 0)

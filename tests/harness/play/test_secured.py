@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from harness.archive.packets.capture_files import read_captures
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario, load_scenario
@@ -51,7 +51,7 @@ def test_rogue_node_without_keys_has_no_effect() -> None:
 
 def test_capture_shows_senders_and_types_of_sealed_messages(tmp_path: Path) -> None:
     request = secured(scenario(duration_s=200, capture=True, events={"mean_s": 5}))
-    finished = run(request, 1, tmp_path / "run", Silent(), "sim")
+    finished = run(request, 1, tmp_path / "run", SilentProgress(), "sim")
     assert not finished.result.bad
     seen = list(read_captures(sorted((tmp_path / "run" / "capture").iterdir())).datagrams)
     assert {datagram.summary.message for datagram in seen} >= {"Block Add Request", "Commit Block"}

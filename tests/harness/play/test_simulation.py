@@ -15,7 +15,7 @@ from harness import checker
 from harness.archive.archive import RunArchive
 from harness.archive.exports import read_export
 from harness.errors import MachineError, ScenarioError
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
@@ -261,7 +261,7 @@ def test_added_loss_does_not_change_the_events() -> None:
 
 def test_run_directory_equals_the_simulation_in_memory(tmp_path: Path) -> None:
     one = load_scenario(SCENARIOS / "loss_15.yaml")
-    finished = run(one, 3, tmp_path / "run", Silent(), "sim")
+    finished = run(one, 3, tmp_path / "run", SilentProgress(), "sim")
     in_memory = simulate(one, 3, tracing=True)
     assert finished.exit_status == 0
     assert finished.result.to_json() == in_memory.result.to_json()
@@ -317,7 +317,7 @@ def test_keys_that_need_virtual_time_are_refused_for_processes(
     tmp_path: Path, keys: dict[str, Any], named: str
 ) -> None:
     with pytest.raises(ScenarioError, match=f"{named} virtual time: use --backend sim"):
-        run(scenario(**keys), 1, tmp_path / "run", Silent(), "process")
+        run(scenario(**keys), 1, tmp_path / "run", SilentProgress(), "process")
     assert not (tmp_path / "run").exists()
 
 
@@ -328,14 +328,14 @@ def test_conditions_without_an_engine_are_refused_with_a_solution(tmp_path: Path
         pytest.skip("this kernel has netem")
     network = {"delay": 1, "receivers": {2: {"rate": 9600}}}
     with pytest.raises(MachineError, match=r"Nothing does delay, receivers 2 rate here .*--backend sim") as caught:
-        run(scenario(network=network), 1, tmp_path / "run", Silent(), "process")
+        run(scenario(network=network), 1, tmp_path / "run", SilentProgress(), "process")
     assert caught.value.exit_status == 3
     assert not (tmp_path / "run").exists()
 
 
 def test_conditions_impossible_at_the_speedup_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match=r"`network` at `speedup` 0\.5: delay\.mean_s: 100\.0 is out of range"):
-        run(scenario(network={"delay": 50}, speedup=0.5), 1, tmp_path / "run", Silent(), "process")
+        run(scenario(network={"delay": 50}, speedup=0.5), 1, tmp_path / "run", SilentProgress(), "process")
 
 
 def test_ctrl_c_ends_a_simulation_and_keeps_its_results(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from harness import cli
 from harness.backend_names import BackendName
 from harness.play import trace_space
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.play.trace_space import estimated_bytes, space_sentence
 from harness.run.run import run
 from harness.scenario import Scenario
@@ -44,7 +44,7 @@ def test_trace_ends_at_the_quota_and_the_run_is_not_judged(
     monkeypatch.setattr(trace_space, "LEAST_BYTES_PER_AGENT", 1)
     keys = {"vehicles": {"kind": "none"}, "events": {"source": "random", "mean_s": 5}, "speedup": 100}
     small = scenario(agents=3, duration_s=200, trace_quota_mb=0.15, **keys)
-    finished = run(small, 1, tmp_path / "run", Silent(), backend)
+    finished = run(small, 1, tmp_path / "run", SilentProgress(), backend)
     for number in (1, 2, 3):
         lines = (finished.directory / "agents" / f"{number}.trace.jsonl").read_bytes()
         assert 40_000 < len(lines) <= 50_000

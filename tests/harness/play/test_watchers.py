@@ -7,7 +7,7 @@ import warnings
 import pytest
 
 from harness.errors import HarnessError
-from harness.play.process._watchers import Watchers
+from harness.play.process._watchers import MissionTasks
 
 
 class LostError(HarnessError):
@@ -24,7 +24,7 @@ async def wait() -> None:
 
 def test_task_started_while_a_mission_fails_causes_no_warning() -> None:
     async def mission() -> None:
-        watchers = Watchers()
+        watchers = MissionTasks()
         async with watchers.guard(fail()):
             try:
                 await asyncio.sleep(3600)

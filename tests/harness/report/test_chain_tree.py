@@ -3,16 +3,25 @@
 from collections.abc import Iterator
 
 from harness.archive.exports import name_blocks
-from harness.report.chain_tree import FEWEST_HIDDEN, KEPT_AT_EACH_END, Mark, Node, chain_tree, marks, ranges, wrapped
+from harness.report.chain_tree import (
+    FEWEST_HIDDEN,
+    KEPT_AT_EACH_END,
+    ChainTreeMark,
+    ChainTreeNode,
+    chain_tree,
+    marks,
+    ranges,
+    wrapped,
+)
 from tests.harness.report.runs import Chains, exports
 
 
-def drawn(chains: Chains, *, abridged: bool = False) -> Mark:
+def drawn(chains: Chains, *, abridged: bool = False) -> ChainTreeMark:
     read = exports(chains)
     return marks(chain_tree(read), name_blocks(read), abridged=abridged)
 
 
-def all_marks(mark: Mark) -> Iterator[Mark]:
+def all_marks(mark: ChainTreeMark) -> Iterator[ChainTreeMark]:
     yield mark
     if mark.beside:
         yield mark.beside
@@ -20,11 +29,11 @@ def all_marks(mark: Mark) -> Iterator[Mark]:
         yield from all_marks(child)
 
 
-def texts(mark: Mark, kind: str) -> list[str]:
+def texts(mark: ChainTreeMark, kind: str) -> list[str]:
     return [" ".join(found.lines) for found in all_marks(mark) if found.kind == kind]
 
 
-def only_child(node: Node) -> Node:
+def only_child(node: ChainTreeNode) -> ChainTreeNode:
     (child,) = node.children.values()
     return child
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from harness.archive.archive import RunArchive
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.report.stories.narration import Narrator
 from harness.report.stories.story_file import Story, read_story
 from harness.run.run import run
@@ -30,7 +30,7 @@ IN_NO_FIGURE = {
 
 def told(story: Story, directory: Path, seed: int = 1) -> str:
     """Return the text of the story as it is played in virtual time."""
-    run(story.in_virtual_time, seed, directory, Silent(), "sim", delivers_all=True)
+    run(story.in_virtual_time, seed, directory, SilentProgress(), "sim", delivers_all=True)
     narrator = Narrator(RunArchive(directory).traces, story.scenario.roster)
     return story.with_answers([narrator.answer(section) for section in story.sections])
 

@@ -11,7 +11,7 @@ import pytest
 from harness.archive.archive import RunArchive
 from harness.archive.connectivity import NETWORK_FILE, Topology, read_connectivity
 from harness.archive.tracks import TRACKS_FILE, read_tracks
-from harness.present.colours import Ink, inks
+from harness.present.colours import AgentColours, inks
 from harness.report import _map_section, write_report
 from harness.report._map_section import MapSection
 from harness.report.map_parts import divisions, letter, longest_divisions
@@ -38,7 +38,7 @@ def drawn(run_dir: Path, seconds: int = 600, tracks: dict[int, Way] | None = Non
     return section
 
 
-def section_of(run_dir: Path, ink: dict[int, Ink]) -> MapSection | None:
+def section_of(run_dir: Path, ink: dict[int, AgentColours]) -> MapSection | None:
     network = read_connectivity(run_dir / NETWORK_FILE, ink)
     return _map_section.section(read_tracks(run_dir / TRACKS_FILE, ink), network, ink, {})
 
@@ -240,17 +240,17 @@ def test_twenty_minutes_of_five_stay_small_and_fifty_within_bounds(tmp_path: Pat
 
 
 @pytest.fixture
-def ink() -> dict[int, Ink]:
+def ink() -> dict[int, AgentColours]:
     return inks(FIVE)
 
 
-def test_run_without_movement_or_tracks_has_no_map(tmp_path: Path, ink: dict[int, Ink]) -> None:
+def test_run_without_movement_or_tracks_has_no_map(tmp_path: Path, ink: dict[int, AgentColours]) -> None:
     assert section_of(tmp_path, ink) is None
     write_flight(tmp_path, scenario(agents=5), {vehicle: still(vehicle, 0) for vehicle in FIVE}, 5)
     assert section_of(tmp_path, ink) is None
 
 
-def test_tracks_without_network_record_are_drawn_with_a_note(tmp_path: Path, ink: dict[int, Ink]) -> None:
+def test_tracks_without_network_record_are_drawn_with_a_note(tmp_path: Path, ink: dict[int, AgentColours]) -> None:
     write_lines(tmp_path / TRACKS_FILE, [{"at_s": at, "places": {"3": [at * 9, 0, 0]}} for at in range(3)])
     section = section_of(tmp_path, ink)
     assert section is not None

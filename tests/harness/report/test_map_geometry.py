@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.archive.tracks import Fix
+from harness.archive.tracks import PositionFix
 from harness.report.map_parts import INVISIBLE_PX, Extent, Point, Projection, extent, simplify, thin
 
 LAND = Extent(south_m=-100, north_m=100, west_m=-200, east_m=200)
@@ -18,11 +18,11 @@ lines = st.lists(st.tuples(st.floats(0, 900), st.floats(0, 600)), min_size=2, ma
 
 
 def test_north_is_up_east_is_right_and_metres_have_equal_lengths() -> None:
-    assert TO_PX(Fix(0, 100, -200)) == (10, 20)
-    assert TO_PX(Fix(0, -100, 200)) == (810, 420)
-    assert TO_PX(Fix(0, 0, 0)) == (410, 220)
-    assert TO_PX(Fix(0, 50, 0)) == (410, 120)
-    assert TO_PX(Fix(0, 0, 50)) == (510, 220)
+    assert TO_PX(PositionFix(0, 100, -200)) == (10, 20)
+    assert TO_PX(PositionFix(0, -100, 200)) == (810, 420)
+    assert TO_PX(PositionFix(0, 0, 0)) == (410, 220)
+    assert TO_PX(PositionFix(0, 50, 0)) == (410, 120)
+    assert TO_PX(PositionFix(0, 0, 50)) == (510, 220)
 
 
 def test_land_of_any_shape_fits_into_its_rectangle() -> None:
@@ -43,7 +43,7 @@ def test_ticks_and_scale_bar_are_round_metres() -> None:
 
 @given(places)
 def test_all_tracks_are_inside_the_map_with_a_margin(flown: list[tuple[float, float]]) -> None:
-    land = extent([Fix(0, *place) for place in flown])
+    land = extent([PositionFix(0, *place) for place in flown])
     for north_m, east_m in flown:
         assert land.south_m < north_m < land.north_m
         assert land.west_m < east_m < land.east_m
@@ -51,7 +51,7 @@ def test_all_tracks_are_inside_the_map_with_a_margin(flown: list[tuple[float, fl
 
 
 def test_a_swarm_that_hardly_moves_is_not_blown_up() -> None:
-    land = extent([Fix(0, 0, 0), Fix(1, 0.5, 0)])
+    land = extent([PositionFix(0, 0, 0), PositionFix(1, 0.5, 0)])
     assert land.width_m == land.height_m == pytest.approx(22)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from harness.archive.run_record import RunRecord
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.report import facts
 from harness.run.run import run
 from tests.harness.command import harness
@@ -24,7 +24,7 @@ def test_report_plays_the_run_again(tmp_path: Path, all_delivered: bool) -> None
         timeline=[{"at_s": 40, "kill": [2]}],
         events={"source": "random", "mean_s": 5},
     )
-    first = run(asked, 7, tmp_path / "first", Silent(), backend="sim", delivers_all=all_delivered)
+    first = run(asked, 7, tmp_path / "first", SilentProgress(), backend="sim", delivers_all=all_delivered)
     page = (first.directory / "report.html").read_text()
     command, text = (html.unescape(part) for part in re.findall(r'<pre tabindex="0">(.*?)</pre>', page, re.DOTALL))
     (tmp_path / "scenario.yaml").write_text(text)

@@ -15,7 +15,7 @@ from harness.archive import archive
 from harness.archive.archive import RunArchive
 from harness.archive.history import Commit, History, Phase, Reconcile, Tie, Vote
 from harness.archive.replication import Replication
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.report import _timeline_charts, _timeline_lanes, _timeline_section, write_report
 from harness.run.run import run
 from tests.harness.play.test_recurrence import in_step
@@ -43,7 +43,7 @@ TROUBLED: dict[str, Any] = {
 @pytest.fixture(scope="module")
 def troubled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs") / "run"
-    return run(scenario(**TROUBLED), 7, directory, Silent(), backend="sim").directory
+    return run(scenario(**TROUBLED), 7, directory, SilentProgress(), backend="sim").directory
 
 
 def html_of(run_dir: Path) -> str:
@@ -221,7 +221,7 @@ def test_template_style_and_script_are_in_the_package() -> None:
 
 
 def test_a_swarm_that_goes_round_in_circles_has_a_bracket_for_each_round(tmp_path: Path) -> None:
-    directory = run(in_step(), 1, tmp_path / "run", Silent(), backend="sim").directory
+    directory = run(in_step(), 1, tmp_path / "run", SilentProgress(), backend="sim").directory
     page = html_of(directory)
     assert page.count('class="round"') == 13, (
         "twelve whole rounds from 11 s to 191 s, and one that the run's end cuts off"

@@ -5,7 +5,7 @@ from typing import Literal
 
 import pytest
 
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.report.browser import Browser
 from tests.harness.report.test_timeline import TROUBLED
@@ -19,7 +19,7 @@ SAID = "document.querySelector('.timeline output').textContent"
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run(scenario(**TROUBLED), 7, tmp_path_factory.mktemp("runs") / "run", Silent(), backend="sim").report
+    return run(scenario(**TROUBLED), 7, tmp_path_factory.mktemp("runs") / "run", SilentProgress(), backend="sim").report
 
 
 def span(browser: Browser) -> tuple[float, float]:

@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from harness.errors import WRONG_REQUEST
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
@@ -149,7 +149,7 @@ def test_unmatched_fate_is_reported_and_the_run_has_status_2(tmp_path: Path) -> 
         {"message": "Commit Block", "after": "never"},
     ]
     one = scenario(agents=3, duration_s=60, events={"source": "scripted", "script": BLOCK_OF_1}, fates=fates)
-    finished = run(one, 1, tmp_path / "run", Silent(), "sim")
+    finished = run(one, 1, tmp_path / "run", SilentProgress(), "sim")
     assert finished.exit_status == WRONG_REQUEST
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert record["unmatched_fates"] == [

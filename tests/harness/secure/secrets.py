@@ -5,7 +5,7 @@ import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from harness.play.keyring.key_directory import Home
+from harness.play.keyring.key_directory import KeyDirectory
 from ucp.messages import MalformedDatagramError
 from ucp.secure.crypto_suite import KEY_BYTES, NONCE_BYTES, expand, next_epoch_secret
 from ucp.secure.envelope import CLEAR, MAGIC, VERSION, read_clear_header
@@ -14,7 +14,7 @@ _SENDER = b"UCP sender\0"
 _CLEAR_START = MAGIC + bytes([VERSION])
 
 
-def secrets(home: Home, epochs: int, boots: Iterable[tuple[int, bytes]] = ()) -> dict[str, bytes]:
+def secrets(home: KeyDirectory, epochs: int, boots: Iterable[tuple[int, bytes]] = ()) -> dict[str, bytes]:
     """Return all secrets by name: private keys, the group secret of each epoch, and the keys derived from it."""
     documents = {name: json.loads((home.directory / name).read_text()) for name in ("authority.key", "depot.key")}
     found = {name: bytes.fromhex(document["private_key"]) for name, document in documents.items()}

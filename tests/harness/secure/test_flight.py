@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.play.keyring.key_directory import Home
+from harness.play.keyring.key_directory import KeyDirectory
 from tests.harness.command import harness
 from tests.harness.secure.secrets import left_in, secrets, told
 
@@ -33,14 +33,14 @@ SCENARIO = {
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
-    home = Home.new(tmp_path_factory.mktemp("flight") / "keys", ROSTER, seals=True, epoch_s=60.0)
+def home(tmp_path_factory: pytest.TempPathFactory) -> KeyDirectory:
+    home = KeyDirectory.new(tmp_path_factory.mktemp("flight") / "keys", ROSTER, seals=True, epoch_s=60.0)
     home.write_bundles(home.directory.parent / "bundles")
     return home
 
 
 @pytest.fixture(scope="module")
-def flown(home: Home) -> Path:
+def flown(home: KeyDirectory) -> Path:
     """The run."""
     directory = home.directory.parent
     security = {"keys": str(home.directory), "seal": True, "captured": 3}
@@ -51,7 +51,7 @@ def flown(home: Home) -> Path:
 
 
 @pytest.fixture
-def keys(home: Home) -> list[str]:
+def keys(home: KeyDirectory) -> list[str]:
     return ["--bundle", str(home.directory.parent / "bundles/1.bundle.json"), "--depot-key", str(home.directory)]
 
 
@@ -82,7 +82,7 @@ COMMANDS: list[tuple[Sequence[str], int, str]] = [
     ("command", "status", "words"), COMMANDS, ids=lambda it: it[0] if isinstance(it, tuple) else ""
 )
 def test_command_prints_the_truth_and_no_secret(
-    home: Home, flown: Path, tmp_path: Path, command: Sequence[str], status: int, words: str
+    home: KeyDirectory, flown: Path, tmp_path: Path, command: Sequence[str], status: int, words: str
 ) -> None:
     bundle = str(home.directory.parent / "bundles/1.bundle.json")
     places = {
@@ -116,7 +116,7 @@ def brought_home(flown: Path, directory: Path) -> Path:
     return directory
 
 
-def test_captures_alone_are_flown_again_with_keys(home: Home, tmp_path: Path, keys: list[str]) -> None:
+def test_captures_alone_are_flown_again_with_keys(home: KeyDirectory, tmp_path: Path, keys: list[str]) -> None:
     plain = {key: value for key, value in SCENARIO.items() if key != "timeline"}
     asked = tmp_path / "asked.yaml"
     asked.write_text(json.dumps({**plain, "security": {"keys": str(home.directory), "seal": True}}))

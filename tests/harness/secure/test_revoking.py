@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from harness.errors import ScenarioError
-from harness.play.keyring.key_directory import Home, write_revocation
+from harness.play.keyring.key_directory import KeyDirectory, write_revocation
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from tests.harness.command import harness
@@ -20,8 +20,8 @@ REVOKED = {"timeline": [{"at_s": 60, "kill": [3]}, {"at_s": 70, "revoke": [3], "
 
 
 @pytest.fixture
-def home(tmp_path: Path) -> Home:
-    home = Home.new(tmp_path / "home", ROSTER, seals=True, epoch_s=600.0)
+def home(tmp_path: Path) -> KeyDirectory:
+    home = KeyDirectory.new(tmp_path / "home", ROSTER, seals=True, epoch_s=600.0)
     home.write_bundles(tmp_path / "bundles")
     return home
 
@@ -30,7 +30,7 @@ def asked(directory: Path, **keys: Any) -> Scenario:
     return scenario(agents=ROSTER, duration_s=200, security={"keys": str(directory)}, **{**REVOKED, **keys})
 
 
-def test_the_home_of_the_keys_revokes_and_stays_as_it_was(home: Home, tmp_path: Path) -> None:
+def test_the_home_of_the_keys_revokes_and_stays_as_it_was(home: KeyDirectory, tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in home.directory.iterdir()}
     path = tmp_path / "asked.yaml"
     path.write_text(json.dumps(asked(home.directory).model_dump(mode="json", exclude_defaults=True)))
@@ -46,14 +46,14 @@ def test_the_home_of_the_keys_revokes_and_stays_as_it_was(home: Home, tmp_path: 
     assert told(secrets(home, 2), left_in(tmp_path / "run")) == []
 
 
-def test_bundles_revoke_by_the_message_that_was_made_at_home(home: Home, tmp_path: Path) -> None:
+def test_bundles_revoke_by_the_message_that_was_made_at_home(home: KeyDirectory, tmp_path: Path) -> None:
     done = harness("keys", "revoke", home.directory, "3", "--out", tmp_path / "bundles/revocation.json")
     assert done.returncode == 0, done.stderr
     played = simulate(asked(tmp_path / "bundles"), 1)
     assert played.result.chains == simulate(asked(home.directory), 1).result.chains
 
 
-Break = Callable[[Home, Path], None]
+Break = Callable[[KeyDirectory, Path], None]
 MISTAKES: list[tuple[Break, dict[str, Any], str]] = [
     (lambda home, bundles: None, {}, "needs the authority's key or a revocation, and the directory has neither"),
     (
@@ -84,20 +84,20 @@ MISTAKES: list[tuple[Break, dict[str, Any], str]] = [
 ]
 
 
-def other(home: Home, bundles: Path) -> Home:
-    return Home.new(bundles / "other", ROSTER, seals=True, epoch_s=600.0)
+def other(home: KeyDirectory, bundles: Path) -> KeyDirectory:
+    return KeyDirectory.new(bundles / "other", ROSTER, seals=True, epoch_s=600.0)
 
 
 @pytest.mark.parametrize(("mistake", "keys", "sentence"), MISTAKES)
 def test_revocation_without_a_key_is_refused(
-    home: Home, tmp_path: Path, mistake: Break, keys: dict[str, Any], sentence: str
+    home: KeyDirectory, tmp_path: Path, mistake: Break, keys: dict[str, Any], sentence: str
 ) -> None:
     mistake(home, tmp_path / "bundles")
     with pytest.raises(ScenarioError, match=sentence):
         simulate(asked(tmp_path / "bundles", **keys), 1)
 
 
-def test_timeline_must_begin_with_the_prepared_revocation(home: Home) -> None:
+def test_timeline_must_begin_with_the_prepared_revocation(home: KeyDirectory) -> None:
     assert home.revoke([3]).number == 1
     assert not simulate(asked(home.directory), 1).result.bad
     later = [{"at_s": 60, "revoke": [2], "heard_by": [1]}, *REVOKED["timeline"][1:]]
@@ -105,7 +105,7 @@ def test_timeline_must_begin_with_the_prepared_revocation(home: Home) -> None:
         simulate(asked(home.directory, timeline=later), 1)
 
 
-def test_run_refuses_keys_with_another_fingerprint(home: Home) -> None:
+def test_run_refuses_keys_with_another_fingerprint(home: KeyDirectory) -> None:
     def with_fingerprint(fingerprint: str) -> Scenario:
         security = {"keys": str(home.directory), "fingerprint": fingerprint}
         return scenario(agents=ROSTER, duration_s=10, security=security)

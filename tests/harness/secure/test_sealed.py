@@ -10,7 +10,7 @@ import pytest
 from harness.archive.exports import SUFFIX, Export
 from harness.archive.traces import HANDLER_RUN, Header, Trace
 from harness.checker import Evidence, steps
-from harness.play.keyring.key_directory import Home
+from harness.play.keyring.key_directory import KeyDirectory
 from tests.harness.command import harness
 from tests.ucp.air import Air
 from ucp.agent import Agent
@@ -29,7 +29,7 @@ class SealedSwarm:
     """Three agents that committed a few encrypted blocks, with exports and keys in a directory."""
 
     def __init__(self, directory: Path) -> None:
-        self.home = Home.new(directory / "keys", ROSTER, seals=True, epoch_s=600.0)
+        self.home = KeyDirectory.new(directory / "keys", ROSTER, seals=True, epoch_s=600.0)
         bundles = self.home.bundles()
         self.initial_data = seal_to(b"sealed", bundles[1].public.depot or b"")
         self.air = Air(ROSTER)
@@ -127,7 +127,7 @@ def test_a_consolidated_record_has_the_events_once_the_depot_opens_them(swarm: S
 
 
 def test_another_depots_key_is_refused(swarm: SealedSwarm, tmp_path: Path) -> None:
-    other = Home.new(tmp_path / "other", ROSTER, seals=True, epoch_s=600.0)
+    other = KeyDirectory.new(tmp_path / "other", ROSTER, seals=True, epoch_s=600.0)
     for command in ("chain", "consolidate"):
         done = harness(command, swarm.directory, "--depot-key", other.directory)
         assert done.returncode == 2

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from harness.play.keyring.key_directory import Home
+from harness.play.keyring.key_directory import KeyDirectory
 from tests.harness.command import harness
 from tests.harness.secure.secrets import boots_in, forms, left_in, secrets, told
 
@@ -18,14 +18,14 @@ EPOCHS = 14
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
+def home(tmp_path_factory: pytest.TempPathFactory) -> KeyDirectory:
     """Create the keys and bundles of a mission with short epochs."""
-    home = Home.new(tmp_path_factory.mktemp("secrets") / "keys", ROSTER, seals=True, epoch_s=30.0)
+    home = KeyDirectory.new(tmp_path_factory.mktemp("secrets") / "keys", ROSTER, seals=True, epoch_s=30.0)
     home.write_bundles(home.directory.parent / "bundles")
     return home
 
 
-def scenario(directory: Path, home: Home, **keys: Any) -> Path:
+def scenario(directory: Path, home: KeyDirectory, **keys: Any) -> Path:
     path = directory / "secret.yaml"
     security = {"keys": str(home.directory.parent / "bundles"), "seal": True, "captured": 3}
     asked = {
@@ -49,7 +49,7 @@ def run(asked: Path, *options: str) -> tuple[int, list[tuple[str, bytes]]]:
     return done.returncode, [("its output", (done.stdout + done.stderr).encode()), *left]
 
 
-def test_files_of_a_run_contain_no_secret(home: Home, tmp_path: Path) -> None:
+def test_files_of_a_run_contain_no_secret(home: KeyDirectory, tmp_path: Path) -> None:
     status, left = run(scenario(tmp_path, home), "--backend", "sim")
     assert status in (0, 1), left[0]
     names = {Path(name).name for name, _ in left}
@@ -63,7 +63,7 @@ def test_files_of_a_run_contain_no_secret(home: Home, tmp_path: Path) -> None:
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_files_of_a_failed_run_of_processes_contain_no_secret(home: Home, tmp_path: Path) -> None:
+def test_files_of_a_failed_run_of_processes_contain_no_secret(home: KeyDirectory, tmp_path: Path) -> None:
     """Agent 2 is a program that prints all its input and ends."""
     tells = ["sh", "-c", "cat *.mission.json; printenv; exit 3"]
     asked = scenario(tmp_path, home, agent_command={"2": tells}, capture=False, speedup=20, duration_s=40, timeline=[])
@@ -74,7 +74,7 @@ def test_files_of_a_failed_run_of_processes_contain_no_secret(home: Home, tmp_pa
 
 
 @pytest.mark.parametrize("tells", ["error", "version"])
-def test_virtual_agent_that_repeats_its_input_reveals_no_secret(home: Home, tmp_path: Path, tells: str) -> None:
+def test_virtual_agent_that_repeats_its_input_reveals_no_secret(home: KeyDirectory, tmp_path: Path, tells: str) -> None:
     """The agent refuses its mission with a copy of its input, or puts it into its status."""
     says = {
         "error": "{'error': 'no: ' + str(given.get('bundle'))[-190:]}",
@@ -95,7 +95,7 @@ def test_virtual_agent_that_repeats_its_input_reveals_no_secret(home: Home, tmp_
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_captured_keys_forge_only_blocks_of_their_vehicle(home: Home, tmp_path: Path) -> None:
+def test_captured_keys_forge_only_blocks_of_their_vehicle(home: KeyDirectory, tmp_path: Path) -> None:
     """Play the run with processes, and check that its directory also contains no secret."""
     forged = [{"at_s": 60, "forge": {"message": "Commit Block", "sender": sender}} for sender in (3,)]
     forged += [{"at_s": 80, "forge": {"message": "Commit Block", "sender": 2}}]
@@ -115,7 +115,7 @@ def test_captured_keys_forge_only_blocks_of_their_vehicle(home: Home, tmp_path: 
 
 
 @pytest.mark.parametrize("mistake", ["mode", "swapped", "cut off", "text"])
-def test_no_error_message_has_a_secret(home: Home, tmp_path: Path, mistake: str) -> None:
+def test_no_error_message_has_a_secret(home: KeyDirectory, tmp_path: Path, mistake: str) -> None:
     bundles = tmp_path / "bundles"
     home.write_bundles(bundles)
     path = bundles / "2.bundle.json"

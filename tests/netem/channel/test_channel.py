@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.channel import PRESETS, Channel, Contention, Fate, Radio, Transmission, Turns
+from netem.channel import PRESETS, Channel, FrameFate, Radio, TimeSlotRadio, Transmission, WifiRadio
 from netem.radio import Place
 
 WIFI_1 = PRESETS["wifi_1"]
@@ -62,14 +62,14 @@ def test_lora_airtime_equals_the_calculator_of_semtech() -> None:
 def test_station_on_an_idle_channel_sends_at_once() -> None:
     (frame,) = sent(QUIET, [0, 100], (0, 1.0))
     assert (frame.queued_at, frame.began_at, frame.ended_at) == (1.0, 1.0, 1.0 + AIRTIME_S)
-    assert frame.fate(1) is Fate.RECEIVED
+    assert frame.fate(1) is FrameFate.RECEIVED
 
 
 def test_stations_that_start_in_the_same_slot_collide() -> None:
     first, second = sent(QUIET, [0, 100, 50], (0, 1.0), (1, 1.0))
     assert first.began_at == second.began_at
-    assert first.lost() == {Fate.COLLISION: 0b100, Fate.HALF_DUPLEX: 0b010}
-    assert second.lost() == {Fate.COLLISION: 0b100, Fate.HALF_DUPLEX: 0b001}
+    assert first.lost() == {FrameFate.COLLISION: 0b100, FrameFate.HALF_DUPLEX: 0b010}
+    assert second.lost() == {FrameFate.COLLISION: 0b100, FrameFate.HALF_DUPLEX: 0b001}
 
 
 def test_station_that_senses_a_frame_waits_for_difs_and_its_backoff() -> None:
@@ -81,8 +81,8 @@ def test_station_that_senses_a_frame_waits_for_difs_and_its_backoff() -> None:
 def test_frame_that_began_too_recently_is_not_sensed() -> None:
     first, second = sent(QUIET, [0, 10], (0, 1.0), (1, 1.0 + 14e-6))
     assert second.began_at == 1.0 + 14e-6
-    assert second.fate(0) is Fate.HALF_DUPLEX
-    assert first.fate(1) is Fate.HALF_DUPLEX
+    assert second.fate(0) is FrameFate.HALF_DUPLEX
+    assert first.fate(1) is FrameFate.HALF_DUPLEX
 
 
 def test_station_draws_a_backoff_after_its_own_frame() -> None:
@@ -100,9 +100,9 @@ def test_station_counts_down_after_its_frame_while_it_has_no_other() -> None:
 def test_hidden_stations_collide_although_each_senses_an_idle_channel() -> None:
     first, second = sent(QUIET, [0, 380, 480], (0, 1.0), (2, 1.0005))
     assert second.began_at == second.queued_at
-    assert first.fate(1) is Fate.COLLISION
-    assert second.fate(1) is Fate.COLLISION
-    assert first.fate(2) is Fate.RANGE
+    assert first.fate(1) is FrameFate.COLLISION
+    assert second.fate(1) is FrameFate.COLLISION
+    assert first.fate(2) is FrameFate.RANGE
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -142,42 +142,42 @@ def test_station_sends_if_the_sum_of_frames_is_below_energy_detection() -> None:
 
 def test_stronger_frame_in_the_same_slot_is_captured() -> None:
     near, far = sent(QUIET, [0, 20, 400], (0, 1.0), (2, 1.0))
-    assert near.fate(1) is Fate.RECEIVED
-    assert far.fate(1) is Fate.COLLISION
+    assert near.fate(1) is FrameFate.RECEIVED
+    assert far.fate(1) is FrameFate.COLLISION
 
 
 def test_receiver_keeps_the_first_frame_after_the_capture_window() -> None:
     metres = [0, 380, 480]  # the second frame is 13.5 dB stronger at station 1
     _, late = sent(QUIET, metres, (0, 1.0), (2, 1.0005))
-    assert late.fate(1) is Fate.COLLISION
+    assert late.fate(1) is FrameFate.COLLISION
     _, early = sent(replace(QUIET, capture_window_s=1e-3), metres, (0, 1.0), (2, 1.0005))
-    assert early.fate(1) is Fate.RECEIVED
+    assert early.fate(1) is FrameFate.RECEIVED
 
 
 def test_frame_survives_a_weaker_one_that_begins_later() -> None:
     first, second = sent(QUIET, [0, 50, 480], (0, 1.0), (2, 1.0005))
-    assert first.fate(1) is Fate.RECEIVED
-    assert second.fate(1) is Fate.COLLISION
+    assert first.fate(1) is FrameFate.RECEIVED
+    assert second.fate(1) is FrameFate.COLLISION
 
 
 def test_sender_receives_nothing_while_it_sends() -> None:
     hidden_but_near = replace(QUIET, sense_s=0.01)  # senses frames too late
     first, second = sent(hidden_but_near, [0, 10], (0, 1.0), (1, 1.0005))
-    assert first.fate(1) is Fate.HALF_DUPLEX
-    assert second.fate(0) is Fate.HALF_DUPLEX
+    assert first.fate(1) is FrameFate.HALF_DUPLEX
+    assert second.fate(0) is FrameFate.HALF_DUPLEX
 
 
 def test_full_queue_drops_messages() -> None:
     made = channel(replace(QUIET, queue_frames=2), 0, 10)
     answers = [made.send(0, 1.0, ANSWER) for _ in range(5)]
-    assert answers == [0, 1, 2, Fate.QUEUE, Fate.QUEUE]  # the first one is on the air
+    assert answers == [0, 1, 2, FrameFate.QUEUE, FrameFate.QUEUE]  # the first one is on the air
     assert made.send(0, 1.0 + AIRTIME_S + DIFS_S + 31 * 20e-6, ANSWER) == 3
 
 
 def test_message_longer_than_a_frame_is_dropped() -> None:
-    assert channel(QUIET, 0, 10).send(0, 1.0, 2305) is Fate.TOO_LONG
-    assert channel(PRESETS["rfd900"], 0, 10).send(0, 1.0, 753) is Fate.TOO_LONG
-    assert channel(PRESETS["lora_sf7"], 0, 10).send(0, 1.0, 256) is Fate.TOO_LONG
+    assert channel(QUIET, 0, 10).send(0, 1.0, 2305) is FrameFate.TOO_LONG
+    assert channel(PRESETS["rfd900"], 0, 10).send(0, 1.0, 753) is FrameFate.TOO_LONG
+    assert channel(PRESETS["lora_sf7"], 0, 10).send(0, 1.0, 256) is FrameFate.TOO_LONG
 
 
 def test_lora_station_keeps_its_duty_cycle() -> None:
@@ -188,7 +188,7 @@ def test_lora_station_keeps_its_duty_cycle() -> None:
 
 def test_telemetry_radios_send_in_turns_and_never_collide() -> None:
     radio = PRESETS["rfd900"]
-    assert isinstance(radio, Turns)
+    assert isinstance(radio, TimeSlotRadio)
     frames = sent(radio, [0, 10, 20], (0, 0.05), (1, 0.05), (2, 0.05), (2, 0.06))
     assert [frame.sender for frame in frames] == [0, 1, 2, 2]
     assert [frame.began_at for frame in frames[:3]] == pytest.approx([0.05, 0.1037, 0.2074], abs=1e-9)
@@ -201,20 +201,20 @@ def test_partition_puts_vehicles_on_different_channels() -> None:
     made.send(0, 1.0, ANSWER)
     made.send(2, 1.0005, ANSWER)
     first, second = made.advance(LONG_AFTER)
-    assert (first.fate(1), first.fate(2)) == (Fate.RECEIVED, Fate.PARTITION)
-    assert (second.fate(3), second.fate(0)) == (Fate.RECEIVED, Fate.PARTITION)
+    assert (first.fate(1), first.fate(2)) == (FrameFate.RECEIVED, FrameFate.PARTITION)
+    assert (second.fate(3), second.fate(0)) == (FrameFate.RECEIVED, FrameFate.PARTITION)
     assert second.began_at == 1.0005
 
 
 def test_antenna_at_half_a_metre_halves_the_range() -> None:
     grounded = replace(QUIET, ground="two_ray", antenna_m=0.5)
-    assert sent(QUIET, [0, 400], (0, 1.0))[0].fate(1) is Fate.RECEIVED
-    assert sent(grounded, [0, 170], (0, 1.0))[0].fate(1) is Fate.RECEIVED
-    assert sent(grounded, [0, 190], (0, 1.0))[0].fate(1) is Fate.RANGE
+    assert sent(QUIET, [0, 400], (0, 1.0))[0].fate(1) is FrameFate.RECEIVED
+    assert sent(grounded, [0, 170], (0, 1.0))[0].fate(1) is FrameFate.RECEIVED
+    assert sent(grounded, [0, 190], (0, 1.0))[0].fate(1) is FrameFate.RANGE
     made = Channel((1, 2), grounded, 1)
     made.move([place(0, 30.0), place(400, 30.0)], 0.0)
     made.send(0, 1.0, ANSWER)
-    assert made.advance(2.0)[0].fate(1) is Fate.RECEIVED
+    assert made.advance(2.0)[0].fate(1) is FrameFate.RECEIVED
 
 
 def test_shadowing_is_the_same_shortly_afterwards_and_in_both_directions() -> None:
@@ -290,9 +290,9 @@ def test_each_receiver_has_one_fate_and_no_station_sends_twice_at_a_time(
 
 def test_more_frames_than_the_channel_carries_are_dropped_or_collide() -> None:
     radio = PRESETS["wifi_1"]
-    assert isinstance(radio, Contention)
+    assert isinstance(radio, WifiRadio)
     made = channel(radio, 0, 10, 20, 30, 40)
     answers = [made.send(number % 5, number * 1e-4, ANSWER) for number in range(2000)]
-    drops = answers.count(Fate.QUEUE)
+    drops = answers.count(FrameFate.QUEUE)
     assert drops > 1500
     assert len(made.advance(LONG_AFTER)) == 2000 - drops

@@ -21,7 +21,7 @@ from itertools import groupby, pairwise
 
 import pytest
 
-from netem.channel import PRESETS, Channel, Contention, Transmission
+from netem.channel import PRESETS, Channel, Transmission, WifiRadio
 
 pytestmark = pytest.mark.any_user
 
@@ -52,7 +52,7 @@ def binomial(n: int, p: float, k: int) -> float:
     return math.comb(n, k) * p**k * (1 - p) ** (n - k)
 
 
-def saturated(radio: Contention, n: int) -> list[tuple[float, int]]:
+def saturated(radio: WifiRadio, n: int) -> list[tuple[float, int]]:
     """Return, for each busy time, the seconds until the next one and the number of senders."""
     channel = Channel(range(1, n + 1), radio, seed=1)
     for station in range(n):
@@ -81,7 +81,7 @@ def ratio(parts: Sequence[float], wholes: Sequence[float]) -> tuple[float, float
 @pytest.mark.parametrize(("preset", "n"), [("wifi_1", 5), ("wifi_1", 20), ("wifi_6", 2), ("wifi_6", 5), ("wifi_6", 20)])
 def test_saturated_stations_collide_as_often_as_the_closed_form(preset: str, n: int) -> None:
     radio = PRESETS[preset]
-    assert isinstance(radio, Contention)
+    assert isinstance(radio, WifiRadio)
     radio = replace(radio, shadowing_db=0.0)
     alone, busy, frames = alone_and_busy(n, radio.contention_window + 1)
     found = saturated(radio, n)

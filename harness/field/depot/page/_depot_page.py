@@ -24,7 +24,7 @@ from harness.field.depot.record_outputs import (
 from harness.field.flight_logs._matching import MatchedLog
 from harness.field.flight_logs._summary import changes
 from harness.present import text as text_module
-from harness.present.colours import Ink, inks
+from harness.present.colours import AgentColours, inks
 from harness.report import html
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
@@ -133,7 +133,7 @@ def _figures(record: Consolidation, single_copies: list[str]) -> list[tuple[str,
 
 
 def _trees(
-    record: Consolidation, reconciliation: Reconciliation | None, ink: Mapping[int, Ink]
+    record: Consolidation, reconciliation: Reconciliation | None, ink: Mapping[int, AgentColours]
 ) -> list[tuple[str, Markup]] | None:
     """Return pictures of the chains before and after the reconcile, or None if there are too many blocks for a
     picture.
@@ -147,11 +147,11 @@ def _trees(
     return drawn
 
 
-def _tree(exports: Mapping[int, Export], record: Consolidation, ink: Mapping[int, Ink], key: str) -> Markup:
+def _tree(exports: Mapping[int, Export], record: Consolidation, ink: Mapping[int, AgentColours], key: str) -> Markup:
     return ChainTreePicture(exports, ink, key, record.names).draw("abridged")
 
 
-def _vehicles(record: Consolidation, ink: Mapping[int, Ink]) -> list[dict[str, Any]]:
+def _vehicles(record: Consolidation, ink: Mapping[int, AgentColours]) -> list[dict[str, Any]]:
     """Return a table row for each export, and for each vehicle without one."""
     rows: list[dict[str, Any]] = [
         {
@@ -171,7 +171,7 @@ def _vehicles(record: Consolidation, ink: Mapping[int, Ink]) -> list[dict[str, A
     return sorted(rows + absent, key=lambda row: row["agent_id"])
 
 
-def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, Ink]) -> list[dict[str, Any]]:
+def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, AgentColours]) -> list[dict[str, Any]]:
     """Return the changes (such as flight modes) of all vehicles with a flight log and an agent, in order of time."""
     found = [change for match in matches if match.agent_id is not None for change in changes(match)]
     return [
@@ -186,7 +186,7 @@ def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, Ink]) -> list[dict
     ]
 
 
-def _row(block: Block, ink: Mapping[int, Ink]) -> dict[str, Any]:
+def _row(block: Block, ink: Mapping[int, AgentColours]) -> dict[str, Any]:
     places = []
     for held in block.held:
         position = "" if held.position is None else f" {held.position}"

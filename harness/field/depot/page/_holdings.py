@@ -81,7 +81,7 @@ Column = tuple[str, str, Mapping[int, str]]
 """The group, the name, and the place of the block on each vehicle."""
 
 
-class _Range(NamedTuple):
+class _BlockRange(NamedTuple):
     """The columns from `begin` up to `end`, in which the agent holds blocks at `place`.
 
     `fraction` is "part" if not all.
@@ -152,7 +152,7 @@ def _group(
     return Markup("").join(parts)
 
 
-def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Iterator[_Range]:
+def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Iterator[_BlockRange]:
     """Yield ranges of consecutive blocks that the agent holds in the same place.
 
     Columns narrower than a pixel are combined into cells. A cell shows the place at which the agent holds most of its
@@ -166,7 +166,7 @@ def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Itera
         begin, at = at, at + len(list(alike))
         if place is not None:
             held = members[begin * columns_per_cell : at * columns_per_cell]
-            yield _Range(
+            yield _BlockRange(
                 place,
                 fraction,
                 begin * columns_per_cell,

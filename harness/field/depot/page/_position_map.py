@@ -11,9 +11,9 @@ from itertools import pairwise
 
 from markupsafe import Markup
 
-from harness.archive.tracks import Fix
+from harness.archive.tracks import PositionFix
 from harness.present import text
-from harness.present.colours import Ink
+from harness.present.colours import AgentColours
 from harness.present.svg import FONT, n
 from harness.report.logbook.positions import GlobalPosition, LogEntry, Track
 from harness.report.map_parts import Point, Projection, extent, thin
@@ -31,7 +31,7 @@ _WIDTH, _HEIGHT = 900, 560
 
 
 @dataclass(frozen=True)
-class Map:
+class EventMap:
     """A map, and sentences about events that it omits."""
 
     drawing: Markup
@@ -42,9 +42,9 @@ def draw(
     tracks: Sequence[Track],
     rare: Iterable[str],
     lost: Mapping[int, Sequence[int]],
-    ink: Mapping[int, Ink],
+    ink: Mapping[int, AgentColours],
     flown: Sequence[Track] = (),
-) -> Map:
+) -> EventMap:
     """Draw the map. `rare` names blocks on one vehicle only, `lost` numbers each agent's lost blocks, and `flown` are
     paths from flight logs.
 
@@ -84,7 +84,7 @@ def draw(
     notes = [] if len(shown) == len(logged) else [f"The map shows {len(shown)} of {len(logged)} events."]
     if far_positions:
         notes.append(f"{far_positions} positions more than {FARTHEST_M / 1000:.0f} km away are at the edge.")
-    return Map(drawing, notes)
+    return EventMap(drawing, notes)
 
 
 class _Field:
@@ -98,16 +98,19 @@ class _Field:
         self._first_us = min(at_us for track in tracks for at_us, _ in track.fixes)
         self.far_positions = 0
 
-    def fix(self, at_us: int, position: GlobalPosition) -> Fix:
+    def fix(self, at_us: int, position: GlobalPosition) -> PositionFix:
         north_m = (position.lat_e7 / 1e7 - self._lat) * METRES_PER_DEGREE
         east_m = ((position.lon_e7 / 1e7 - self._lon + 180) % 360 - 180) * self._east
         self.far_positions += max(abs(north_m), abs(east_m)) > FARTHEST_M
         at_s = (at_us - self._first_us) / 1e6
-        return Fix(at_s, *(max(-FARTHEST_M, min(FARTHEST_M, metres)) for metres in (north_m, east_m)))
+        return PositionFix(at_s, *(max(-FARTHEST_M, min(FARTHEST_M, metres)) for metres in (north_m, east_m)))
 
 
 def _flown(
-    tracks: Sequence[Track], paths: Sequence[Sequence[Fix]], projection: Projection, ink: Mapping[int, Ink]
+    tracks: Sequence[Track],
+    paths: Sequence[Sequence[PositionFix]],
+    projection: Projection,
+    ink: Mapping[int, AgentColours],
 ) -> Markup:
     stride = sum(map(len, paths)) // MAX_FIXES + 1
     lines = thin([[projection(fix) for fix in (*path[:-1:stride], path[-1])] for path in paths], MAX_POINTS)
@@ -121,10 +124,10 @@ def _flown(
 
 def _paths(
     tracks: Sequence[Track],
-    paths: Mapping[int, Sequence[Fix]],
+    paths: Mapping[int, Sequence[PositionFix]],
     lost: Mapping[int, Sequence[int]],
     projection: Projection,
-    ink: Mapping[int, Ink],
+    ink: Mapping[int, AgentColours],
 ) -> Markup:
     pieces = [(track, gap, piece) for track in tracks for gap, piece in _pieces(track, paths[track.agent_id], lost)]
     stride = sum(map(len, paths.values())) // MAX_FIXES + 1  # thinning visits each point several times
@@ -143,8 +146,8 @@ def _paths(
 
 
 def _pieces(
-    track: Track, path: Sequence[Fix], lost: Mapping[int, Sequence[int]]
-) -> Iterable[tuple[bool, Sequence[Fix]]]:
+    track: Track, path: Sequence[PositionFix], lost: Mapping[int, Sequence[int]]
+) -> Iterable[tuple[bool, Sequence[PositionFix]]]:
     """Yield the pieces of a path, each with true if the piece is a gap.
 
     A gap is where blocks between two positions were lost.
@@ -173,7 +176,7 @@ def _logged(track: Track, single_copies: set[str]) -> Iterable[tuple[bool, int, 
             yield rare, track.agent_id, entry
 
 
-def _mark(place: Point, entry: LogEntry, rare: bool, ink: Ink) -> Markup:
+def _mark(place: Point, entry: LogEntry, rare: bool, ink: AgentColours) -> Markup:
     tip = [
         describe(entry.event.event_id, entry.event.data),
         text.moment(entry.event.timestamp_us),
@@ -184,7 +187,9 @@ def _mark(place: Point, entry: LogEntry, rare: bool, ink: Ink) -> Markup:
     )
 
 
-def _ends(paths: Mapping[int, Sequence[Fix]], projection: Projection, ink: Mapping[int, Ink]) -> Markup:
+def _ends(
+    paths: Mapping[int, Sequence[PositionFix]], projection: Projection, ink: Mapping[int, AgentColours]
+) -> Markup:
     parts = []
     for agent_id, path in paths.items():
         colours = ink[agent_id]

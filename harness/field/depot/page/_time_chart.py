@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from harness.field.depot.consolidation import Consolidation, RecordedBlock, events_in
 from harness.present import svg, text
-from harness.present.colours import Ink
+from harness.present.colours import AgentColours
 from harness.present.svg import n
 
 WIDTH, LEFT, RIGHT, TOP, BOTTOM = 900, 76, 24, 8, 34
@@ -46,7 +46,7 @@ def time_span_of(record: Consolidation) -> TimeSpan | None:
     return TimeSpan(first, last, outside)
 
 
-def draw(record: Consolidation, time_span: TimeSpan, ink: Mapping[int, Ink]) -> Markup:
+def draw(record: Consolidation, time_span: TimeSpan, ink: Mapping[int, AgentColours]) -> Markup:
     """Draw the rows of all vehicles."""
     length_s = max(1.0, (time_span.last_us - time_span.first_us) / 1e6)
     axis = svg.linear_axis(0.0, length_s, (LEFT, WIDTH - RIGHT))
@@ -90,7 +90,7 @@ def _lane(
     time_span: TimeSpan,
     axis: svg.Axis,
     top: float,
-    ink: Ink,
+    ink: AgentColours,
 ) -> Markup:
     name = Markup('<text x="{}" y="{}" text-anchor="end">{}</text>').format(n(LEFT - 10), n(top + 25), agent_id)
     ground = Markup('<rect class="lane" x="{}" y="{}" width="{}" height="{}"/>').format(
@@ -107,7 +107,9 @@ def _lane(
     )
 
 
-def _bars(blocks: Sequence[RecordedBlock], time_span: TimeSpan, axis: svg.Axis, top: float, ink: Ink) -> Markup:
+def _bars(
+    blocks: Sequence[RecordedBlock], time_span: TimeSpan, axis: svg.Axis, top: float, ink: AgentColours
+) -> Markup:
     """Draw a histogram of the events over time."""
     width = (axis.end - axis.start) / BINS
     length = max(1, time_span.last_us - time_span.first_us)

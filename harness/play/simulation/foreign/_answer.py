@@ -34,7 +34,7 @@ class RefusedError(Exception):
 
 
 @dataclass(slots=True)
-class Answer:
+class ForeignAnswer:
     """A valid answer of a foreign agent."""
 
     sent: list[tuple[bytes, RecordedBytes]]
@@ -46,7 +46,7 @@ class Answer:
     """The answer to a command. The parser does not check it."""
 
 
-def read_answer(line: bytes, *, tracing: bool) -> Answer:
+def read_answer(line: bytes, *, tracing: bool) -> ForeignAnswer:
     """Parse a line. Raises AnswerError, LacksError or RefusedError."""
     try:
         document = from_json(line, allow_inf_nan=False)
@@ -66,7 +66,7 @@ def read_answer(line: bytes, *, tracing: bool) -> Answer:
     if timer is not None and (type(timer) not in (int, float) or not -LATEST_S <= timer <= LATEST_S):
         what = f"with the timer {shown(timer)}, not" if "timer" in document else "without"
         raise AnswerError(f"{what} a number of mission seconds, or null, as `timer`")
-    answer = Answer([_datagram(text) for text in sent], timer, command_answer=document.get("answer"))
+    answer = ForeignAnswer([_datagram(text) for text in sent], timer, command_answer=document.get("answer"))
     if tracing:
         trace = document.get("trace")
         if not isinstance(trace, list):

@@ -19,8 +19,8 @@ from harness.play.agent_control import Status, is_shell_error, last_line
 from harness.play.simulation._simulated_agent import AgentOutput, DiskContents
 from harness.play.simulation.foreign._answer import (
     AgentLacksError,
-    Answer,
     AnswerError,
+    ForeignAnswer,
     LacksError,
     Outcome,
     RefusedError,
@@ -260,7 +260,7 @@ class ForeignAgent:
             raise self._failure("crashed", f"refused to {command}: {last_line(error)}")
         return command_answer
 
-    def _give_input(self, line: str, what: str, now: float) -> Answer:
+    def _give_input(self, line: str, what: str, now: float) -> ForeignAnswer:
         """Give an input to the agent, and store its outputs. If the agent refuses the input, there are no outputs."""
         answer = self._exchange(line, what, now)
         if self._datagrams_sent.add(len(answer.sent), now) > MAX_SENT_PER_S:
@@ -277,7 +277,7 @@ class ForeignAgent:
             self.chain_changed_at = self._now
         return answer
 
-    def _exchange(self, line: str, what: str, now: float) -> Answer:
+    def _exchange(self, line: str, what: str, now: float) -> ForeignAnswer:
         if self.failed is not None:
             raise self.failed
         given = f"{line}\n".encode("ascii")

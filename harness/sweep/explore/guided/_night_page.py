@@ -7,7 +7,7 @@ from typing import Any
 from markupsafe import Markup
 
 from harness.present import svg, text
-from harness.present.svg import Area, linear_axis, n
+from harness.present.svg import ChartArea, linear_axis, n
 from harness.report import html
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
@@ -55,7 +55,7 @@ def headline(night: dict[str, Any]) -> str:
 def _curve(title: str, samples: Sequence[Sequence[int]], unit: str) -> Markup:
     if len(samples) < 2:
         return Markup("")
-    area = Area(0, 0, svg.WIDTH, HEIGHT)
+    area = ChartArea(0, 0, svg.WIDTH, HEIGHT)
     across = linear_axis(0, max(1, *(x for x, _ in samples)), area.across)
     up = linear_axis(0, max(1, *(y for _, y in samples)), area.up)
     frame = svg.frame(

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from markupsafe import Markup
 
 from harness.present import svg, text
-from harness.present.svg import Area, Axis, n
+from harness.present.svg import Axis, ChartArea, n
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import Estimate
 from harness.sweep.matrix._matrix_picture import Dot, curve
@@ -61,7 +61,7 @@ def _drawing(height: float, label: str, panels: Sequence[Markup]) -> Markup:
     ).format(w=svg.WIDTH, h=n(height), label=label, panels=Markup("").join(panels))
 
 
-def _panel(figure: Figure, cell: Cell, dots: Sequence[Dot], dates: Sequence[str], area: Area) -> Markup:
+def _panel(figure: Figure, cell: Cell, dots: Sequence[Dot], dates: Sequence[str], area: ChartArea) -> Markup:
     last = len(dates) - 1
     across = Axis(0, last, *area.across, sorted({0, last // 2, last} if last > 3 else {0, last}))
     up = _value_axis(figure, [dot.estimate for dot in dots], area)
@@ -76,7 +76,7 @@ def _panel(figure: Figure, cell: Cell, dots: Sequence[Dot], dates: Sequence[str]
     return Markup('<g class="panel">{}<g class="series {}">{}</g></g>\n').format(frame, svg.CLASSES[0], drawing)
 
 
-def _value_axis(figure: Figure, estimates: Sequence[Estimate], area: Area) -> Axis:
+def _value_axis(figure: Figure, estimates: Sequence[Estimate], area: ChartArea) -> Axis:
     """Return a vertical axis for all confidence intervals. Its minimum length makes small changes look small."""
     bounds = [
         bound for estimate in estimates for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None

@@ -10,7 +10,7 @@ import pytest
 
 from harness.errors import FieldError
 from harness.field.bisection._live_replay import play_live, script_of
-from harness.field.bisection._scripted_peers import Lateness, message_key
+from harness.field.bisection._scripted_peers import AgentLateness, message_key
 from harness.field.replay import open_record
 from tests.harness.command import harness
 from ucp.messages import ChainContainQuery, encode
@@ -72,7 +72,7 @@ def test_record_with_unknown_names_is_rejected(records: Path, tmp_path: Path) ->
 
 
 def test_peers_are_delayed_while_a_late_agent_reconciles() -> None:
-    lateness = Lateness(0.1)
+    lateness = AgentLateness(0.1)
     assert lateness.at(5.0) == 0.0
     lateness.note_question(10.5, [2.0, 10.0])
     assert lateness.at(14.0) == pytest.approx(0.6)

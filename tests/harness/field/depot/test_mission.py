@@ -10,7 +10,7 @@ import pytest
 from harness.archive.exports import Export
 from harness.errors import RunDirectoryError
 from harness.field.depot.mission_comparison import Comparison, compare
-from harness.field.depot.mission_files import Manifest, MissionFileError, Plan, write
+from harness.field.depot.mission_files import Manifest, MissionFileError, MissionPlan, write
 from tests.harness.command import harness, sentences
 from tests.harness.virtual import scenario
 from ucp.agent import Agent
@@ -27,7 +27,7 @@ DATA = b"the second field test"
 
 @pytest.fixture
 def directory(tmp_path: Path) -> Path:
-    write(Plan(scenario(agents=ROSTER, name="field"), DATA), tmp_path / "mission")
+    write(MissionPlan(scenario(agents=ROSTER, name="field"), DATA), tmp_path / "mission")
     return tmp_path / "mission"
 
 
@@ -111,7 +111,7 @@ def test_missions_of_the_same_name_have_different_inception_blocks(tmp_path: Pat
 
 def test_existing_files_are_kept_without_the_overwrite_option(directory: Path) -> None:
     before = (directory / "10.mission.json").read_text()
-    plan = Plan(scenario(agents=ROSTER), b"another")
+    plan = MissionPlan(scenario(agents=ROSTER), b"another")
     with pytest.raises(RunDirectoryError, match="--overwrite"):
         write(plan, directory)
     assert (directory / "10.mission.json").read_text() == before
@@ -121,7 +121,7 @@ def test_existing_files_are_kept_without_the_overwrite_option(directory: Path) -
 
 def test_stale_mission_file_in_the_directory_is_an_error(directory: Path) -> None:
     with pytest.raises(RunDirectoryError, match=r"122\.mission\.json"):
-        write(Plan(scenario(agents=ROSTER[:-1]), DATA), directory, overwrite=True)
+        write(MissionPlan(scenario(agents=ROSTER[:-1]), DATA), directory, overwrite=True)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_invalid_mission_gives_one_sentence(tmp_path: Path, options: tuple[str, 
 
 def test_too_long_initial_data_is_rejected() -> None:
     with pytest.raises(MissionFileError, match="initial data"):
-        Plan(scenario(), bytes(600_000)).documents()
+        MissionPlan(scenario(), bytes(600_000)).documents()
 
 
 # Verify

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from harness.errors import HarnessError, UnsupportedError
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.play.simulation.foreign import _foreign_agent, _virtual_program
 from harness.run.run import Run, run
 from harness.run.simulate import simulate
@@ -29,7 +29,7 @@ def narrow_limits(monkeypatch: pytest.MonkeyPatch) -> None:
 def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
     """Play a run in which agent 2 is a small program with `code`."""
     one = played_by({2: small(tmp_path, code)}, **{**SHORT, **keys})
-    return run(one, 1, tmp_path / "run", Silent(), "sim")
+    return run(one, 1, tmp_path / "run", SilentProgress(), "sim")
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ virtual.main()
 def test_crash_of_an_agent_violates_no_characteristic(tmp_path: Path) -> None:
     (tmp_path / "dying.py").write_text(ENDS_IN_PHASE_TWO)
     dying = [sys.executable, str(tmp_path / "dying.py")]
-    finished = run(played_by({2: dying}, network={"loss": 0.3}), 1, tmp_path / "run", Silent(), "sim")
+    finished = run(played_by({2: dying}, network={"loss": 0.3}), 1, tmp_path / "run", SilentProgress(), "sim")
     assert "agent 2 ended by itself with status 7" in str(finished.played.outcome_detail)
     assert finished.exit_status == 1 and not finished.result.bad
 

@@ -5,7 +5,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario
@@ -80,7 +80,7 @@ def test_own_agent_with_keys_behaves_the_same_behind_lines() -> None:
 
 def test_run_directory_with_foreign_agents_equals_memory(tmp_path: Path) -> None:
     one = played_by({2: OURS}, agents=3, duration_s=200, network={"loss": 0.1})
-    finished = run(one, 1, tmp_path / "run", Silent(), "sim")
+    finished = run(one, 1, tmp_path / "run", SilentProgress(), "sim")
     assert finished.exit_status == 0
     in_memory = simulate(one, 1, tracing=True)
     assert finished.result.to_json() == in_memory.result.to_json()

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from harness.play.keyring.key_directory import Home, KeysError, load_depot_key
+from harness.play.keyring.key_directory import KeyDirectory, KeysError, load_depot_key
 from tests.harness.command import harness
 from ucp.secure.bundle import load_bundle, load_public
 
@@ -17,13 +17,13 @@ from ucp.secure.bundle import load_bundle, load_public
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Create the keys of three vehicles with their bundles, for tests that only read them."""
     home = tmp_path_factory.mktemp("keys") / "home"
-    Home.new(home, [1, 7, 28], seals=True, epoch_s=60.0).write_bundles(home.parent / "bundles")
+    KeyDirectory.new(home, [1, 7, 28], seals=True, epoch_s=60.0).write_bundles(home.parent / "bundles")
     return home
 
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    return Home.new(tmp_path / "home", [1, 7, 28], seals=True, epoch_s=60.0).directory
+    return KeyDirectory.new(tmp_path / "home", [1, 7, 28], seals=True, epoch_s=60.0).directory
 
 
 def secrets(home: Path) -> list[str]:
@@ -69,12 +69,12 @@ def test_revocation_lists_all_vehicles_revoked_so_far(home: Path) -> None:
     done = harness("keys", "revoke", home, "1", "--out", home.parent / "message.json")
     assert done.stdout.rstrip().endswith("number 2, revoked 1, 7")
     assert (home.parent / "message.json").read_text() == (home / "revocation.json").read_text()
-    assert [path.name for path in Home(home).write_bundles(home.parent / "left")] == ["28.bundle.json"]
+    assert [path.name for path in KeyDirectory(home).write_bundles(home.parent / "left")] == ["28.bundle.json"]
     for wrong, sentence in ((7, "already revoked"), (9, "not in this mission, which has agents 1, 7, 28")):
         done = harness("keys", "revoke", home, str(wrong))
         assert (done.returncode, sentence in done.stderr) == (2, True)
     with pytest.raises(KeysError, match="agent 7 is revoked"):
-        Home(home).bundle(7)
+        KeyDirectory(home).bundle(7)
 
 
 def test_existing_key_files_are_not_replaced(home: Path) -> None:
@@ -92,21 +92,21 @@ def edited(path: Path, **keys: Any) -> None:
 def test_keys_that_do_not_belong_together_are_refused(home: Path, made: Path) -> None:
     (home / "vehicles.key").write_text((made / "vehicles.key").read_text())
     with pytest.raises(KeysError, match="belongs to another mission"):
-        Home(home).bundle(7)
+        KeyDirectory(home).bundle(7)
     edited(home / "vehicles.key", mission=load_public(home / "public.json").mission.hex())
     with pytest.raises(KeysError, match="does not match"):
-        Home(home).bundle(7)
+        KeyDirectory(home).bundle(7)
     (home / "authority.key").write_text((made / "authority.key").read_text())
     with pytest.raises(KeysError, match="key of the authority does not match"):
-        Home(home).revoke([7])
+        KeyDirectory(home).revoke([7])
     (home / "depot.key").chmod(0o640)
     with pytest.raises(KeysError, match="chmod 600"):
         load_depot_key(home)
 
 
 def test_edited_revocation_revokes_no_vehicle(home: Path) -> None:
-    Home(home).revoke([7])
+    KeyDirectory(home).revoke([7])
     for message in ("AAAA", "no base64", 7, None):
         edited(home / "revocation.json", message=message)
         with pytest.raises(KeysError, match="`message` is"):
-            Home(home).revocation()
+            KeyDirectory(home).revocation()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.play.progress import Silent
+from harness.play.progress import SilentProgress
 from harness.report.facts import link_qualities
 from harness.run.run import run as play
 from tests.harness.command import DEADLINE_S
@@ -102,7 +102,7 @@ def test_live_page_and_film_show_the_loss_of_the_network(browser: Browser, run: 
     """Receivers record messages late, and a partition lasts for a part of the minute."""
     partition = [{"at_s": 50, "partition": [[1, 2, 3], [4, 5, 6]]}, {"at_s": 80, "heal": True}]
     asked = scenario(agents=6, duration_s=150, network={"loss": 0.2}, timeline=partition, events={"mean_s": 4})
-    lossy = play(asked, 1, tmp_path / "lossy", Silent(), "sim", delivers_all=True).directory
+    lossy = play(asked, 1, tmp_path / "lossy", SilentProgress(), "sim", delivers_all=True).directory
     stories = {"film": film(lossy), "live": late_film(lossy, tmp_path / "live", lag=1)}
     with page_of("watch", run) as (_, address):
         browser.show(address, width=1000, scheme="light")

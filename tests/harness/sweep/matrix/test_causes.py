@@ -103,7 +103,7 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str
         return Outcome(subject="a run"), run
 
     monkeypatch.setattr(_culprits, "ROOT", path)
-    monkeypatch.setattr(_culprits.Workshop, "play", play)
+    monkeypatch.setattr(_culprits.SubjectPlayer, "play", play)
     return commits
 
 
