@@ -37,7 +37,7 @@ from harness.scenario.changes import NO_MORE_FATES
 from netem.conditions import NetworkConditions
 from netem.link import LinkConditions
 from ucp.block import HASH_BYTES
-from ucp.trace import HandlerRun, SentMessage
+from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun, SentMessage
 from ucp.trigger import MessageTrigger
 
 if TYPE_CHECKING:
@@ -168,6 +168,17 @@ class Evidence:
             or (self.scenario is not None and self.scenario.security is not None)
             or any(trace.header.secured for trace in self.traces.values())
             or are_signed(self.exports.values())
+        )
+
+    @cached_property
+    def sent_without_trace(self) -> bool:
+        """True if agents with keys may have sent revocations, challenges or echoes, which have no line in traces.
+
+        Agents send challenges and echoes only after a restart, or after a datagram that needs one.
+        """
+        return any(
+            (trace.header.secured and trace.starts) or any(_needs_control_datagrams(aside) for _, aside in trace.asides)
+            for trace in self.traces.values()
         )
 
     @cached_property
@@ -374,6 +385,12 @@ class Evidence:
         for agent_id, trace in self.traces.items():
             owners.update(dict.fromkeys(trace.completed(), agent_id))
         return owners
+
+
+def _needs_control_datagrams(aside: DroppedDatagram | CommandEntry) -> bool:
+    if isinstance(aside, CommandEntry):
+        return aside.command == "revoke"
+    return aside.dropped in ("not confirmed", "old boot")
 
 
 def gather(archive: RunArchive) -> Evidence:

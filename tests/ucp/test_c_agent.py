@@ -249,8 +249,9 @@ def test_secured_c_agent_drops_the_datagrams_of_the_vectors(secured: Path) -> No
     with Player([str(secured)]) as player:
         begun = player.give({"t": drops["now"], "mission": told, "boot": vectors["boot"], "bundle": {"schema": "x"}})
         assert "bundle" in begun["error"]
-        begun = {"t": drops["now"], "mission": told, "boot": vectors["boot"], "bundle": vectors["bundles"]["7"]}
+        begun = {"t": 0.0, "mission": told, "boot": vectors["boot"], "bundle": vectors["bundles"]["7"]}
         assert "error" not in player.give(begun)
+        player.give({"t": 0.0, "datagram": ""})
         for case in drops["datagrams"]:
             (line,) = player.give({"t": drops["now"], "datagram": case["datagram"]})["trace"]
             assert line.get("dropped") == case["dropped"], case["what"]

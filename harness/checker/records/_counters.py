@@ -13,7 +13,7 @@ from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
 from ucp.messages import Datagram, datagram_bytes
 from ucp.secure.envelope import ADDED_BYTES
-from ucp.trace import CommandEntry, DroppedDatagram, RecordedBytes
+from ucp.trace import DroppedDatagram, RecordedBytes
 from ucp.trigger import BootTrigger
 
 ROUNDED_S = 5e-4
@@ -118,7 +118,8 @@ def _counted(
     if (failures := recorded.send_failures or 0) > sent:
         detail = f"it could not send {failures} messages according to run.json, but its trace has only {sent}"
         yield of_agent(agent_id, detail, "1")
-    sent_bytes = _bytes_sent(trace) if trace.header.has_inputs else None
+    is_traced = trace.header.has_inputs and not evidence.sent_without_trace
+    sent_bytes = _bytes_sent(trace) if is_traced else None
     if sent_bytes is not None and recorded.bytes_sent is not None and recorded.bytes_sent > sent_bytes:
         yield of_agent(
             agent_id,
@@ -143,10 +144,8 @@ def _counted(
             yield of_agent(agent_id, detail)
 
 
-def _bytes_sent(trace: Trace) -> int | None:
-    """Return the total size of all sent datagrams, or None if the agent sent revocations, which are not in traces."""
-    if any(isinstance(aside, CommandEntry) and aside.command == "revoke" for _, aside in trace.asides):
-        return None
+def _bytes_sent(trace: Trace) -> int:
+    """Return the total size of all sent datagrams in a trace."""
     added = ADDED_BYTES if trace.header.secured else {}
     sent = [message for run in trace.runs for message in run.sent]
     return sum([_bytes(message.datagram) + added.get(message.message, 0) for message in sent if message.datagram])

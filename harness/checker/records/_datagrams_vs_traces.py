@@ -16,7 +16,7 @@ from harness.archive.run_record import DatagramsRead
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
-from ucp.trace import CommandEntry, DroppedDatagram
+from ucp.trace import DroppedDatagram
 from ucp.trigger import MessageTrigger
 
 UNDER_WAY_WALL_S = 0.25
@@ -30,10 +30,8 @@ def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
     record = evidence.record
     if record is None or set(record.roster) - set(evidence.traces):
         return
-    if any(_is_revocation(aside) for trace in evidence.traces.values() for _, aside in trace.asides):
-        return  # agents broadcast revocations, and ignore known ones, without a line in the trace
-    if evidence.secured and any(fault.kind.ends_incarnation for fault in record.faults):
-        return  # agents broadcast challenges and echoes after a restart, without a line in the trace
+    if evidence.sent_without_trace:
+        return
     for agent_id, trace in evidence.traces.items():
         counted = record.datagrams.get(str(agent_id))
         if counted is None or trace.problem or not trace.header.has_inputs:
@@ -67,10 +65,6 @@ def find_unread(evidence: Evidence) -> Iterator[Contradiction]:
         if unread > _at_the_end(evidence, agent_id, trace, UNREAD_WALL_S):
             detail = f"{unread} of {counted.broadcasts} datagrams that arrived were left unread in its socket"
             yield of_agent(agent_id, detail)
-
-
-def _is_revocation(aside: DroppedDatagram | CommandEntry) -> bool:
-    return isinstance(aside, CommandEntry) and aside.command == "revoke"
 
 
 def _sentence(counted: DatagramsRead, unrecorded: int, handled: int, dropped: int, own: int) -> str:

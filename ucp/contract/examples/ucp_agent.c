@@ -799,13 +799,14 @@ enum drop {
     GOOD = -1, TRUNCATED, OVERSIZED, WRONG_MAGIC, WRONG_VERSION, IMPOSSIBLE_SENDER, WRONG_LENGTH, UNKNOWN_TYPE,
     BAD_VOTE, IMPOSSIBLE_AGENT, OWN_SENDER, STRANGER, STRANGERS_BLOCK,
     NOT_SECURED, REVOKED_SENDER, NOT_THE_AUTHORITY, KNOWN_ALREADY, EPOCH_OUT_OF_RANGE, OLD_BOOT, REPLAYED,     /* with keys */
-    NOT_AUTHENTIC, NOT_THE_SENDER, ANSWERS_NO_REQUEST, NOT_THE_MAKER, DROPS
+    NOT_AUTHENTIC, NOT_THE_SENDER, ANSWERS_NO_REQUEST, NOT_THE_MAKER, NOT_CONFIRMED, DROPS
 };
 static const char *const DROP[DROPS] = {
     "truncated", "oversized", "wrong magic", "wrong version", "impossible sender", "wrong length", "unknown type",
     "bad vote", "impossible agent", "own sender", "sender not on the roster", "block not of the roster",
     "not secured", "revoked sender", "not signed by the authority", "known already", "epoch out of range", "old boot",
-    "replayed", "not authentic", "not signed by its sender", "answers no request", "block not signed by its maker"};
+    "replayed", "not authentic", "not signed by its sender", "answers no request", "block not signed by its maker",
+    "not confirmed"};
 
 typedef struct { uint64_t yes, no; } Count;
 typedef struct { bool is_top; Hash block; uint64_t count, timestamp; } Candidate;   /* is_top: Is Top Of Chain */
@@ -1103,6 +1104,8 @@ enum { BOOT = 16, REVOCATION = 10 };
 #define keys_replay(a, what, at, n) ((size_t)0)
 #define keys_boot(a) ((void)(a))
 #define keys_moved(a) false
+#define keys_begin(a) ((void)(a))
+#define put_head(b, a, exported_at) ((void)(b))
 #define put_keys_store(b, a) ((void)(b))
 #define put_lived(b, keys) ((void)(b))
 #define put_bundle(b, j, bundle, keys) ((void)(b))
@@ -1598,8 +1601,9 @@ static void take_sealed(Agent *a, double now, const uint8_t *datagram, size_t n)
     Opened opened = {0};
     Buf plain = {0};
     enum drop drop = keys_open(a, now, datagram, n, &plain, &opened);
-    if (drop == GOOD && opened.type == REVOCATION) {
-        note_revocation(a, datagram + 36, n - 36, opened.sender);
+    if (drop == GOOD && opened.type >= REVOCATION) {
+        if (opened.type == REVOCATION)
+            note_revocation(a, plain.data, plain.len, opened.sender);
     } else {
         if (drop == GOOD)
             drop = keys_allow(a, now, &opened, &in, read_datagram(a, plain.data, plain.len, &in));
@@ -1860,6 +1864,8 @@ static void put_export(Buf *b, Agent *a, uint64_t exported_at) {
     put_format(b, "\"},\"reconcile_in_progress\":%s,\"idle\":%s", truth(a->reconciling),
                truth(is_idle(a)));
     put_hashes(b, a);
+    if (a->keys != NULL)
+        put_head(b, a, exported_at);
     put_byte(b, '}');
 }
 
@@ -2128,7 +2134,9 @@ static bool bundle_read(Station *s, Fault *fault) {
     put_byte(&s->keys, '\0');
     if (s->keys.len - 1 > MAX_BUNDLE || !json_parse(&s->bundle, (char *)s->keys.data, s->keys.len - 1))
         return fail(fault, STATUS_WRONG, "The bundle is too large, or no JSON.");
-    return keys_read(a, &s->bundle, ROOT, life, fault);
+    if (!keys_read(a, &s->bundle, ROOT, life, fault)) return false;
+    keys_begin(a);
+    return true;
 }
 
 static void bundle_write(Station *s) {                  /* without the secrets of epochs that are over */

@@ -8,8 +8,9 @@
 
 enum {
     KEY = 32, SIGNATURE = 64, TAG = 16, NONCE = 12, MISSION_ID = 16, BOOT = 16, CLEAR = 36, SEAL = TAG + SIGNATURE,
-    ASKED_BY = 24, REVOCATION = 10, AHEAD = 8, WINDOW = 1024, WORDS = WINDOW / 64 + 1, MAX_REVOKED = 256,
-    SEALED_EVENTS = KEY + TAG, TELL_AGAIN_S = 5
+    ASKED_BY = 24, REVOCATION = 10, CHALLENGE, ECHO, AHEAD = 4096, FOLLOWED = AHEAD / 2,
+    WINDOW = 1024, WORDS = WINDOW / 64 + 1, MAX_REVOKED = 256, SEALED_EVENTS = KEY + TAG, TELL_AGAIN_S = 5,
+    ALL = 0, CHALLENGE_AGAIN_S = 5, ECHO_AGAIN_S = 1, TRUST_AFTER_S = 2
 };
 
 typedef struct { uint32_t sender, sequence; uint8_t boot[BOOT]; } Request;
@@ -22,29 +23,47 @@ typedef struct Opened {                                 /* what came, if it is a
     uint64_t revocations;
 } Opened;
 
-typedef struct {                                        /* of another sender: its newest life */
-    uint8_t boot[BOOT];
+typedef struct {                                        /* of another sender: the life that it has */
+    uint8_t boot[BOOT], latest[BOOT];                   /* latest: the greatest boot of the sender so far */
+    int64_t control;                                    /* sequence of the newest challenge */
     uint64_t word[WORDS];                               /* a ring: which sequence numbers have come (RFC 6479) */
     int64_t newest;
     uint32_t asked[REVOCATION];                         /* by type of a request: the newest sequence of it */
 } Life;
 
+typedef struct {                                        /* challenges to an agent, or to ALL; and its own, to be echoed */
+    bool due, has_sent, has_echoed;
+    double sent_at, echoed_at;
+    uint32_t sequence;                                  /* of the newest challenge */
+} Challenge;
+
 typedef struct { Hash block; uint8_t signature[SIGNATURE]; } Signed;
 
 struct Keys {
     uint8_t mission[MISSION_ID], authority[KEY], private_key[KEY], public_key[KEY], depot[KEY], boot[BOOT];
-    bool has_depot, seals;
-    double epoch_s;
-    uint64_t epoch, clock;                              /* the current one, and that of its own clock */
-    uint8_t secret[KEY], before[KEY];                   /* of the current epoch, and of the one before */
-    bool has_before, moved;                             /* moved: the bundle on disk has an older secret */
+    bool has_depot, seals, draws;                       /* draws: ephemeral keys are random, with a clock and UDP */
+    double epoch_s, begun_s, until_s;                   /* mission seconds: of its start, and of the end of the epoch */
+    uint64_t epoch, first, followed;                    /* of its clock, of the bundle, and of what it received */
+    uint8_t secret[KEY], before[KEY];                   /* of the clock's epoch, and of the one before */
+    Buf later;                                          /* the secrets of epochs after it, as far as they were needed */
+    bool has_before, moved;                             /* moved: the bundle on disk is out of date */
+    bool is_first, has_begun, complete;                 /* complete: it has received all datagrams that it accepts */
+    uint64_t bundle_us;                                 /* the start of the last life with this bundle */
+    Challenge *challenges[AGENT_IDS];
+    Life *waiting[AGENT_IDS];                           /* lives of senders that echoed, before they are trusted */
+    bool has_challenged;
+    double challenged_at;
+    Buf echoes;                                         /* sender, boot and sequence of the challenges to answer */
+    uint32_t control, next, exports;                    /* next: after the greatest sequence of a message */
+    size_t vehicles_len;
     uint8_t *vehicles[AGENT_IDS];                       /* public keys, NULL of who has none */
     Life *lives[AGENT_IDS];
     bool has_asked[REVOCATION];
     uint32_t asked[REVOCATION];                         /* its own newest request of a type */
     Signed *held;                                       /* makers' signatures of blocks */
     size_t held_len, held_cap;
-    Buf revocation;                                     /* the body of the newest, empty if there is none */
+    Buf revocations;                                    /* bodies, each behind its length (2 bytes) */
+    uint64_t digest;                                    /* of the revoked agents, 0 if there are none */
     bool revoked[AGENT_IDS], tells, has_told;
     double told_at;
     uint64_t lived_us;                                  /* when the last life began that a store tells of */
@@ -175,9 +194,15 @@ static void keys_free(Agent *a) {
     for (size_t i = 0; i < AGENT_IDS; i++) {
         free(k->vehicles[i]);
         free(k->lives[i]);
+        free(k->waiting[i]);
+        free(k->challenges[i]);
     }
     free(k->held);
-    free(k->revocation.data);
+    free(k->revocations.data);
+    free(k->echoes.data);
+    if (k->later.len > 0)
+        OPENSSL_cleanse(k->later.data, k->later.len);
+    free(k->later.data);
     OPENSSL_cleanse(k, sizeof *k);
     free(k);
     a->keys = NULL;
@@ -210,8 +235,10 @@ static bool keys_read(Agent *a, Json *j, uint32_t bundle, const uint8_t boot[BOO
             id = name[c] >= '0' && name[c] <= '9' ? id * 10 + (size_t)(name[c] - '0') : AGENT_IDS;
         if (id < 1 || id >= AGENT_IDS || !json_hex(j, i + 1, key, KEY))
             return fail(fault, STATUS_WRONG, "The bundle of keys names a vehicle without a key.");
-        if (k->vehicles[id] == NULL)
+        if (k->vehicles[id] == NULL) {
             k->vehicles[id] = grow(NULL, KEY);
+            k->vehicles_len++;
+        }
         memcpy(k->vehicles[id], key, KEY);
     }
     for (size_t i = 0; i < a->m.roster_len; i++)
@@ -226,7 +253,11 @@ static bool keys_read(Agent *a, Json *j, uint32_t bundle, const uint8_t boot[BOO
         return fail(fault, STATUS_WRONG, "The bundle seals to another depot than initial_data names.");
     if (k->seals && a->m.settings.max_block_bytes > MAX_EVENT_DATA - SEALED_EVENTS)
         return fail(fault, STATUS_WRONG, "Sealed events leave 976 for max_block_bytes.");
-    k->clock = k->epoch;
+    uint32_t started = member(j, bundle, "started_us");
+    k->is_first = started == 0;
+    if (started != 0 && !json_uint(j, started, 0, INT64_MAX, &k->bundle_us))
+        return fail(fault, STATUS_WRONG, "started_us of the bundle is no time.");
+    k->first = k->epoch;
     return true;
 }
 
@@ -234,7 +265,7 @@ static bool keys_read(Agent *a, Json *j, uint32_t bundle, const uint8_t boot[BOO
 static void put_bundle(Buf *b, Json *j, uint32_t bundle, const Keys *k) {
     const char *comma = "{";
     for (uint32_t i = bundle + 1; i < j->node[bundle].end; i = j->node[i + 1].end) {
-        if (says(j, i, "group_secret") || says(j, i, "epoch")) continue;
+        if (says(j, i, "group_secret") || says(j, i, "epoch") || says(j, i, "started_us")) continue;
         const Node *key = &j->node[i], *value = key + 1;
         put_text(b, comma);
         put_ascii(b, (const uint8_t *)j->text + key->at - 1, value->at + value->len + (value->kind == '"') - key->at + 1);
@@ -242,7 +273,7 @@ static void put_bundle(Buf *b, Json *j, uint32_t bundle, const Keys *k) {
     }
     put_text(b, ",\"group_secret\":\"");
     put_hex(b, k->secret, KEY);
-    put_format(b, "\",\"epoch\":%" PRIu64 "}\n", k->epoch);
+    put_format(b, "\",\"epoch\":%" PRIu64 ",\"started_us\":%" PRIu64 "}\n", k->epoch, read_be(k->boot, 8));
 }
 
 /* --- Epochs ------------------------------------------------------------------------------------------------------ */
@@ -257,13 +288,26 @@ static void next_secret(const Keys *k, uint8_t secret[KEY]) {
     free(info.data);
 }
 
-static void follow(Keys *k, uint64_t epoch) {
+static void advance(Keys *k, uint64_t epoch) {          /* only its own clock erases secrets */
     for (; k->epoch < epoch; k->epoch++) {
         memcpy(k->before, k->secret, KEY);
         k->has_before = k->moved = true;
-        next_secret(k, k->secret);
+        if (k->later.len > 0) {
+            memcpy(k->secret, k->later.data, KEY);
+            k->later.len -= KEY;
+            memmove(k->later.data, k->later.data + KEY, k->later.len);
+        } else {
+            next_secret(k, k->secret);
+        }
     }
 }
+
+static void follow(Keys *k, uint64_t epoch) {           /* others send in this epoch */
+    uint64_t most = k->epoch + FOLLOWED, to = epoch < most ? epoch : most;
+    k->followed = to > k->followed ? to : k->followed;
+}
+
+static uint64_t current(const Keys *k) { return k->followed > k->epoch ? k->followed : k->epoch; }
 
 static bool keys_moved(Agent *a) {                      /* whether the bundle has to be written anew; asked once */
     bool moved = a->keys->moved;
@@ -274,50 +318,55 @@ static bool keys_moved(Agent *a) {                      /* whether the bundle ha
 static bool keys_seals(const Agent *a) { return a->keys->seals; }
 
 static void look_at(Keys *k, double now) {
-    double epoch = floor(now / k->epoch_s);
-    k->clock = epoch <= 0 ? 0 : epoch >= UINT32_MAX ? UINT32_MAX : (uint64_t)epoch;
-    if (k->clock > k->epoch)
-        follow(k, k->clock);
+    if (k->has_begun && now < k->until_s) return;
+    if (!k->has_begun) {
+        k->has_begun = true;
+        k->begun_s = now;
+        k->complete = k->is_first && fabs(now) < k->epoch_s;
+    }
+    double shown = floor(now / k->epoch_s), since = floor((now - k->begun_s) / k->epoch_s);
+    double epoch = shown > (double)k->first + since ? shown : (double)k->first + since;
+    if (epoch > (double)k->epoch)
+        advance(k, epoch >= UINT32_MAX ? UINT32_MAX : (uint64_t)epoch);
+    double by_clock = (shown + 1) * k->epoch_s, by_start = k->begun_s + (since + 1) * k->epoch_s;
+    k->until_s = by_clock < by_start ? by_clock : by_start;
 }
 
 static bool can_open(const Keys *k, uint64_t epoch) {
-    if (epoch > k->epoch) return epoch <= k->clock + AHEAD;
-    return epoch == k->epoch || (epoch + 1 == k->epoch && k->has_before);
+    if (epoch >= k->epoch) return epoch <= k->epoch + AHEAD;
+    return epoch + 1 == k->epoch && k->has_before;
 }
 
-typedef struct { uint8_t key[KEY], iv[NONCE], mask[KEY]; } Sender;
+typedef struct { uint8_t key[KEY], iv[NONCE]; } Sender;
 
-static Sender sender_keys(const Keys *k, uint64_t epoch, uint32_t sender, const uint8_t boot[BOOT]) {
-    uint8_t secret[KEY];
+static const uint8_t *secret_of(Keys *k, uint64_t epoch) {
+    if (epoch < k->epoch) return k->before;
+    while (k->later.len < (epoch - k->epoch) * KEY) {
+        uint8_t secret[KEY];
+        memcpy(secret, k->later.len > 0 ? k->later.data + k->later.len - KEY : k->secret, KEY);
+        next_secret(k, secret);
+        put(&k->later, secret, KEY);
+        OPENSSL_cleanse(secret, KEY);
+    }
+    return epoch == k->epoch ? k->secret : k->later.data + (epoch - k->epoch - 1) * KEY;
+}
+
+static Sender sender_keys(Keys *k, uint64_t epoch, uint32_t sender, const uint8_t boot[BOOT]) {
     Sender made;
     Buf info = {0};
-    memcpy(secret, epoch < k->epoch ? k->before : k->secret, KEY);
-    for (uint64_t at = k->epoch; at < epoch; at++)
-        next_secret(k, secret);
     put_tag(&info, "UCP sender", k);
     put_be(&info, epoch, 4);
     put_be(&info, sender, 4);
     put(&info, boot, BOOT);
-    expand(secret, &info, (uint8_t *)&made, sizeof made);
-    OPENSSL_cleanse(secret, KEY);
+    expand(secret_of(k, epoch), &info, (uint8_t *)&made, sizeof made);
     free(info.data);
     return made;
 }
 
-static void nonce_of(const Sender *s, uint32_t sequence, uint8_t nonce[NONCE]) {
+static void nonce_of(const Sender *s, int type, uint32_t sequence, uint8_t nonce[NONCE]) {
     memcpy(nonce, s->iv, NONCE);
+    write_be(nonce + 4, read_be(s->iv + 4, 4) ^ (type >= REVOCATION), 4);
     write_be(nonce + 8, read_be(s->iv + 8, 4) ^ sequence, 4);
-}
-
-static void mask(const Sender *s, uint32_t sequence, uint8_t signature[SIGNATURE]) {
-    uint8_t stream[SIGNATURE];
-    Buf info = {0};
-    put(&info, "UCP signature mask", 19);
-    put_be(&info, sequence, 4);
-    expand(s->mask, &info, stream, SIGNATURE);
-    for (int i = 0; i < SIGNATURE; i++)
-        signature[i] ^= stream[i];
-    free(info.data);
 }
 
 /* --- Blocks: signed by their makers, events sealed to the depot --------------------------------------------------- */
@@ -389,7 +438,8 @@ static void expand_labeled(bool kem, const uint8_t secret[KEY], const char *labe
     free(in.data);
 }
 
-/* HPKE in base mode, to the depot: enc, ciphertext, tag. The ephemeral key comes of all that it is used for. */
+/* HPKE in base mode, to the depot: enc, ciphertext, tag. In virtual time the ephemeral key follows from
+   all that it is used for; else it is random, so that nobody with the private key can confirm a guess. */
 static size_t keys_seal_events(Agent *a, uint64_t timestamp, uint8_t *out) {
     Keys *k = a->keys;
     uint8_t ephemeral[KEY], dh[KEY], secret[KEY], key[KEY], nonce[NONCE], hash[KEY];
@@ -402,6 +452,8 @@ static size_t keys_seal_events(Agent *a, uint64_t timestamp, uint8_t *out) {
     put(&in, info.data, info.len);
     put(&in, a->current, a->current_len);
     hmac(k->private_key, KEY, &in, ephemeral);
+    if (k->draws && getrandom(ephemeral, KEY, 0) != KEY)
+        abort();
     if (!public_of(EVP_PKEY_X25519, ephemeral, out) || !agree(ephemeral, k->depot, dh))
         abort();                                        /* to this depot nobody can seal */
     in.len = 0;
@@ -428,12 +480,28 @@ static size_t keys_seal_events(Agent *a, uint64_t timestamp, uint8_t *out) {
 
 /* --- Revocations ------------------------------------------------------------------------------------------------- */
 
-static uint64_t revocations(const Keys *k) { return k->revocation.len > 0 ? read_be(k->revocation.data, 2) : 0; }
-
-static void tell(Keys *k, double now) {                 /* somebody may not know of the newest */
-    if (k->has_told && now < k->told_at + TELL_AGAIN_S) return;
+static void tell(Keys *k, double now) {                 /* somebody may not know all revoked agents */
+    if (k->digest == 0 || (k->has_told && now < k->told_at + TELL_AGAIN_S)) return;
     k->tells = k->has_told = true;
     k->told_at = now;
+}
+
+static size_t listed(const uint8_t *body, size_t n) {   /* the number of agents in a body, 0 if it is none */
+    size_t count = n < 4 ? 0 : (size_t)read_be(body + 2, 2);
+    return count <= MAX_REVOKED && n == 4 + 4 * count + SIGNATURE ? count : 0;
+}
+
+/* Whether each agent that a body lists is revoked, or is listed by another body if there is one. */
+static bool adds_nothing(const Keys *k, const uint8_t *body, size_t n, const uint8_t *other, size_t other_n) {
+    size_t count = listed(body, n), others = other != NULL ? listed(other, other_n) : 0;
+    for (size_t i = 0; i < count; i++) {
+        uint64_t id = read_be(body + 4 + 4 * i, 4);
+        bool known = other == NULL && id < AGENT_IDS && k->revoked[id];
+        for (size_t at = 0; at < others && !known; at++)
+            known = read_be(other + 4 + 4 * at, 4) == id;
+        if (!known) return false;
+    }
+    return count > 0;
 }
 
 static bool revocation_good(const Keys *k, const uint8_t *body, size_t n) {
@@ -452,19 +520,35 @@ static bool revocation_good(const Keys *k, const uint8_t *body, size_t n) {
     return good;
 }
 
-static void take_over(Keys *k, const uint8_t *body, size_t n) {        /* a revocation that is good */
-    k->revocation.len = 0;
-    put(&k->revocation, body, n);
-    memset(k->revoked, 0, sizeof k->revoked);
-    for (size_t i = 4; i + SIGNATURE < n; i += 4)
-        k->revoked[read_be(body + i, 4)] = true;
+static void take_over(Keys *k, const uint8_t *body, size_t n) {        /* a good revocation that lists a further agent */
+    Buf kept = {0}, ids = {0};
+    for (size_t at = 0; at < k->revocations.len;) {
+        const uint8_t *held = k->revocations.data + at + 2;
+        size_t size = (size_t)read_be(held - 2, 2);
+        if (!adds_nothing(k, held, size, body, n))
+            put(&kept, held - 2, 2 + size);
+        at += 2 + size;
+    }
+    put_be(&kept, n, 2);
+    put(&kept, body, n);
+    free(k->revocations.data);
+    k->revocations = kept;
+    for (size_t i = 0; i < listed(body, n); i++)
+        k->revoked[read_be(body + 4 + 4 * i, 4)] = true;
+    for (size_t id = 1; id < AGENT_IDS; id++)
+        if (k->revoked[id])
+            put_be(&ids, id, 4);
+    Hash hash = H(ids.data, ids.len);
+    k->digest = read_be(hash.b, 2);
+    if (k->digest == 0)
+        k->digest = 1;
+    free(ids.data);
 }
 
-/* GOOD if it is new. */
+/* GOOD if it lists a further agent. */
 static enum drop keys_revoke(Agent *a, double now, const uint8_t *body, size_t n) {
     Keys *k = a->keys;
-    uint64_t number = read_be(body, n < 2 ? (int)n : 2);
-    if (number > 0 && number <= revocations(k)) return KNOWN_ALREADY;
+    if (adds_nothing(k, body, n, NULL, 0)) return KNOWN_ALREADY;
     if (!revocation_good(k, body, n)) return NOT_THE_AUTHORITY;
     take_over(k, body, n);
     k->has_told = false;
@@ -501,14 +585,129 @@ static void accept_sequence(Life *life, uint32_t sequence) {
     life->word[word % WORDS] |= (uint64_t)1 << sequence % 64;
 }
 
-/* Up to where nothing changes. GOOD: `plain` is the datagram of version 1; or it was a revocation, which is taken. */
+static Life *life_new(Life *old, const uint8_t boot[BOOT], uint32_t first, const uint8_t *latest) {
+    Life *life = old != NULL ? old : grow(NULL, sizeof *life);
+    bool later = latest != NULL && memcmp(latest, boot, BOOT) > 0;
+    uint8_t greatest[BOOT];
+    memcpy(greatest, later ? latest : boot, BOOT);      /* `latest` may be of `old` */
+    *life = (Life){.newest = (int64_t)first - 1, .control = -1};
+    memset(life->word, first > 0 ? 0xff : 0, sizeof life->word);
+    memcpy(life->boot, boot, BOOT);
+    memcpy(life->latest, greatest, BOOT);
+    return life;
+}
+
+static bool is_boot(const Life *life, const uint8_t boot[BOOT]) { return memcmp(boot, life->boot, BOOT) == 0; }
+
+static bool is_later(const Life *life, const uint8_t boot[BOOT]) { return memcmp(boot, life->latest, BOOT) > 0; }
+
+/* --- Challenges: whether a sender exists now ---------------------------------------------------------------------- */
+
+static Challenge *challenge_of(Keys *k, uint32_t agent) {
+    if (k->challenges[agent] == NULL)
+        memset(k->challenges[agent] = grow(NULL, sizeof(Challenge)), 0, sizeof(Challenge));
+    return k->challenges[agent];
+}
+
+static void challenge(Keys *k, uint32_t target, double now) {
+    Challenge *c = challenge_of(k, target);
+    if (!c->has_sent || now >= c->sent_at + CHALLENGE_AGAIN_S)
+        c->due = true;
+}
+
+static bool is_pending(Keys *k, uint32_t target, uint32_t sequence) {
+    return k->challenges[target] != NULL && k->challenges[target]->has_sent && k->challenges[target]->sequence == sequence;
+}
+
+static void trust_waiting(Keys *k, double now) {
+    size_t answered = 0;
+    for (size_t i = 1; i < AGENT_IDS; i++)
+        answered += k->waiting[i] != NULL || k->lives[i] != NULL;
+    bool collects = !k->complete && k->has_challenged && now < k->challenged_at + TRUST_AFTER_S;
+    if (collects && answered != k->vehicles_len - 1) return;
+    for (size_t i = 1; i < AGENT_IDS; i++)
+        if (k->waiting[i] != NULL) {
+            free(k->lives[i]);
+            k->lives[i] = k->waiting[i];
+            k->waiting[i] = NULL;
+        }
+}
+
+static bool opens(Keys *k, const Opened *o, uint64_t epoch, const uint8_t *d, size_t n, uint8_t *body) {
+    uint8_t nonce[NONCE];
+    Sender keys = sender_keys(k, epoch, o->sender, o->boot);
+    nonce_of(&keys, o->type, o->sequence, nonce);
+    return decrypt(keys.key, nonce, d + CLEAR, n - CLEAR, d, CLEAR, body);
+}
+
+static bool is_signed(const Keys *k, const Opened *o, const uint8_t *d, const uint8_t *body, size_t size) {
+    Buf claim = {0};
+    put_tag(&claim, "UCP datagram", k);
+    put(&claim, d, CLEAR);
+    put(&claim, body, size);
+    bool good = verify(k->vehicles[o->sender], &claim, body + size);
+    free(claim.data);
+    return good;
+}
+
+static enum drop take_challenge(Agent *a, double now, const Opened *o, uint64_t epoch, const uint8_t *d, size_t n) {
+    Keys *k = a->keys;
+    uint8_t body[MAX_DATAGRAM];
+    Life *life = k->lives[o->sender];
+    Challenge *c = challenge_of(k, o->sender);
+    bool is_new = life == NULL ? k->complete
+                : (is_boot(life, o->boot) && (int64_t)o->sequence > life->control) || is_later(life, o->boot);
+    if (!is_new && c->has_echoed && now < c->echoed_at + ECHO_AGAIN_S) return REPLAYED;
+    if (!opens(k, o, epoch, d, n, body)) return NOT_AUTHENTIC;
+    if (!is_signed(k, o, d, body, n - CLEAR - SEAL)) return NOT_THE_SENDER;
+    if (n != CLEAR + SEAL + 4) return WRONG_LENGTH;
+    if (is_new) {
+        if (life == NULL || !is_boot(life, o->boot))
+            life = k->lives[o->sender] = life_new(life, o->boot, 0, NULL);
+        life->control = o->sequence;
+    }
+    follow(k, epoch);
+    uint64_t target = read_be(body, 4);
+    if (target == ALL || target == a->m.agent_id) {
+        c->has_echoed = true;
+        c->echoed_at = now;
+        put_be(&k->echoes, o->sender, 4);
+        put(&k->echoes, o->boot, BOOT);
+        put_be(&k->echoes, o->sequence, 4);
+    }
+    k->has_told = false;                                /* it waits for revocations before it trusts others */
+    return GOOD;
+}
+
+static enum drop take_echo(Agent *a, double now, const Opened *o, uint64_t epoch, const uint8_t *d, size_t n) {
+    Keys *k = a->keys;
+    uint8_t body[MAX_DATAGRAM];
+    if (!opens(k, o, epoch, d, n, body)) return NOT_AUTHENTIC;
+    if (n != CLEAR + SEAL + ASKED_BY + 4) return WRONG_LENGTH;
+    uint32_t sequence = (uint32_t)read_be(body + 20, 4);
+    if (read_be(body, 4) != a->m.agent_id || memcmp(body + 4, k->boot, BOOT) != 0
+        || !(is_pending(k, ALL, sequence) || is_pending(k, o->sender, sequence)))
+        return ANSWERS_NO_REQUEST;
+    if (!is_signed(k, o, d, body, ASKED_BY + 4)) return NOT_THE_SENDER;
+    follow(k, epoch);
+    Life *known = k->lives[o->sender];
+    if (known == NULL || !is_boot(known, o->boot)) {
+        k->waiting[o->sender] = life_new(k->waiting[o->sender], o->boot, (uint32_t)read_be(body + ASKED_BY, 4),
+                                         known != NULL ? known->latest : NULL);
+        trust_waiting(k, now);
+    }
+    return GOOD;
+}
+
+/* Up to where nothing changes. GOOD: `plain` is the datagram of version 1; or the body of a revocation, which is taken;
+   or it was a challenge or an echo, which is dealt with. */
 static enum drop keys_open(Agent *a, double now, const uint8_t *d, size_t n, Buf *plain, Opened *o) {
     Keys *k = a->keys;
     look_at(k, now);
     if (n < 4) return TRUNCATED;
     if (n > MAX_DATAGRAM) return OVERSIZED;
     if (d[0] != 'U' || d[1] != 'C') return WRONG_MAGIC;
-    if (d[2] != 2) return d[2] == 1 ? NOT_SECURED : WRONG_VERSION;
+    if (d[2] != 3) return d[2] == 1 ? NOT_SECURED : WRONG_VERSION;
     if (n < CLEAR) return TRUNCATED;
     o->type = d[3];
     o->sender = (uint32_t)read_be(d + 4, 4);
@@ -518,41 +717,48 @@ static enum drop keys_open(Agent *a, double now, const uint8_t *d, size_t n, Buf
     o->revocations = read_be(d + 34, 2);
     if (o->sender < 1 || o->sender >= AGENT_IDS) return IMPOSSIBLE_SENDER;
     if (read_be(d + 12, 2) != n - CLEAR) return WRONG_LENGTH;
-    if (o->type < 1 || o->type > REVOCATION) return UNKNOWN_TYPE;
-    if (o->type != REVOCATION && n < CLEAR + SEAL) return WRONG_LENGTH;
+    if (o->type < 1 || o->type > ECHO) return UNKNOWN_TYPE;
+    if (n < (size_t)CLEAR + (o->type == REVOCATION ? TAG : SEAL)) return WRONG_LENGTH;
     if (o->sender == a->m.agent_id) return OWN_SENDER;
     if (!set_has(&a->roster, (uint16_t)o->sender)) return STRANGER;
-    if (o->type == REVOCATION) return keys_revoke(a, now, d + CLEAR, n - CLEAR);
-    if (k->revoked[o->sender]) return REVOKED_SENDER;
+    if (o->type != REVOCATION && k->revoked[o->sender]) return REVOKED_SENDER;
+    if (o->type < REVOCATION)
+        trust_waiting(k, now);
 
-    Life *life = k->lives[o->sender];
-    int later = life == NULL ? 1 : memcmp(o->boot, life->boot, BOOT);
+    uint8_t body[MAX_DATAGRAM];
     if (!can_open(k, epoch)) return EPOCH_OUT_OF_RANGE;
-    if (later < 0) return OLD_BOOT;
-    if (later == 0 && !is_fresh(life, o->sequence)) return REPLAYED;
-    uint8_t body[MAX_DATAGRAM], nonce[NONCE], signature[SIGNATURE];
-    size_t size = n - CLEAR - SEAL;
-    Sender keys = sender_keys(k, epoch, o->sender, o->boot);
-    nonce_of(&keys, o->sequence, nonce);
-    if (!decrypt(keys.key, nonce, d + CLEAR, size + TAG, d, CLEAR, body)) return NOT_AUTHENTIC;
-    memcpy(signature, d + n - SIGNATURE, SIGNATURE);
-    mask(&keys, o->sequence, signature);
-    Buf claim = {0};
-    put_tag(&claim, "UCP datagram", k);
-    put(&claim, d, n - SIGNATURE);
-    bool good = verify(k->vehicles[o->sender], &claim, signature);
-    free(claim.data);
-    if (!good) return NOT_THE_SENDER;
-
-    if (later != 0) {
-        if (life == NULL)
-            life = k->lives[o->sender] = grow(NULL, sizeof *life);
-        *life = (Life){.newest = -1};
-        memcpy(life->boot, o->boot, BOOT);
+    if (o->type == REVOCATION) {
+        if (!opens(k, o, epoch, d, n, body)) return NOT_AUTHENTIC;
+        put(plain, body, n - CLEAR - TAG);
+        return keys_revoke(a, now, body, n - CLEAR - TAG);
     }
-    accept_sequence(life, o->sequence);
-    if (epoch > k->epoch)
+    if (o->type > REVOCATION) {
+        enum drop drop = (o->type == CHALLENGE ? take_challenge : take_echo)(a, now, o, epoch, d, n);
+        if (drop == GOOD && o->revocations != k->digest)
+            tell(k, now);
+        return drop;
+    }
+    Life *life = k->lives[o->sender];
+    if (life == NULL && !k->complete) {
+        if (!opens(k, o, epoch, d, n, body)) return NOT_AUTHENTIC;
         follow(k, epoch);
+        challenge(k, ALL, now);
+        return NOT_CONFIRMED;
+    }
+    if (life != NULL && !is_boot(life, o->boot) && !is_later(life, o->boot)) {
+        if (!opens(k, o, epoch, d, n, body)) return NOT_AUTHENTIC;
+        challenge(k, o->sender, now);
+        return OLD_BOOT;
+    }
+    if (life != NULL && is_boot(life, o->boot) && !is_fresh(life, o->sequence)) return REPLAYED;
+    size_t size = n - CLEAR - SEAL;
+    if (!opens(k, o, epoch, d, n, body)) return NOT_AUTHENTIC;
+    if (!is_signed(k, o, d, body, size)) return NOT_THE_SENDER;
+
+    if (life == NULL || !is_boot(life, o->boot))
+        life = k->lives[o->sender] = life_new(life, o->boot, 0, NULL);
+    accept_sequence(life, o->sequence);
+    follow(k, epoch);
     if (is_request(o->type) && life->asked[o->type] < o->sequence)
         life->asked[o->type] = o->sequence;
 
@@ -586,15 +792,14 @@ static bool is_asked(const Agent *a, const Request *r, int asking) {
         return memcmp(r->boot, k->boot, BOOT) == 0 && k->has_asked[asking] && r->sequence == k->asked[asking];
     if (r->sender < 1 || r->sender >= AGENT_IDS || k->vehicles[r->sender] == NULL) return false;
     const Life *life = k->lives[r->sender];
-    int later = life == NULL ? 1 : memcmp(r->boot, life->boot, BOOT);
-    return later > 0 || (later == 0 && r->sequence >= life->asked[asking]);
+    return life == NULL || is_later(life, r->boot) || (is_boot(life, r->boot) && r->sequence >= life->asked[asking]);
 }
 
 /* What is authentic, and must not be handled all the same. */
 static enum drop keys_allow(Agent *a, double now, const Opened *o, const Input *in, enum drop drop) {
     Keys *k = a->keys;
     if (drop != GOOD && drop != STRANGERS_BLOCK) return drop;
-    if (o->revocations < revocations(k))
+    if (o->revocations != k->digest)
         tell(k, now);
     if (drop != GOOD) return drop;
     int asking = requested_by(o->type);
@@ -621,14 +826,83 @@ static void keys_keep(Agent *a, const Opened *o, const Input *in) {
 
 static void put_clear(Buf *b, const Agent *a, int type, uint32_t sequence, size_t behind) {
     const Keys *k = a->keys;
-    put(b, "UC\2", 3);
+    put(b, "UC\3", 3);
     put_byte(b, (uint8_t)type);
     put_be(b, a->m.agent_id, 4);
     put_be(b, sequence, 4);
     put_be(b, behind, 2);
-    put_be(b, k->epoch, 4);
+    put_be(b, current(k), 4);
     put(b, k->boot, BOOT);
-    put_be(b, revocations(k), 2);
+    put_be(b, k->digest, 2);
+}
+
+/* A datagram with this body, signed and sealed, behind its length. A revocation has the authority's signature alone. */
+static void put_sealed(Buf *out, Agent *a, int type, uint32_t sequence, const Buf *body) {
+    Keys *k = a->keys;
+    Buf clear = {0}, plain = {0}, claim = {0};
+    uint8_t nonce[NONCE], signature[SIGNATURE];
+    put(&plain, body->data, body->len);
+    put_clear(&clear, a, type, sequence, body->len + (type == REVOCATION ? TAG : SEAL));
+    if (type != REVOCATION) {
+        put_tag(&claim, "UCP datagram", k);
+        put(&claim, clear.data, clear.len);
+        put(&claim, body->data, body->len);
+        sign(k->private_key, &claim, signature);
+        put(&plain, signature, SIGNATURE);
+    }
+    Sender keys = sender_keys(k, current(k), a->m.agent_id, k->boot);
+    nonce_of(&keys, type, sequence, nonce);
+    put_be(out, CLEAR + plain.len + TAG, 2);
+    put(out, clear.data, clear.len);
+    buf_room(out, plain.len + TAG);
+    encrypt(keys.key, nonce, plain.data, plain.len, clear.data, CLEAR, out->data + out->len);
+    out->len += plain.len + TAG;
+    free(clear.data);
+    free(plain.data);
+    free(claim.data);
+}
+
+static bool has_control(const Keys *k) {
+    if (k->tells || k->echoes.len > 0) return true;
+    for (size_t i = 0; i < AGENT_IDS; i++)
+        if (k->challenges[i] != NULL && k->challenges[i]->due) return true;
+    return false;
+}
+
+static void put_control(Buf *out, Agent *a) {           /* revocations, challenges, echoes */
+    Keys *k = a->keys;
+    Buf body = {0};
+    for (size_t at = 0; k->tells && at < k->revocations.len; at += 2 + body.len) {
+        body.len = 0;
+        put(&body, k->revocations.data + at + 2, (size_t)read_be(k->revocations.data + at, 2));
+        put_sealed(out, a, REVOCATION, k->control++, &body);
+    }
+    k->tells = false;
+    if (!k->complete && !k->has_challenged)
+        challenge(k, ALL, a->now);
+    for (uint32_t target = 0; target < AGENT_IDS; target++) {
+        Challenge *c = k->challenges[target];
+        if (c == NULL || !c->due) continue;
+        c->due = false;
+        c->has_sent = true;
+        c->sent_at = a->now;
+        c->sequence = k->control;
+        if (target == ALL && !k->has_challenged) {
+            k->has_challenged = true;
+            k->challenged_at = a->now;
+        }
+        body.len = 0;
+        put_be(&body, target, 4);
+        put_sealed(out, a, CHALLENGE, k->control++, &body);
+    }
+    for (size_t at = 0; at < k->echoes.len; at += ASKED_BY) {
+        body.len = 0;
+        put(&body, k->echoes.data + at, ASKED_BY);
+        put_be(&body, k->next, 4);
+        put_sealed(out, a, ECHO, k->control++, &body);
+    }
+    k->echoes.len = 0;
+    free(body.data);
 }
 
 static void seal(Agent *a, Buf *out, const uint8_t *plain, size_t n, const Opened *heard) {
@@ -637,7 +911,9 @@ static void seal(Agent *a, Buf *out, const uint8_t *plain, size_t n, const Opene
     uint32_t sequence = (uint32_t)read_be(plain + 8, 4);
     const uint8_t *body = plain + HEADER;
     size_t size = n - HEADER;
-    Buf sealed = {0}, claim = {0};
+    Buf sealed = {0};
+    if (sequence >= k->next)
+        k->next = sequence + 1;
     if (is_request(type)) {
         k->has_asked[type] = true;
         k->asked[type] = sequence;
@@ -659,34 +935,16 @@ static void seal(Agent *a, Buf *out, const uint8_t *plain, size_t n, const Opene
         const uint8_t *signature = keys_signature(a, body + before, size - before);
         put(&sealed, signature != NULL ? signature : unsigned_block, SIGNATURE);
     }
-    uint8_t nonce[NONCE], signature[SIGNATURE];
-    Sender keys = sender_keys(k, k->epoch, a->m.agent_id, k->boot);
-    nonce_of(&keys, sequence, nonce);
-    put_be(out, CLEAR + sealed.len + SEAL, 2);
-    size_t at = out->len;
-    put_clear(out, a, type, sequence, sealed.len + SEAL);
-    buf_room(out, sealed.len + TAG);
-    encrypt(keys.key, nonce, sealed.data, sealed.len, out->data + at, CLEAR, out->data + at + CLEAR);
-    out->len += sealed.len + TAG;
-    put_tag(&claim, "UCP datagram", k);
-    put(&claim, out->data + at, out->len - at);
-    sign(k->private_key, &claim, signature);
-    mask(&keys, sequence, signature);
-    put(out, signature, SIGNATURE);
+    put_sealed(out, a, type, sequence, &sealed);
     free(sealed.data);
-    free(claim.data);
 }
 
 static void keys_seal(Agent *a, const Opened *heard) {
     Keys *k = a->keys;
     Buf out = {0};
+    if (a->out.len == 0 && !has_control(k)) return;
     look_at(k, a->now);
-    if (k->tells) {
-        k->tells = false;
-        put_be(&out, CLEAR + k->revocation.len, 2);
-        put_clear(&out, a, REVOCATION, 0, k->revocation.len);
-        put(&out, k->revocation.data, k->revocation.len);
-    }
+    put_control(&out, a);
     for (size_t at = 0; at < a->out.len;) {
         size_t n = (size_t)read_be(a->out.data + at, 2);
         seal(a, &out, a->out.data + at + 2, n, heard);
@@ -714,10 +972,11 @@ static void put_keys_store(Buf *b, Agent *a) {
         put(b, k->held[i].block.b, 32);
         put(b, k->held[i].signature, SIGNATURE);
     }
-    if (k->revocation.len > 0) {
+    for (size_t at = 0; at < k->revocations.len;) {
+        size_t size = 2 + (size_t)read_be(k->revocations.data + at, 2);
         put_byte(b, REVOKED);
-        put_be(b, k->revocation.len, 2);
-        put(b, k->revocation.data, k->revocation.len);
+        put(b, k->revocations.data + at, size);
+        at += size;
     }
 }
 
@@ -737,11 +996,76 @@ static size_t keys_replay(Agent *a, int what, const uint8_t *at, size_t n) {
     }
     if (what == REVOKED && n >= 2 && n - 2 >= read_be(at, 2)) {
         size_t size = (size_t)read_be(at, 2);
-        if (revocation_good(k, at + 2, size))           /* of keys that it had before: not */
+        if (revocation_good(k, at + 2, size) && !adds_nothing(k, at + 2, size, NULL, 0))   /* of other keys: not */
             take_over(k, at + 2, size);
         return 2 + size;
     }
     return 0;
+}
+
+/* --- The export: a head that the agent signs ----------------------------------------------------------------------- */
+
+static void put_digest(Buf *b, const char *name, const Hash *hash) {
+    put_format(b, ",\"%s\":\"", name);
+    put_hex(b, hash->b, 32);
+    put_byte(b, '"');
+}
+
+static void put_head(Buf *b, Agent *a, uint64_t exported_at) {
+    Keys *k = a->keys;
+    uint8_t signature[SIGNATURE];
+    Buf held = {0}, claim = {0}, ids = {0};
+    const List *lists[] = {&a->deque, &a->stack};
+    put_be(&held, a->deque.len, 4);
+    put_be(&held, a->stack.len, 4);
+    put_byte(&held, a->reconciling);
+    put_byte(&held, is_idle(a));
+    for (int l = 0; l < 2; l++)
+        for (size_t i = 0; i < lists[l]->len; i++)
+            put(&held, lists[l]->at[i]->hash.b, 32);
+    put(&held, a->current, a->current_len);
+    Hash completed = H(a->completed.data, a->completed.len), rest = H(held.data, held.len);
+    for (size_t id = 1; id < AGENT_IDS; id++)
+        if (k->revoked[id])
+            put_be(&ids, id, 4);
+    k->exports++;
+    put_tag(&claim, "UCP export", k);
+    put_be(&claim, a->m.agent_id, 4);
+    put(&claim, k->boot, BOOT);
+    put_be(&claim, k->exports, 4);
+    put_be(&claim, exported_at, 8);
+    put_be(&claim, a->chain.len, 4);
+    put(&claim, a->top.b, 32);
+    put(&claim, completed.b, 32);
+    put(&claim, rest.b, 32);
+    put_be(&claim, ids.len / 4, 2);
+    put(&claim, ids.data, ids.len);
+    sign(k->private_key, &claim, signature);
+    put_text(b, ",\"head\":{\"mission\":\"");
+    put_hex(b, k->mission, MISSION_ID);
+    put_text(b, "\",\"boot\":\"");
+    put_hex(b, k->boot, BOOT);
+    put_format(b, "\",\"number\":%u,\"height\":%zu", k->exports, a->chain.len);
+    put_digest(b, "top_chain_hash", &a->top);
+    put_digest(b, "completed", &completed);
+    put_digest(b, "held", &rest);
+    put_text(b, ",\"revoked\":[");
+    for (size_t at = 0; at < ids.len; at += 4)
+        put_format(b, "%s%u", at > 0 ? "," : "", (unsigned)read_be(ids.data + at, 4));
+    put_text(b, "],\"signature\":\"");
+    put_base64(b, signature, SIGNATURE);
+    put_text(b, "\"}");
+    free(held.data);
+    free(claim.data);
+    free(ids.data);
+}
+
+/* On a vehicle: the life is later than the one before, whatever the clock says, and the bundle has to be written. */
+static void keys_begin(Agent *a) {
+    Keys *k = a->keys;
+    if (!k->is_first && started_us(k) <= k->bundle_us)
+        write_be(k->boot, k->bundle_us + 1, 8);
+    k->draws = k->moved = true;
 }
 
 static void keys_boot(Agent *a) {                       /* this life is later than those before, whatever the clock says */
