@@ -12,9 +12,10 @@ An explanation counts only if the reference then agrees with the lines that foll
 
 import base64
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from copy import copy
+from typing import Protocol
 
 from harness.checker.recorded_inputs import NotOnRecordError, decoded, event_of
 from harness.checker.reference.state import State
@@ -34,8 +35,18 @@ from ucp.trigger import MessageTrigger
 
 Line = tuple[int, HandlerRun]
 """A handler run with its line number."""
-Datagrams = Callable[[int, int], list[bytes]]
-"""A function that returns the datagrams of a sender with a sequence number, according to other records."""
+
+
+class OtherRecords(Protocol):
+    """The other records of the flight."""
+
+    def datagrams(self, sender: int, sequence: int) -> list[bytes]:
+        """Return the datagrams of a sender with a sequence number."""
+
+    def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
+        """Return false if the records prove that no such message reached the agent until this time."""
+
+
 LINES_AFTER = 8
 """Number of lines after the difference with which the explanation must agree."""
 MAX_LOCAL = 4
@@ -43,14 +54,14 @@ MAX_LOCAL = 4
 
 
 def damage_that_explains(
-    before: Follower, deviation: Deviation, line: Line, following: Sequence[Line], datagrams: Datagrams
+    before: Follower, deviation: Deviation, line: Line, following: Sequence[Line], others: OtherRecords
 ) -> str | None:
     """Return the damage to a trace that explains the difference, such as "a line is missing", or None.
 
     `before` is a follower in the state before the line. It stays unchanged.
     """
     following = following[:LINES_AFTER]
-    if _is_one_character_off(before, deviation, line, following, datagrams):
+    if _is_one_character_off(before, deviation, line, following, others):
         return "one character of the line is damaged"
     if following and _agrees(before.copy(), [following[0], line, *following[1:]]):
         return "two lines are in the wrong order"
@@ -58,7 +69,7 @@ def damage_that_explains(
         return damage
     if _is_malformed(line[1]):
         return "the line is damaged"
-    for trial in _with_a_line_more(before, line[1]):
+    for trial in _with_a_line_more(before, line[1], others):
         if _agrees(trial, [line, *following]):
             return "a line is missing"
     return None
@@ -76,20 +87,20 @@ def _agrees(follower: Follower, lines: Sequence[Line]) -> bool:
 
 
 def _is_one_character_off(
-    before: Follower, deviation: Deviation, line: Line, following: Sequence[Line], datagrams: Datagrams
+    before: Follower, deviation: Deviation, line: Line, following: Sequence[Line], others: OtherRecords
 ) -> bool:
     number, run = line
     text = run.to_line()
     return any(
         _differ_in_one_character(text, other.to_line()) and _agrees(before.copy(), [(number, other), *following])
-        for other in _as_it_may_have_been(before, deviation, run, datagrams)
+        for other in _as_it_may_have_been(before, deviation, run, others)
     )
 
 
 def _as_it_may_have_been(
-    before: Follower, deviation: Deviation, run: HandlerRun, datagrams: Datagrams
+    before: Follower, deviation: Deviation, run: HandlerRun, others: OtherRecords
 ) -> Iterator[HandlerRun]:
-    if deviation.expected is not None and deviation.run is run and not _was_received(before, run, datagrams):
+    if deviation.expected is not None and deviation.run is run and not _was_received(before, run, others):
         other = copy(deviation.expected)
         other.input, other.sealed, other.started = run.input, run.sealed, other.started or None
         yield other
@@ -101,7 +112,7 @@ def _as_it_may_have_been(
             yield other
         except MalformedDatagramError:
             pass
-        texts = [base64.b64encode(data).decode() for data in datagrams(run.trigger.sender, run.trigger.sequence)]
+        texts = [base64.b64encode(data).decode() for data in others.datagrams(run.trigger.sender, run.trigger.sequence)]
         texts += [
             base64.b64encode(encode(run.trigger.sender, run.trigger.sequence, message)).decode()
             for message in _answers(before.state, run)
@@ -119,13 +130,13 @@ def _as_it_may_have_been(
                 yield other
 
 
-def _was_received(before: Follower, run: HandlerRun, datagrams: Datagrams) -> bool:
+def _was_received(before: Follower, run: HandlerRun, others: OtherRecords) -> bool:
     """Return true if another agent received a message exactly as this line shows it. Then the line is not damaged."""
     for sent in run.sent:
         if sent.datagram is not None:
             with suppress(ValueError):
                 data = base64.b64decode(sent.datagram.text, validate=True)
-                if data in datagrams(before.state.agent_id, sent.seq):
+                if data in others.datagrams(before.state.agent_id, sent.seq):
                     return True
     return False
 
@@ -168,7 +179,7 @@ def _damage_to_events(before: Follower, run: HandlerRun) -> str | None:
     return None
 
 
-def _with_a_line_more(before: Follower, run: HandlerRun) -> Iterator[Follower]:
+def _with_a_line_more(before: Follower, run: HandlerRun, others: OtherRecords) -> Iterator[Follower]:
     """Yield copies of the reference in the states that one lost trace line may have led to."""
     trial = before.copy()
     for _ in range(MAX_LOCAL):
@@ -185,9 +196,10 @@ def _with_a_line_more(before: Follower, run: HandlerRun) -> Iterator[Follower]:
                 yield trial.copy()
     for message in _answers(before.state, run):
         for sender in sorted(before.roster - {before.state.agent_id}):
-            trial = before.copy()
-            if trial.play_lost_message(sender, message, run.t):
-                yield trial
+            if others.may_have_arrived(sender, message, run.t):
+                trial = before.copy()
+                if trial.play_lost_message(sender, message, run.t):
+                    yield trial
 
 
 def _answers(state: State, run: HandlerRun) -> Iterator[Message]:

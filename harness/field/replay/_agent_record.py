@@ -15,13 +15,15 @@ from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.lost_lines import lost_lines
+from harness.checker.missing_incarnations import lacking_traces
+from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.end_of_record import Arrival, sent_to, unfinished
 from harness.checker.steps.follower import Follower
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError
 from harness.field._vehicle_captures import AgentCapture, Sighting
 from ucp.clock import MICROSECONDS
-from ucp.messages import decode
+from ucp.messages import MalformedDatagramError, Message, NextInSequenceResponse, decode
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
 
@@ -128,6 +130,31 @@ class Record:
                             found.setdefault(key, []).append(base64.b64decode(datagram.text, validate=True))
         return found
 
+    def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
+        """Return false if the records prove that no such message reached the agent until this time.
+
+        A capture of the vehicle proves it, and so does a trace of the sender that lacks no line.
+        """
+        if self.arrivals and self.arrivals[0].at_s < at_s < self.arrivals[-1].at_s:
+            return any(
+                seen.sender == sender and _are_alike(decode(seen.datagram).message, message) for seen in self.arrivals
+            )
+        sent = self._sent_by_complete_traces.get(sender)
+        return sent is None or any(_are_alike(other, message) for other in sent)
+
+    @cached_property
+    def _sent_by_complete_traces(self) -> dict[int, list[Message]]:
+        """Agent -> the messages that it sent, for other agents whose traces lack no line."""
+        sent = {}
+        lacking = {agent_id for agent_id, _ in lacking_traces(self.flight.traces)}
+        for agent_id, trace in self.flight.traces.items():
+            if agent_id in lacking or trace.problem or trace.cut_off or trace.gaps or trace.jumps or lost_lines(trace):
+                continue
+            datagrams = [each.datagram for run in trace.runs for each in run.sent]
+            with suppress(MalformedDatagramError):
+                sent[agent_id] = [decoded(datagram).message for datagram in datagrams]
+        return sent
+
     @cached_property
     def arrivals(self) -> list[Sighting] | None:
         """The datagrams that reached the vehicle of the agent, in order. None without a capture of the vehicle."""
@@ -198,6 +225,13 @@ class Record:
     @cached_property
     def _times(self) -> list[float]:
         return sorted(entry.content.t for entry in self.entries)
+
+
+def _are_alike(ours: Message, other: Message) -> bool:
+    """Return whether two messages have the same content. The judge does not know all timestamps of candidates."""
+    if isinstance(ours, NextInSequenceResponse) and isinstance(other, NextInSequenceResponse):
+        return (ours.chain_hash, ours.block_hash) == (other.chain_hash, other.block_hash)
+    return ours == other
 
 
 def _entries(trace: Trace) -> Iterator[RecordEntry]:

@@ -300,7 +300,7 @@ class _DoubtingPlayer(RecordPlayer):
             entry = self.entries[self.position]
             assert isinstance(entry.content, HandlerRun)
             line, following = (entry.line, entry.content), list(islice(self._following(), LINES_AFTER))
-            damage = damage_that_explains(before._follower, deviations[0], line, following, self.record.datagrams)
+            damage = damage_that_explains(before._follower, deviations[0], line, following, self.record)
             self.found[self.position] = damage and f"perhaps {damage} (otherwise: {deviations[0].sentence(_short)}),"
         return self.found[self.position]
 
