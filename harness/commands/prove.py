@@ -12,8 +12,6 @@ from harness import proof as prove
 from harness.commands._shared_options import RARE
 from harness.commands.terminal import StatusLine, complain, output, print_json
 from harness.errors import INTERRUPTED
-from harness.play.core_version import edited_files
-from harness.play.variant import variant_in_use
 from harness.proof import Bounds, BoundsError, Limits, Progress, original, specification
 from harness.run.parallel import cores, sigterm_as_ctrl_c
 
@@ -129,11 +127,6 @@ def prove_command(
             "--lies needs --captured, and does not apply to --network any, where the number of lies is "
             "unlimited: leave it out"
         )
-    variant = variant_in_use()
-    if edited := edited_files():
-        complain(f"state reduction is disabled: it assumes the released core, and {', '.join(edited)} was edited")
-    elif variant is not None:
-        complain(f"state reduction is disabled: it assumes the released core, and the variant is {variant.in_words}")
     bounds = Bounds(
         agents,
         blocks,
@@ -143,7 +136,7 @@ def prove_command(
         coincidences,
         _pairs("--settings", settings),
         quirks,
-        reduced=not (whole or quirks or edited or variant),
+        reduced=not whole,
         steps=steps,
         stagger=_pairs("--stagger", stagger),  # type: ignore[arg-type]  # it is checked
         captured=captured,
@@ -152,6 +145,9 @@ def prove_command(
         losses=losses,
         crossing=not no_crossing,
     )
+    if bounds.reduced and (reason := bounds.why_not_reduced()) is not None:
+        complain(f"state reduction is disabled: {reason}")
+        bounds = replace(bounds, reduced=False)
     limits = Limits(memory * GIGABYTE, float("inf") if for_s is None else for_s, cores() if cores_ is None else cores_)
     if second_opinion:
         with StatusLine() as status_line, sigterm_as_ctrl_c():

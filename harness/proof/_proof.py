@@ -216,6 +216,8 @@ def prove(
     Raises HarnessError if the file cannot be written, if an agent does something that state reduction does not allow,
     or if its steps depend on something that is no part of a state.
     """
+    if bounds.reduced and bounds.why_not_reduced() is not None:
+        bounds = replace(bounds, reduced=False)
     try:
         if bounds.network == "any":
             return _alone(bounds, limits, out, watch)

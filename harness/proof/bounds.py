@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from harness.errors import HarnessError
+from harness.play.core_version import edited_files
+from harness.play.variant import variant_in_use
 from harness.present.text import did_you_mean
 from harness.scenario.agent_options import Stagger, Staggered, staggered
 from ucp.quirks import check_quirk
@@ -38,7 +40,7 @@ class Bounds:
     - `coincidences`: the maximum number of moments that are equal by chance. None means any number.
     - `settings`: protocol settings of all agents, by name.
     - `quirks`: mistakes of all agents, by name (see `ucp.quirks`).
-    - `reduced`: treat states that behave alike as one state.
+    - `reduced`: treat states that behave alike as one state. `prove` does so only if `why_not_reduced` gives no reason.
     - `steps`: compare each step of the agents with the step of a correct agent.
     - `stagger`: by timer, the seconds by which each agent's timer is longer than the timer of the agent before it.
     - `captured`: the ID of an agent whose keys an attacker has. From some moment on, the attacker sends in its name.
@@ -130,6 +132,16 @@ class Bounds:
                 raise BoundsError(f"{option} does not apply to --timers any and --network any: leave it out")
         if self.clocks_any and (self.quirks or self.captured is not None):
             raise BoundsError("--clocks any excludes --quirk and --captured: leave them out")
+
+    def why_not_reduced(self) -> str | None:
+        """Return the reason why no two states may count as one. None for the released core, as reductions assume."""
+        if edited := edited_files():
+            return f"it assumes the released core, and {', '.join(edited)} was edited"
+        if (variant := variant_in_use()) is not None:
+            return f"it assumes the released core, and the variant is {variant.in_words}"
+        if wrong := [name for name, value in self.quirks.items() if value]:
+            return f"it assumes the released core, and the agents have the quirk {' and '.join(wrong)}"
+        return None
 
     @property
     def nameless(self) -> bool:

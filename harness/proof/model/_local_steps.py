@@ -20,6 +20,7 @@ from harness.proof.model._snapshot import (
     AgentStep,
     ReductionError,
     Snapshot,
+    Started,
     TimerResult,
     UncoveredError,
     check_that_nothing_is_lost,
@@ -38,8 +39,8 @@ Content = tuple[int, Snapshot, "Flaw | None", Ordinals]
 """The definition of a local state, as another process needs it."""
 
 
-OTHER_COUNTS = (1, 2, 1000)
-"""Counts with which each step of an unreduced proof is repeated."""
+OTHER_COUNTS = ((1, 0.0), (2, 60.0), (1000, 10_000.0))
+"""Counts and mission seconds with which each step of an unreduced proof is repeated."""
 COUNTED = ("reconciles", "sent", "chain_changed_at")
 """Attributes of the state that are only counted, with their names in error messages."""
 
@@ -91,7 +92,9 @@ class LocalStates(KnownStates):
             names = self.names_in_order(local, sender)
             if names is None:
                 heard = self.messages[message]
-                step = self._computed(local, lambda agent: agent.receive_message(sender, 0, heard, NOW_S), hears=True)
+                step = self._computed(
+                    local, lambda agent: agent.receive_message(sender, 0, heard, agent.state.now), hears=True
+                )
             else:
                 step = self.hear(self.renamed(local, names), names[sender - FIRST_OTHER], message)
                 step = step._replace(local=self.renamed_back(step.local, names))
@@ -274,17 +277,10 @@ class LocalStates(KnownStates):
         if wrong is not None:
             handler, sentence = wrong
             flaw = Flaw("steps", sentence, handler)
-        sent = tuple(self.message(message) for _, message in agent.messages_to_send())
-        started = tuple(
-            (number, round((timer.deadline - NOW_S) * MICROSECONDS))
-            for number, timer in enumerate(agent.state.timers)
-            if timer.deadline is not None and timer.deadline < RUNNING_S
-        )
-        for number, _ in started:
-            agent.state.timers[number].start(RUNNING_S, 0.0)
+        sent, started = self._results(agent)
         after = take(agent, {} if boots else before.snapshot)
         if not (self.bounds.reduced or boots or self.bounds.captured):
-            self._check_counts(before.agent_id, before.snapshot, give, after, sent)
+            self._check_counts(before.agent_id, before.snapshot, give, after, (sent, started))
         if flaw is None and all(after[name] is part for name, part in before.snapshot.items()):
             self.agents.leave_in(before.agent_id, after)
             return AgentStep(local, sent, started)
@@ -295,25 +291,34 @@ class LocalStates(KnownStates):
         local = self._intern(before.agent_id, agent, after, before.snapshot, flaw, keep=not boots)
         return AgentStep(local, sent, started)
 
+    def _results(self, agent: Agent) -> tuple[tuple[int, ...], Started]:
+        """Take the messages that the agent sent in a step, and the timers that it started. The timers then run on."""
+        sent = tuple(self.message(message) for _, message in agent.messages_to_send())
+        started = tuple(
+            (number, round((timer.deadline - agent.state.now) * MICROSECONDS))
+            for number, timer in enumerate(agent.state.timers)
+            if timer.deadline is not None and timer.deadline < RUNNING_S
+        )
+        for number, _ in started:
+            agent.state.timers[number].start(RUNNING_S, 0.0)
+        return sent, started
+
     def _check_counts(
-        self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, sent: tuple[int, ...]
+        self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, results: tuple[tuple[int, ...], Started]
     ) -> None:
-        """Raise UncoveredError if the step differs when the agent has counted more reconciles or messages."""
-        for count in OTHER_COUNTS:
+        """Raise UncoveredError if the step differs at another time, or after more reconciles or messages."""
+        for count, now_s in OTHER_COUNTS:
             agent = self._counting[agent_id]
             put_back(agent, before)
-            set_counts(agent, count)
+            set_counts(agent, count, now_s)
             with suppress(Exception):  # the step itself reports an exception
                 give(agent)
                 end_at_once(agent)
-            also_sent = tuple(self.message(message) for _, message in agent.messages_to_send())
-            for timer in agent.state.timers:
-                if timer.deadline is not None and timer.deadline < RUNNING_S:
-                    timer.start(RUNNING_S, 0.0)
-            if also_sent != sent or take(agent, after).items() != after.items():
+            if self._results(agent) != results or take(agent, after).items() != after.items():
                 raise UncoveredError(
-                    f"a step of an agent depends on how often it has done something before ({', '.join(COUNTED)}); a "
-                    "state of the proof has no such count, so keep the count in an attribute of its own"
+                    "a step of an agent depends on the mission time, or on how often it has done something before "
+                    f"({', '.join(COUNTED)}); a state of the proof has neither, so keep what the step needs in an "
+                    "attribute of its own"
                 )
 
     def message(self, message: Message) -> int:

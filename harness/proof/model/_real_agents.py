@@ -98,7 +98,7 @@ def log(agent: Agent, ordinal: int) -> None:
     for number in range(MOST_AT_ONCE):
         if len(agent.state.completed) > completed:
             return
-        agent.add_event(LoggableEvent(ordinal * MICROSECONDS + number, 1, data), NOW_S)
+        agent.add_event(LoggableEvent(ordinal * MICROSECONDS + number, 1, data), agent.state.now)
 
 
 def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
@@ -108,17 +108,18 @@ def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
     if oldest is not None:
         counted = agent.state.reconcile_response_dictionary[oldest]
         counted[1] = min(counted[1], 1)
-    agent.end_timer(agent.state.timers[timer], NOW_S)
+    agent.end_timer(agent.state.timers[timer], agent.state.now)
 
 
 def end_at_once(agent: Agent) -> str | None:
     """End the timers that expire before any message can arrive. Return the text of a handler's exception, or None."""
+    now_s = agent.state.now
     try:
         for _ in range(MOST_AT_ONCE):
-            soon = [t for t in agent.state.timers if t.deadline is not None and t.deadline <= NOW_S + AT_ONCE_S]
+            soon = [t for t in agent.state.timers if t.deadline is not None and t.deadline <= now_s + AT_ONCE_S]
             if not soon:
                 return None
-            agent.end_timer(min(soon, key=lambda timer: timer.deadline or 0.0), NOW_S)
+            agent.end_timer(min(soon, key=lambda timer: timer.deadline or 0.0), now_s)
     except Exception as error:  # any exception of a handler is a flaw
         return f"{type(error).__name__}: {error}"
     return "its timers end at once again and again"

@@ -22,8 +22,9 @@ from ucp.timers import Timer
 REPORTED = frozenset(("now", "sent", "reconciles", "chain_changed_at", "_sequence"))
 """Counters and notes that only a trace or the sequence number of a datagram needs.
 
-They grow without limit, so they cannot be part of a state. Each step begins with them at zero. `LocalStates` repeats
-each step of an unreduced proof with other counts, and refuses an agent whose step depends on them.
+They grow without limit, so they cannot be part of a state. Each step begins with the counters at zero, at `NOW_S`.
+`LocalStates` repeats each step of an unreduced proof with other counts and at other times, and refuses an agent whose
+step depends on them.
 """
 COUNTS = ("reconciles", "_sequence", "chain_changed_at")
 """The counters among them that are numbers and that no input sets."""
@@ -33,7 +34,7 @@ HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
 LEFT_OUT = REPORTED | FIXED | HANDED_OVER
 
 NOW_S = 1000.0
-"""The mission second of every input. The zones contain the relevant times."""
+"""The mission second of each step. The zones contain the relevant times."""
 RUNNING_S = 1e15
 """The deadline of a timer that was running before the input."""
 
@@ -90,8 +91,7 @@ def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) ->
     `since` is the agent's present state, if it is known. Parts that both have are not changed.
     """
     state = vars(agent.state)
-    state["now"] = NOW_S
-    set_counts(agent, 0)
+    set_counts(agent, 0, NOW_S)
     for name in HANDED_OVER & state.keys():
         state[name].clear()
     for name in [name for name in state if name not in snapshot and name not in LEFT_OUT]:
@@ -105,9 +105,10 @@ def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) ->
             state[name] = _copied(value)
 
 
-def set_counts(agent: Agent, count: int) -> None:
-    """Set all counters of the agent that do not affect its steps to `count`."""
+def set_counts(agent: Agent, count: int, now_s: float) -> None:
+    """Set all counters of the agent to `count`, and its time to `now_s`. Steps of covered agents ignore them."""
     state = vars(agent.state)
+    state["now"] = now_s
     state.update(dict.fromkeys(COUNTS, count))
     state["sent"] = Counter(dict.fromkeys(MESSAGE_NAMES, count) if count else ())
 

@@ -86,5 +86,13 @@ def test_agent_that_depends_on_a_counter_is_refused(tmp_path: Path) -> None:
     core = edited(tmp_path, Bug("commit.py", NOT_APPROVED, wrong))
     done = with_core(core, "prove", "--agents", 2, "--blocks", 2, cwd=tmp_path)
     assert done.returncode == 2
-    assert "depends on how often it has done something before (reconciles" in done.stderr
+    assert "depends on the mission time, or on how often it has done something before (reconciles" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_agent_that_depends_on_the_mission_time_is_refused(tmp_path: Path) -> None:
+    """A state of the proof has the remaining times of timers, and not the time of the mission."""
+    late = Bug("commit.py", NOT_APPROVED, NOT_APPROVED.replace("not approved", "not approved and core.now < 60"))
+    done = with_core(edited(tmp_path, late), "prove", "--agents", 2, "--blocks", 2, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "depends on the mission time, or on how often" in done.stderr

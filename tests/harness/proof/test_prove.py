@@ -49,8 +49,9 @@ def test_all_properties_hold_with_fewer_blocks(tmp_path: Path) -> None:
     [("forget_stack", "2", "2"), ("commit_others_twice", "3", "3"), ("leave_flag_set", "hang", "liveness")],
 )
 def test_wrong_agent_is_found_and_its_scenario_confirms_it(tmp_path: Path, quirk: str, kind: str, key: str) -> None:
-    bounds = Bounds(2, 2, "lossy", quirks={quirk: True}, reduced=False)
-    proof = prove(bounds, out=tmp_path / "wrong.yaml")
+    """No state is reduced, although the bounds allow it."""
+    proof = prove(Bounds(2, 2, "lossy", quirks={quirk: True}), out=tmp_path / "wrong.yaml")
+    assert not proof.bounds.reduced
     assert proof.flaw is not None
     assert proof.flaw.kind == kind
     assert proof.example is not None
