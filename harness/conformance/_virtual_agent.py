@@ -34,12 +34,15 @@ from harness.conformance._udp_lab import (
     last_line,
 )
 from harness.conformance._virtual_lines import given_line, virtual_mission
+from harness.conformance.results import FURTHER_CHECKS, CaseResult
 from harness.errors import UnsupportedError
 from harness.play.child_processes import ChildProcesses
 from ucp.clock import MICROSECONDS
 
 ANSWER_BYTES = 4 * 1024 * 1024
-NO_AGENT = "the agent does not answer in virtual time"
+END_CASE = "the program ends with status 0 at the end of its input"
+END_SECTION = "contract, Virtual time"
+RIGHT_END = "status 0"
 
 
 class VirtualProgram:
@@ -137,6 +140,14 @@ class VirtualProgram:
                 raise UnsupportedError(str(answer["error"]))
             raise AgentEndedError(f"it answers with an error: {answer['error']}")
         return answer
+
+    async def finish(self) -> str:
+        """End the input of the process, and return how the process ends: "status 0" if it follows the contract."""
+        self._input.close()
+        with suppress(TimeoutError):
+            await asyncio.wait_for(_wait_for_end(self._process), ANSWER_LIMIT_S)
+        status = self._process.returncode
+        return f"it still runs after {ANSWER_LIMIT_S:g} s" if status is None else f"status {status}"
 
     async def close(self) -> None:
         """End the process and all processes that it started, even if they hold its pipes open."""
@@ -254,6 +265,16 @@ def _same_instant(announced_s: Any, expected_s: float | None) -> bool:
     if expected_s is None or announced_s is None:
         return expected_s is announced_s
     return isinstance(announced_s, int | float) and math.isclose(announced_s, expected_s, rel_tol=1e-9)
+
+
+async def case_of_end(programs: Sequence[VirtualProgram]) -> CaseResult:
+    """End the inputs of these processes, and return the result of the test case about their exit status."""
+    ends = [await program.finish() for program in programs]
+    wrong = next((end for end in ends if end != RIGHT_END), None)
+    if wrong is None:
+        return CaseResult(END_CASE, FURTHER_CHECKS, "passed" if ends else "not tried", section=END_SECTION)
+    reason = f"expected {RIGHT_END} at the end of the input; came {wrong}"
+    return CaseResult(END_CASE, FURTHER_CHECKS, "failed", reason=reason, wrong=(reason,), section=END_SECTION)
 
 
 def starter(command: Sequence[str], errors: Path) -> tuple[Start, list[VirtualProgram]]:

@@ -87,6 +87,8 @@ async def _run(
             await _play(
                 VectorSuite(start, vector_sets, show_progress, workers=VIRTUAL_WORKERS), until, request, results
             )
+            if request.only is None:
+                results.cases.append(await virtual.case_of_end(programs))
         finally:
             for program in programs:
                 await program.close()

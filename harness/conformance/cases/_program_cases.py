@@ -37,6 +37,8 @@ REFUSALS: dict[str, Any] = json.loads((DIRECTORY / "refusals.json").read_text(en
 NO_EXPIRY = {**VARIANTS["default"].settings.to_json(), "vote_timeout_s": 10_000.0}
 """Settings with which no vote ends during a case."""
 INPUTS = 50
+SIGNAL_GAP_S = 0.05
+"""Wall seconds between two signals, because a signal that is still pending absorbs an equal one."""
 SECONDS_WITHOUT_EVENT = 20.0
 """Mission seconds in which an agent would log an event with a probability of almost 1, if it drew one each second."""
 
@@ -86,17 +88,25 @@ async def _ahead(bench: CaseBench) -> None:
         require(shown in (None, 0), "mission second 0", shown)
 
 
+async def _exported(agent: BenchAgent, *signals: int) -> dict[str, Any]:
+    """Send these signals, wait for the end of the agent, and return its chain export."""
+    for number in signals:
+        await agent.process.send_signal(number)
+        await asyncio.sleep(SIGNAL_GAP_S)
+    returned = await agent.end()
+    await agent.receive_nothing("after its end")
+    require(returned == 0, "exit status 0", f"status {returned}")
+    path = agent.process.directory / f"{agent.agent_id}.chain.json"
+    require(path.exists(), "a chain export", "none")
+    export: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return export
+
+
 async def _ends(bench: CaseBench, number: int) -> None:
     async with bench.agent({"settings": NO_EXPIRY}) as agent:
         await agent.log(b"event")
         await agent.receive_one(BlockAddRequest, "an event that fills a block")
-        await agent.process.send_signal(number)
-        returned = await agent.end()
-        await agent.receive_nothing("after its end")
-        require(returned == 0, "exit status 0", f"status {returned}")
-        path = agent.process.directory / f"{agent.agent_id}.chain.json"
-        require(path.exists(), "a chain export", "none")
-        export = json.loads(path.read_text(encoding="utf-8"))
+        export = await _exported(agent, number)
         require(len(export["completed"]) == 1, "one completed block in the export", len(export["completed"]))
         socket = agent.process.directory / f"{agent.agent_id}.control"
         require(not socket.exists(), "no control socket any more", "it is there")
@@ -113,6 +123,22 @@ async def _sigterm(bench: CaseBench) -> None:
 @case("SIGINT exports the chain, exit status 0", "contract, The program")
 async def _sigint(bench: CaseBench) -> None:
     await _ends(bench, signal.SIGINT)
+
+
+@case("SIGTERM twice during a reconcile exports the chain once, exit status 0", "contract, The program")
+async def _sigterm_twice(bench: CaseBench) -> None:
+    async with bench.agent() as agent:
+        await agent.process.ask("reconcile")
+        await agent.receive_one(ChainContainQuery, "the command reconcile")
+        export = await _exported(agent, signal.SIGTERM, signal.SIGTERM)
+        require(export["chain"] == [], "an export of a chain without blocks", f"{len(export['chain'])} blocks")
+
+
+@case("SIGTERM before the mission starts exports the chain, exit status 0", "contract, The program")
+async def _sigterm_early(bench: CaseBench) -> None:
+    async with bench.agent(started=False) as agent:
+        export = await _exported(agent, signal.SIGTERM)
+        require(export["exported_at_us"] == 0, "`exported_at_us` 0 in the export", export["exported_at_us"])
 
 
 async def _processes(agent: BenchAgent) -> list[int]:

@@ -42,6 +42,11 @@ def test_agent_that_ends_after_many_inputs_is_named(tmp_path: Path) -> None:
     assert [case.name.partition(":")[0] for case in results.failures] == ["it ended with status 3"]
 
 
+def test_wrong_status_at_the_end_of_the_input_fails_its_case(tmp_path: Path) -> None:
+    results = results_of("ends_with_status_3_without_a_mission", tmp_path, virtual=True)
+    assert [case.reason for case in results.failures] == ["expected status 0 at the end of the input; came status 3"]
+
+
 def test_failure_without_a_path_in_virtual_time_is_kept(tmp_path: Path) -> None:
     case = CaseResult("a late timer", 5, "failed", settings="default", inputs=("the next timer ends", "vote yes"))
     keep(case, ("agent",), tmp_path / "kept")

@@ -51,6 +51,16 @@ def test_records_of_reference_pass(case: str, tmp_path: Path) -> None:
         ("writes_export_in_place", "a chain export replaces the earlier one in one step", "came the same"),
         ("leaves_other_files", "SIGTERM exports the chain, exit status 0", "came scratch.tmp"),
         ("sends_after_sigterm", "SIGINT exports the chain, exit status 0", "came Chain Contain Query"),
+        (
+            "ends_with_status_3_without_a_mission",
+            "SIGTERM before the mission starts exports the chain, exit status 0",
+            "expected exit status 0; came status 3",
+        ),
+        (
+            "dies_of_a_second_sigterm",
+            "SIGTERM twice during a reconcile exports the chain once, exit status 0",
+            "came status -15",
+        ),
         ("receives_only_1500_bytes", "malformed datagrams are dropped and change nothing", "expected `dropped`"),
         (
             "ignores_requested_quirks",

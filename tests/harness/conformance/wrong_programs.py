@@ -6,6 +6,7 @@ Each is `python -m ucp.node` with one mistake outside the 20 algorithms. `ucp/qu
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -308,6 +309,33 @@ def sends_after_sigterm() -> None:
 @mistake
 def ends_with_status_3() -> None:
     _patch(Node, "run", lambda old, self: (old(self), 3)[1])
+
+
+@mistake
+def dies_of_a_second_sigterm() -> None:
+    def run(old: Callable[..., Any], self: Node) -> int:
+        def stop(stop_loop: Callable[..., Any]) -> None:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+            time.sleep(1)
+            stop_loop()
+
+        _patch(self._loop, "stop", stop)
+        status: int = old(self)
+        return status
+
+    _patch(Node, "run", run)
+
+
+@mistake
+def ends_with_status_3_without_a_mission() -> None:
+    """It does so at a signal before the command `start`, and at the end of its input in virtual time."""
+
+    def run(old: Callable[..., Any], self: Node) -> int:
+        status: int = old(self)
+        return status if self.clock.running else 3
+
+    _patch(Node, "run", run)
+    _patch(virtual, "main", lambda old: old() or 3)
 
 
 @mistake
