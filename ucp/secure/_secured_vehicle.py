@@ -13,7 +13,7 @@ from typing import Any
 
 from ucp.mission import Mission, MissionError
 from ucp.sealed import sealed_to
-from ucp.secure.bundle import BUNDLE_SCHEMA, Bundle, load_bundle, write_bundle
+from ucp.secure.bundle import BUNDLE_SCHEMA, KEY_BYTES, Bundle, load_bundle, write_bundle
 from ucp.secure.envelope import BOOT_BYTES
 from ucp.secure.keyfile import KeyFileError, key_in
 from ucp.secure.sealing import make_seal
@@ -45,7 +45,8 @@ def agent_factory(
     _check_bundle(bundle, mission, f"`security.bundle`: {path}")
     earlier_us = -1 if bundle.started_us is None else bundle.started_us
     started_us = max(time.time_ns() // 1000, earlier_us + 1)  # the clock may be lost
-    return _factory(mission, Session(bundle, make_boot(started_us, os.urandom(8)), save))
+    session = Session(bundle, make_boot(started_us, os.urandom(8)), save)
+    return _factory(mission, session, partial(os.urandom, KEY_BYTES))
 
 
 def virtual_agent_factory(mission: Mission, bundle: Any, boot: Any) -> Callable[..., SecuredAgent]:
@@ -76,6 +77,8 @@ def _check_bundle(bundle: Bundle, mission: Mission, place: str) -> None:
         raise MissionError(f"{place} seals to another depot than the mission's `initial_data` names")
 
 
-def _factory(mission: Mission, session: Session) -> Callable[..., SecuredAgent]:
+def _factory(
+    mission: Mission, session: Session, draw_key: Callable[[], bytes] | None = None
+) -> Callable[..., SecuredAgent]:
     seals = sealed_to(mission.initial_data) is not None
-    return partial(SecuredAgent, session, seal=make_seal(session.epochs.bundle) if seals else None)
+    return partial(SecuredAgent, session, seal=make_seal(session.epochs.bundle, draw_key) if seals else None)

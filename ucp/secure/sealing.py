@@ -4,12 +4,15 @@ Sealing is HPKE (RFC 9180) in base mode: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256
 key. `info` contains mission, agent and timestamp, so sealed data of one block is not valid in another block.
 Additional data (AAD) would bind them as well, but some HPKE libraries do not support it.
 
-An agent draws no random numbers. It derives the ephemeral key of each block from its private key and from all data of
-the block. Equal blocks therefore give equal bytes, and blocks that differ never share a key. HPKE libraries do not
-accept an ephemeral key, so this module seals with its own code. It opens with the HPKE of the library.
+A vehicle draws a random ephemeral key for each block. If the key followed from the vehicle's private key and the
+events, the holder of the private key could guess the events of a block, and confirm each guess. In virtual time, equal
+runs must give equal bytes. There, the ephemeral key is derived from the private key and from all data of the block.
+HPKE libraries do not accept an ephemeral key, so this module seals with its own code. It opens with the HPKE of the
+library.
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -57,8 +60,11 @@ class Depot:
             raise NotOpenedError("not sealed to this depot by the agent that it names, or damaged") from None
 
 
-def make_seal(bundle: Bundle) -> Seal | None:
-    """Return the function with which this vehicle seals its event data. None if its mission does not seal."""
+def make_seal(bundle: Bundle, draw_key: Callable[[], bytes] | None = None) -> Seal | None:
+    """Return the function with which this vehicle seals its event data. None if its mission does not seal.
+
+    `draw_key` returns a random ephemeral key, 32 bytes. Without it, ephemeral keys are derived, for virtual time.
+    """
     depot = bundle.public.depot
     if depot is None:
         return None
@@ -66,11 +72,17 @@ def make_seal(bundle: Bundle) -> Seal | None:
 
     def seal(event_data: bytes, timestamp_us: int) -> bytes:
         info = _info(mission, agent_id, timestamp_us)
-        derivation = HMAC(bundle.private_key, SHA256())
-        derivation.update(b"UCP ephemeral key\0" + depot + info + event_data)
-        return _hpke_seal(event_data, recipient, X25519PrivateKey.from_private_bytes(derivation.finalize()), info)
+        ephemeral = draw_key() if draw_key is not None else _derived_key(bundle, depot + info + event_data)
+        return _hpke_seal(event_data, recipient, X25519PrivateKey.from_private_bytes(ephemeral), info)
 
     return seal
+
+
+def _derived_key(bundle: Bundle, data: bytes) -> bytes:
+    """Return an ephemeral key that follows from the vehicle's private key and all data of a block."""
+    derivation = HMAC(bundle.private_key, SHA256())
+    derivation.update(b"UCP ephemeral key\0" + data)
+    return derivation.finalize()
 
 
 def _hpke_seal(plain: bytes, recipient: X25519PublicKey, ephemeral: X25519PrivateKey, info: bytes) -> bytes:

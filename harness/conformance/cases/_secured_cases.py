@@ -76,7 +76,7 @@ class SecuredPeers:
         Raises WrongBehaviourError if fewer arrive, or if one is not authentic.
         """
         peer_socket, until = self.agent.peer_socket, time.time() + PATIENCE_S
-        while len(peer_socket.received) < count and time.time() < until:
+        while self._drop_challenges() < count and time.time() < until:
             peer_socket.drain()
             await peer_socket.arrival(min(until, time.time() + SILENCE_S))
         datagrams = [data for _, data in peer_socket.received[:count]]
@@ -87,6 +87,14 @@ class SecuredPeers:
         except MalformedDatagramError as error:
             require(False, f"{what}, authentic and sealed", f"one that is not: {error.reason}")
             raise
+
+    def _drop_challenges(self) -> int:
+        """Remove challenges and echoes from the received datagrams, and return the number of the others."""
+        from ucp.secure.envelope import CHALLENGE, ECHO
+
+        received = self.agent.peer_socket.received
+        received[:] = [(at_s, data) for at_s, data in received if data[3:4] not in (bytes([CHALLENGE]), bytes([ECHO]))]
+        return len(received)
 
     async def require_single_answer(self, after: str) -> bytes:
         """Ask the agent whether it has the inception block. Its next datagram must be the answer to this request.

@@ -1,10 +1,17 @@
 """Test encrypted event data: the method is HPKE (RFC 9180), and only the depot can decrypt them."""
 
+import base64
+from pathlib import Path
+
 import pytest
 from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
 
+from tests.ucp.test_node import mission
+from ucp.events import LoggableEvent
+from ucp.mission import parse_mission
 from ucp.sealed import SEAL_BYTES, seal_to, sealed_to
-from ucp.secure.bundle import KeySet
+from ucp.secure._secured_vehicle import agent_factory
+from ucp.secure.bundle import Bundle, KeySet, write_bundle
 from ucp.secure.sealing import Depot, NotOpenedError, key_schedule, make_seal
 
 KEYS = KeySet.derived(b"a seed".ljust(32), (1, 7), seals=True)
@@ -47,6 +54,29 @@ def test_equal_blocks_give_equal_bytes_and_others_use_other_keys() -> None:
         sealed[:32] for sealed in (seal(EVENTS, 5), seal(EVENTS, 6), seal(EVENTS + b".", 5), seal(EVENTS, 5, 1))
     }
     assert len(ephemeral) == 4
+
+
+def confirms(guess: bytes, sealed: bytes, bundle: Bundle, timestamp_us: int) -> bool:
+    """Return whether the holder of a vehicle's keys can confirm the events of one of its blocks."""
+    attack = make_seal(bundle)
+    assert attack is not None
+    return attack(guess, timestamp_us) == sealed
+
+
+def test_holder_of_a_vehicles_keys_cannot_confirm_guesses(tmp_path: Path) -> None:
+    bundle = KEYS.bundle(7)
+    assert confirms(EVENTS, seal(EVENTS, 5), bundle, 5), "in virtual time, which draws no random numbers"
+    write_bundle(tmp_path / "7.bundle.json", bundle)
+    initial_data = base64.b64encode(seal_to(b"test", DEPOT.public_key)).decode()
+    told = mission(agent_id=7, roster=[1, 7], security={"bundle": "7.bundle.json"}, initial_data=initial_data)
+    told["settings"] = {"max_block_bytes": 976}
+    parsed = parse_mission(told)
+    agent = agent_factory(parsed, tmp_path, lambda error: None)(7, [1, 7], parsed.initial_data, parsed.settings)
+    for number in range(4):
+        agent.add_event(LoggableEvent(number, 7, bytes(240)), 0.0)
+    (block,) = agent.state.blocks_to_be_committed
+    events = DEPOT.open(block.event_data, 7, block.timestamp_us)
+    assert not confirms(events, block.event_data, bundle, block.timestamp_us)
 
 
 def test_other_keys_blocks_and_altered_bytes_do_not_open() -> None:
