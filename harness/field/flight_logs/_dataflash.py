@@ -43,6 +43,16 @@ _COLUMN_TYPES: dict[str, tuple[str, float | None]] = {
 """Code of a column in FMT -> its code in `struct`, and the divisor of its values."""
 _VEHICLE_PARAMETERS = ("MAV_SYSID", "SYSID_THISMAV")
 _EVENT_ARMED, _EVENT_DISARMED = 10, 11
+_FAILSAFES = {
+    3: "radio failsafe",
+    4: "battery failsafe",
+    5: "ground station failsafe",
+    6: "EKF failsafe",
+    10: "fence breached",
+    11: "terrain failsafe",
+    19: "crash failsafe",
+}
+"""ModeReason of ArduPilot -> words. Other reasons are no failsafe."""
 _FIRMWARE = {"ArduPlane": 1, "ArduCopter": 2, "ArduRover": 10, "Rover": 10}
 """First word of the firmware's text -> MAV_TYPE."""
 
@@ -187,7 +197,8 @@ class DataFlashReader:
 
     def _mode(self, at_us: int, values: Values) -> None:
         number = values["ModeNum"] if "ModeNum" in values else values["Mode"]
-        self.vehicle.add_change(ModeChange(at_us, None, number, str(number)), number)
+        failsafe = _FAILSAFES.get(values.get("Rsn", 0))
+        self.vehicle.add_change(ModeChange(at_us, None, number, str(number), failsafe), number)
 
     def _arm(self, at_us: int, values: Values) -> None:
         armed = bool(values["ArmState"])

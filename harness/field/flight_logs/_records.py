@@ -28,6 +28,8 @@ class ModeChange(NamedTuple):
     number: int
     name: str
     """The name of the mode, or its number if it has no known name."""
+    failsafe: str | None = None
+    """The failsafe that changed the mode, such as "battery failsafe". Only DataFlash logs have it."""
 
 
 class Arming(NamedTuple):

@@ -64,7 +64,10 @@ def changes(match: MatchedLog) -> list[LoggedChange]:
     problems.
     """
     vehicle, agent_id = match.vehicle, match.agent_id
-    found = [LoggedChange(_time(mode), agent_id, f"mode {mode.name}") for mode in vehicle.modes]
+    found = [
+        LoggedChange(_time(mode), agent_id, f"mode {mode.name}" + (f", {mode.failsafe}" if mode.failsafe else ""))
+        for mode in vehicle.modes
+    ]
     found += [LoggedChange(_time(arm), agent_id, "armed" if arm.armed else "disarmed") for arm in vehicle.arming]
     gps = [(status, status.fix < LOWEST_FIX) for status in vehicle.gps if status.instance == 0]
     found += _turns(gps, agent_id, "GPS without a fix", "GPS has a fix")

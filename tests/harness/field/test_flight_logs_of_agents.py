@@ -1,6 +1,7 @@
 """Test that flight logs are assigned to the agents that flew on the vehicles, in each command that uses them."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -113,7 +114,15 @@ def test_changes_of_gps_and_mode_are_in_time_order(tmp_path: Path) -> None:
     ]
     match = matched(tmp_path / "1.bin", {7: []}, dataflash_file(messages))
     words = [change.words for change in changes(match)]
-    assert words == ["mode GUIDED", "armed", "mode LAND", "disarmed", "GPS without a fix", "GPS has a fix"]
+    assert words == [
+        "mode GUIDED",
+        "armed",
+        "mode LAND",
+        "disarmed",
+        "GPS without a fix",
+        "GPS has a fix",
+        "mode RTL, battery failsafe",
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +153,8 @@ def test_consolidation_shows_flight_logs_on_the_map_and_over_time(folder: Path) 
     assert "flight log of vehicle 7" in page
     assert "Vehicles over time" in page and "mode GUIDED" in page and "disarmed" in page
     assert "is of agent 7 by 14 positions; the clock of agent 7 was +2." in page
+    marks = re.findall(r'<path class="mark" [^>]*><title>(.*?)</title>', page)
+    assert marks == ["mode GUIDED, armed", "mode LAND, disarmed"]
     assert "other.tlog: the telemetry log of a plane matches no agent" in page
 
 

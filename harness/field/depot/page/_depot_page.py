@@ -29,6 +29,7 @@ from harness.report import html
 from harness.report.chain_tree_svg import STYLE as TREE_STYLE
 from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.map_svg import STYLE as MAP_STYLE
+from ucp.clock import MICROSECONDS
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 _STYLE = _TEMPLATE.with_name("page.css").read_text(encoding="utf-8")
@@ -44,6 +45,9 @@ def draw(record: Consolidation, reconciliation: Reconciliation | None = None) ->
     when = _time_chart.time_span_of(record)
     agent_tracks = tracks(record)
     matches = flight_logs(record)
+    marks = _marks(matches)
+    if when is not None:
+        when = _time_chart.extended(when, (mark for of_agent in marks.values() for mark in of_agent))
     flown = flown_tracks(matches)
     single_copies = [block.line.name for block in record.blocks if len(block.line.holders) < 2]
     lost: dict[int, list[int]] = {}
@@ -68,7 +72,7 @@ def draw(record: Consolidation, reconciliation: Reconciliation | None = None) ->
         when=when,
         began=text_module.moment(when.first_us) if when else "",
         ended=text_module.moment(when.last_us) if when else "",
-        along=_time_chart.draw(record, when, ink) if when else None,
+        along=_time_chart.draw(record, when, ink, marks) if when else None,
         shades=range(_time_chart.SHADES),
         holdings=_holdings.draw(record),
         places=_holdings.PLACES,
@@ -184,6 +188,17 @@ def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, AgentColours]) -> 
         for change in sorted(found, key=lambda change: change.at_us)
         if change.agent_id is not None
     ]
+
+
+def _marks(matches: Sequence[MatchedLog]) -> dict[int, list[_time_chart.Mark]]:
+    """Return the changes in the flight log of each agent, by the clock of the agent."""
+    marks: dict[int, list[_time_chart.Mark]] = {}
+    for match in matches:
+        if match.agent_id is not None:
+            ahead_us = round((match.clock_ahead_s or 0.0) * MICROSECONDS)
+            of_agent = marks.setdefault(match.agent_id, [])
+            of_agent += [(change.at_us + ahead_us, change.words) for change in changes(match)]
+    return marks
 
 
 def _row(block: Block, ink: Mapping[int, AgentColours]) -> dict[str, Any]:

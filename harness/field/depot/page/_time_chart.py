@@ -1,11 +1,11 @@
 """Draw a chart over time with a row for each vehicle: its events, and below them its blocks, shaded by the number of
-holders.
+holders. Marks show the changes in the flight log of the vehicle.
 """
 
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from markupsafe import Markup
 
@@ -22,6 +22,8 @@ MAX_GAP_PX = 0.6
 OUTLIER_SHARE = 0.01
 """Share of events at both ends of the time span whose clocks may be wrong."""
 SHADES = 4
+MAX_NAMED = 8
+"""Maximum number of changes in the text of a mark."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +48,24 @@ def time_span_of(record: Consolidation) -> TimeSpan | None:
     return TimeSpan(first, last, outside)
 
 
-def draw(record: Consolidation, time_span: TimeSpan, ink: Mapping[int, AgentColours]) -> Markup:
-    """Draw the rows of all vehicles."""
+def extended(time_span: TimeSpan, marks: Iterable["Mark"]) -> TimeSpan:
+    """Return the interval with the marks before and after it, up to its length away. Others have a wrong clock."""
+    length = time_span.last_us - time_span.first_us
+    near = [at for at, _ in marks if time_span.first_us - length <= at <= time_span.last_us + length]
+    return replace(time_span, first_us=min([time_span.first_us, *near]), last_us=max([time_span.last_us, *near]))
+
+
+Mark = tuple[int, str]
+"""A time on the clock of the agent in microseconds, and the change of its vehicle, such as "mode LAND"."""
+
+
+def draw(
+    record: Consolidation,
+    time_span: TimeSpan,
+    ink: Mapping[int, AgentColours],
+    marks: Mapping[int, Sequence[Mark]],
+) -> Markup:
+    """Draw the rows of all vehicles. `marks` are the changes of each vehicle."""
     length_s = max(1.0, (time_span.last_us - time_span.first_us) / 1e6)
     axis = svg.linear_axis(0.0, length_s, (LEFT, WIDTH - RIGHT))
     of_agent: dict[int, list[RecordedBlock]] = defaultdict(list)
@@ -56,7 +74,12 @@ def draw(record: Consolidation, time_span: TimeSpan, ink: Mapping[int, AgentColo
     roster = record.header.roster
     height = TOP + LANE * len(roster) + BOTTOM
     lanes = [
-        _lane(agent_id, of_agent[agent_id], record, time_span, axis, TOP + LANE * number, ink[agent_id])
+        Markup("").join(
+            [
+                _lane(agent_id, of_agent[agent_id], record, time_span, axis, TOP + LANE * number, ink[agent_id]),
+                *_marks(marks.get(agent_id, ()), time_span, axis, TOP + LANE * number + 2),
+            ]
+        )
         for number, agent_id in enumerate(roster)
     ]
     return Markup(
@@ -105,6 +128,19 @@ def _lane(
             *_losses(agent_id, blocks, record, time_span, axis, top + 4),
         ]
     )
+
+
+def _marks(marks: Iterable[Mark], time_span: TimeSpan, axis: svg.Axis, top: float) -> Iterable[Markup]:
+    """Draw the changes of a vehicle. Changes at the same pixel share a mark."""
+    at_px: dict[int, list[str]] = defaultdict(list)
+    for at_us, words in marks:
+        if time_span.first_us <= at_us <= time_span.last_us:
+            at_px[round(axis((at_us - time_span.first_us) / 1e6))].append(words)
+    for x, changes in sorted(at_px.items()):
+        named = ", ".join([*changes[:MAX_NAMED], *(["..."] if len(changes) > MAX_NAMED else [])])
+        yield Markup('<path class="mark" d="M{} {}h6l-3 6zm3 6v{}"><title>{}</title></path>').format(
+            n(x - 3), n(top), n(LANE - 10), named
+        )
 
 
 def _bars(
