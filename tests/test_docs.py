@@ -151,6 +151,16 @@ def test_every_key_of_a_scenario_has_a_description() -> None:
     assert [row for row in rows if row.endswith("|  |")] == []
 
 
+def test_gallery_has_each_scenario_with_its_result_and_picture(site: Path) -> None:
+    page = (site / "gallery.html").read_text()
+    names = {path.stem for path in (REPOSITORY / "scenarios").glob("*.yaml") if not path.stem.endswith("_matrix")}
+    assert set(re.findall(r"ucp-harness run (\w+) --backend sim --seed \d", page)) == names
+    assert set(re.findall(r'<img alt="agents? [^"]+" src="gallery/(\w+)\.svg"', page)) == names
+    assert {path.stem for path in (site / "gallery").iterdir()} == names
+    assert page.count("Verdict: all checks are good.") > len(names) / 3
+    assert "Verdict: characteristic 5 violated, characteristic 6 violated, swarm not finished." in page
+
+
 def test_picture_of_the_rooms_shows_the_imports(site: Path) -> None:
     text = (site / "explanation/architecture.html").read_text()
     assert re.search(r"<title>\d+ of the files in report/ use archive/</title>", text)
