@@ -1,6 +1,7 @@
 # make run    play the thesis's 15 % loss experiment and write a report
+# make check  run lint, types and the essential tests, in three minutes
 # make test   run all tests
-# Both set up what they need: Debian packages (asking sudo if you are not root) and a virtual environment in .venv.
+# All set up what they need: Debian packages (asking sudo if you are not root) and a virtual environment in .venv.
 
 PYTHON ?= python3
 VENV := .venv
@@ -11,10 +12,16 @@ TESTS ?= -n 2
 FUZZ_SECONDS ?= 10
 TARGETS ?=
 
-.PHONY: run test test-netem test-ros fuzz docs lint setup clean
+ESSENTIAL := tests/ucp tests/harness/archive tests/harness/checker tests/harness/run tests/harness/scenario \
+  tests/harness/test_api.py tests/harness/test_rooms.py tests/harness/test_schemas.py tests/test_prose.py
+
+.PHONY: run check test test-netem test-ros fuzz docs lint setup clean
 
 run: setup
 	$(BIN)/ucp-harness run $(SCENARIO)
+
+check: lint
+	$(BIN)/python -m pytest -n 2 -m 'not (lab or docker or uml)' $(ESSENTIAL)
 
 test: setup
 	$(BIN)/python -m pytest $(TESTS)
