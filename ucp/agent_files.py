@@ -1,6 +1,7 @@
 """Write the files of an agent: its chain export as a whole, and its trace and log line by line."""
 
 import contextlib
+import errno
 import json
 import os
 import time
@@ -8,6 +9,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 CHUNK_BYTES = 64 * 1024
+RESERVED_BYTES = 1024 * 1024
+"""Space for an export of about 700 blocks."""
+KEPT_FREE_SHARE = 0.1
+"""Share of the file system that traces and logs leave to stores and exports."""
+MAX_KEPT_FREE_BYTES = 16 * 1024 * 1024
 
 
 def write_json_atomically(path: Path, document: dict[str, Any]) -> None:
@@ -33,6 +39,27 @@ def write_atomically(path: Path, text: str) -> None:
         raise
 
 
+class ReservedSpace:
+    """Space on the disk for the export, which other files cannot take.
+
+    The space is that of a file without a name, so it is free again when the process ends.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._descriptor: int | None = None
+        with contextlib.suppress(OSError):  # the disk is full, or its file system cannot do this
+            self._descriptor = os.open(directory, os.O_TMPFILE | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+            os.posix_fallocate(self._descriptor, 0, RESERVED_BYTES)
+
+    def release(self) -> bool:
+        """Free the space. Return false if it was free already."""
+        if self._descriptor is None:
+            return False
+        os.close(self._descriptor)
+        self._descriptor = None
+        return True
+
+
 class LogFile:
     """A log file for human readers. A line that cannot be written is lost."""
 
@@ -43,6 +70,7 @@ class LogFile:
         now = time.time()
         at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(now))
         with contextlib.suppress(OSError):
+            leave_space(self._file)
             self._file.write(f"{at},{int(now % 1 * 1000):03d} {sentence}\n".encode(errors="replace"))
 
     def close(self) -> None:
@@ -70,6 +98,7 @@ class TraceFile:
         data = lines.encode("ascii")
         end = self._file.tell()
         try:
+            leave_space(self._file)
             while data:
                 data = data[self._file.write(data) :]  # the call after a partial one raises the reason
             return
@@ -80,6 +109,15 @@ class TraceFile:
 
     def close(self) -> None:
         self._file.close()
+
+
+def leave_space(file: BinaryIO) -> None:
+    """Raise OSError if the file system has only the space left that stores and exports need."""
+    system = os.fstatvfs(file.fileno())
+    if system.f_bavail * system.f_frsize < min(
+        MAX_KEPT_FREE_BYTES, system.f_blocks * system.f_frsize * KEPT_FREE_SHARE
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _end_of_last_line(file: BinaryIO) -> int:

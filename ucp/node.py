@@ -11,15 +11,16 @@ import contextlib
 import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any, cast
 
+from ucp._drop_quota import DropQuota
 from ucp._status import status_of
 from ucp.agent import Agent
-from ucp.agent_files import LogFile, TraceFile, write_json_atomically
+from ucp.agent_files import LogFile, ReservedSpace, TraceFile, write_json_atomically
 from ucp.clock import MissionClock
 from ucp.control import CommandError, ControlServer, UnsupportedCommandError
 from ucp.events import EVENT_HEADER_BYTES, LoggableEvent, RandomEvents
@@ -29,7 +30,7 @@ from ucp.loop import Loop, Timer
 from ucp.messages import MalformedDatagramError
 from ucp.mission import Mission, MissionError, UnsupportedMissionError, is_epoch, load_mission
 from ucp.store import Store, StoreError
-from ucp.trace import CommandEntry, Entry, HandlerRun, header_line
+from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun, header_line
 
 if TYPE_CHECKING:
     from ucp.secure.secured_agent import SecuredAgent
@@ -68,6 +69,8 @@ class Node:
         self._joined_s = 0.0  # mission seconds at which the agent joined a mission that was under way
         self._directory = directory
         self._trace = TraceFile(directory / f"{mission.agent_id}.trace.jsonl")
+        self._drop_quota = DropQuota()
+        self._export_space = ReservedSpace(directory)
         self._store = Store(directory / mission.store, self.agent.state) if mission.store else None
         self._socket = _broadcast_socket(mission)
         self._loop = Loop() if loop is None else loop
@@ -143,7 +146,13 @@ class Node:
         now = self.clock.now()
         at_us, secured = self.clock.timestamp_us(now), self._secured
         document = export_chain(self.agent.state, at_us) if secured is None else secured.signed_export(at_us)
-        write_json_atomically(path, document)
+        self._record_entries([*self._drop_quota.counts(now)])
+        try:
+            write_json_atomically(path, document)
+        except OSError:
+            if not self._export_space.release():
+                raise
+            write_json_atomically(path, document)
         return path
 
     def _apply_quirks(self) -> None:
@@ -186,7 +195,7 @@ class Node:
         Store and trace come before the broadcast, because the process can be killed in between.
         """
         feed(self.clock.now())
-        self._record_entries(self.agent.trace())
+        self._record_entries([*self._within_quota(self.agent.trace())])
         for datagram in self.agent.datagrams_to_send():
             try:
                 self._socket.sendto(datagram, (self.mission.network.broadcast, self.mission.network.port))
@@ -214,6 +223,13 @@ class Node:
             self._trace.write("".join(entry.to_line() for entry in entries))
             if self._trace.problem:
                 self._log_line(f"the trace ends here: {self._trace.problem}")
+
+    def _within_quota(self, entries: list[Entry]) -> Iterator[Entry]:
+        for entry in entries:
+            if isinstance(entry, DroppedDatagram):
+                yield from self._drop_quota.lines(entry)
+            else:
+                yield entry
 
     # Event sources
 

@@ -170,14 +170,23 @@ class HandlerRun:
 
 @dataclass(slots=True)
 class DroppedDatagram:
-    """A trace line about a datagram that the agent dropped, with the reason."""
+    """A trace line about a datagram that the agent dropped, with the reason.
+
+    With a `count`, the line stands for this number of datagrams, and `datagram` is empty.
+    """
 
     t: float
     dropped: str
     datagram: RecordedBytes
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ValueError("count is at least 1")
 
     def to_line(self) -> str:
-        return _encode({"t": round(self.t, 6), "dropped": self.dropped, "datagram": self.datagram.text}) + "\n"
+        record: dict[str, Any] = {"t": round(self.t, 6), "dropped": self.dropped, "datagram": self.datagram.text}
+        return _encode(record if self.count == 1 else {**record, "count": self.count}) + "\n"
 
 
 @dataclass(slots=True)

@@ -172,6 +172,14 @@ class Trace:
         for count, (position, aside) in enumerate(self.asides, 1):
             yield position + 1 + bisect_right(self.starts, position) + count, aside
 
+    def dropped(self) -> Counter[str]:
+        """Return the number of dropped datagrams by reason, including those that the agent only counted."""
+        counts: Counter[str] = Counter()
+        for _, aside in self.asides:
+            if isinstance(aside, DroppedDatagram):
+                counts[aside.dropped] += aside.count
+        return counts
+
     def extend(self, entries: Iterable[Entry]) -> None:
         """Append further entries."""
         for entry in entries:

@@ -26,6 +26,7 @@ from ucp.messages import BlockAddRequest, CommitBlock, RequestForBlock, decode, 
 from ucp.mission import parse_mission
 from ucp.node import Node
 from ucp.store import Store
+from ucp.trace import DroppedDatagram
 
 DEADLINE_S = 10.0
 NEEDED = {
@@ -43,7 +44,7 @@ NEEDED = {
         "short_value",
         "state",
     ),
-    *("sealed", "_status", "store", "timers", "trace", "trigger", "wire"),
+    *("_drop_quota", "plain_file", "sealed", "_status", "store", "timers", "trace", "trigger", "wire"),
 }
 """The modules of `ucp` that each agent imports."""
 
@@ -519,6 +520,65 @@ def test_full_disk_ends_the_trace_and_the_agent_continues(directory: Path) -> No
     agent.wait_for(lambda: agent.ask("status")["trace_problem"] == "No space left on device")
     agent.process.terminate()
     assert agent.process.wait(DEADLINE_S) == 0
+
+
+def test_flood_of_datagrams_fills_no_disk_and_is_counted(directory: Path) -> None:
+    flooded = mission(epoch_us=round(time.time() * 1e6))
+    agent = AgentUnderTest(directory, flooded)
+    agent.wait_for(lambda: agent.ask("status")["started"])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as attacker:
+        attacker.bind(("127.0.0.2", 0))
+        attacker.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        for _ in range(20):
+            for _ in range(100):
+                attacker.sendto(b"x" * 1472, (flooded["network"]["broadcast"], flooded["network"]["port"]))
+            agent.ask("status")  # so that the agent has read some of them
+    agent.process.terminate()
+    assert agent.process.wait(DEADLINE_S) == 0
+    trace = read_trace(directory / "7.trace.jsonl")
+    assert trace is not None
+    assert trace.dropped()["wrong magic"] > 1000
+    assert any(isinstance(aside, DroppedDatagram) and aside.count > 100 for _, aside in trace.asides)
+    assert (directory / "7.trace.jsonl").stat().st_size < 1.2 * 1024 * 1024
+
+
+@pytest.mark.lab
+def test_trace_leaves_the_disk_to_the_store_and_the_export(tmp_path: Path) -> None:
+    script = r"""
+import os, pathlib, subprocess, sys
+sys.path.insert(0, sys.argv[2])
+from tests.ucp.test_node import AgentUnderTest, mission
+disk = pathlib.Path(sys.argv[1])
+subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", disk], check=True)
+agent = AgentUnderTest(disk, mission(events={"source": "random", "mean_s": 1.0}, store="7.store"))
+agent.start()
+agent.ask("export")
+agent.wait_for((disk / "7.store").exists)
+with (disk / "ballast").open("wb", buffering=0) as ballast:
+    while os.statvfs(disk).f_bavail * 4096 > 200_000: ballast.write(bytes(4096))
+agent.wait_for(lambda: agent.ask("status")["trace_problem"])
+written = (disk / "7.store").stat().st_size
+agent.wait_for(lambda: (disk / "7.store").stat().st_size > written)
+try:
+    with (disk / "rest").open("wb", buffering=0) as ballast:
+        while ballast.write(bytes(4096)) == 4096: pass
+except OSError: pass
+before = (disk / "7.chain.json").stat().st_mtime_ns
+agent.ask("export")
+assert (disk / "7.chain.json").stat().st_mtime_ns > before
+agent.process.terminate()
+sys.exit(agent.process.wait(10))
+"""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    private = ["unshare", "--user", "--map-root-user", "--mount"]
+    done = subprocess.run(
+        [*private, sys.executable, "-c", script, str(disk), str(Path(__file__).parents[2])],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_error_names_the_file_or_the_port_that_is_unavailable(directory: Path) -> None:

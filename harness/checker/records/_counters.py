@@ -1,7 +1,6 @@
 """Compare the counters and completed blocks of each agent in run.json with its trace and its export."""
 
 from bisect import bisect_left, bisect_right
-from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -13,7 +12,7 @@ from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
 from ucp.messages import Datagram, datagram_bytes
 from ucp.secure.envelope import ADDED_BYTES
-from ucp.trace import DroppedDatagram, RecordedBytes
+from ucp.trace import RecordedBytes
 from ucp.trigger import BootTrigger
 
 ROUNDED_S = 5e-4
@@ -162,7 +161,7 @@ def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Con
     """Yield a contradiction if the trace has fewer lines about dropped datagrams than the agent counted."""
     if recorded.dropped is None or not trace.header.has_inputs:
         return
-    traced = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, DroppedDatagram))
+    traced = trace.dropped()
     for reason, count in recorded.dropped.items():
         if traced[reason] < count:
             detail = (

@@ -41,7 +41,7 @@ def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
         if evidence.injected.messages and _killed_at(evidence, agent_id):
             continue  # the datagrams of a rogue node may have been under way
         handled = sum(isinstance(run.trigger, MessageTrigger) for run in trace.runs)
-        dropped = sum(isinstance(aside, DroppedDatagram) for _, aside in trace.asides)
+        dropped = trace.dropped().total()
         own = sum(len(run.sent) for run in trace.runs)
         read = counted.read - counted.before_start - counted.others
         unrecorded = read - handled - dropped - own

@@ -3,7 +3,6 @@ test.
 """
 
 import base64
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -168,7 +167,7 @@ async def _agree(bench: CaseBench) -> None:
     require(status["handled"] == runs, f"`handled` {runs}, the number of lines of handler runs", status["handled"])
     sent_bytes = sum(map(len, played.sent))
     require(status["bytes_sent"] == sent_bytes, f"`bytes_sent` {sent_bytes}", status["bytes_sent"])
-    drops = Counter(aside.dropped for _, aside in trace.asides if isinstance(aside, DroppedDatagram))
+    drops = trace.dropped()
     require(status.get("dropped", drops) == drops, f"`dropped` {dict(drops)}", status.get("dropped"))
     completed = trace.completed()
     require(export.completed == completed, "the completed blocks of the trace in the export", export.completed)

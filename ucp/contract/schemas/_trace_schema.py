@@ -187,7 +187,10 @@ def aside() -> Schema:
     """Return the JSON schema of trace lines about dropped datagrams and commands."""
     return {
         "oneOf": [
-            record({"t": SECONDS, "dropped": {"enum": [*DROPS, *SECURED_DROPS]}, "datagram": BASE64}),
+            record(
+                {"t": SECONDS, "dropped": {"enum": [*DROPS, *SECURED_DROPS]}, "datagram": BASE64, "count": COUNT},
+                optional=("count",),
+            ),
             record({"t": SECONDS, "command": {"type": "string"}, "request": {"type": "object"}}),
         ]
     }

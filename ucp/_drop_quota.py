@@ -1,0 +1,48 @@
+"""A quota for dropped datagrams in the trace, because any sender can cause them.
+
+A flood of datagrams that are dropped would fill the disk of a vehicle. The agent therefore writes them whole only
+within a quota. It counts the others, and writes their number. The trace thus accounts for each datagram, and its size
+does not depend on the flood.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+
+from ucp.trace import DroppedDatagram, RecordedBytes
+
+QUOTA_BYTES = 1024 * 1024
+BYTES_PER_S = 128
+"""Growth of the quota per mission second, so that the trace has samples of a long flood."""
+COUNTED_S = 10.0
+"""Mission seconds between two lines with the number of datagrams of one reason."""
+LINE_BYTES = 80
+"""Size of a line without its datagram."""
+
+
+class DropQuota:
+    """Select the dropped datagrams that are written whole, and count the others."""
+
+    def __init__(self) -> None:
+        self._left_bytes = float(QUOTA_BYTES)
+        self._at_s = self._counted_at_s = 0.0
+        self._counts: Counter[str] = Counter()
+
+    def lines(self, entry: DroppedDatagram) -> Iterator[DroppedDatagram]:
+        """Yield the entries to write for a dropped datagram. Within the quota, it is the entry itself."""
+        self._left_bytes = min(QUOTA_BYTES, self._left_bytes + (entry.t - self._at_s) * BYTES_PER_S)
+        self._at_s = entry.t
+        size = LINE_BYTES + len(entry.datagram.text)
+        if size <= self._left_bytes:
+            self._left_bytes -= size
+            yield entry
+        else:
+            self._counts[entry.dropped] += 1
+        if self._counts and entry.t >= self._counted_at_s + COUNTED_S:
+            yield from self.counts(entry.t)
+
+    def counts(self, t: float) -> Iterator[DroppedDatagram]:
+        """Yield an entry for each reason with the number of datagrams since the previous one."""
+        self._counted_at_s = t
+        for reason, count in self._counts.items():
+            yield DroppedDatagram(t, reason, RecordedBytes(""), count)
+        self._counts.clear()
