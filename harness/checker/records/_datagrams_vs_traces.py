@@ -16,7 +16,6 @@ from harness.archive.run_record import DatagramsRead
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import Contradiction, of_agent
-from ucp.trace import DroppedDatagram
 from ucp.trigger import MessageTrigger
 
 UNDER_WAY_WALL_S = 0.25
