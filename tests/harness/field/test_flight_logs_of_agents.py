@@ -114,15 +114,13 @@ def test_changes_of_gps_and_mode_are_in_time_order(tmp_path: Path) -> None:
     ]
     match = matched(tmp_path / "1.bin", {7: []}, dataflash_file(messages))
     words = [change.words for change in changes(match)]
-    assert words == [
-        "mode GUIDED",
-        "armed",
-        "mode LAND",
-        "disarmed",
-        "GPS without a fix",
-        "GPS has a fix",
-        "mode RTL, battery failsafe",
-    ]
+    assert words == ["mode GUIDED", "armed", "mode LAND", "disarmed", "GPS without a fix", "GPS has a fix"]
+
+
+def test_failsafe_that_changed_the_mode_is_named(tmp_path: Path) -> None:
+    messages = [*flight_messages(seconds=5), dataflash("MODE", 12_000_000, 6, 6, 4)]
+    words = [change.words for change in changes(matched(tmp_path / "1.bin", {7: []}, dataflash_file(messages)))]
+    assert words[-1] == "mode RTL, battery failsafe"
 
 
 @pytest.fixture(scope="module")
