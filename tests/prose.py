@@ -9,6 +9,7 @@ down, and a file that is not listed has none. A low count does not make a text r
 """
 
 import ast
+import functools
 import io
 import re
 import sys
@@ -111,6 +112,7 @@ def _paragraphs(page: str) -> list[str]:
     return [block.strip().lstrip("# *") for block in blocks if not block.strip().startswith(("-", "|", "1.", "* "))]
 
 
+@functools.cache
 def counted() -> dict[str, int]:
     """Return the number of occurrences of each file that has any."""
     counts = {name: sum(1 for _ in occurrences(REPOSITORY / name)) for name in files() if name not in EXCEPTIONS}

@@ -69,6 +69,7 @@ def test_a_partition_heals_at_the_end_of_its_block(pytester: pytest.Pytester) ->
 
 
 @pytest.mark.lab
+@pytest.mark.any_user
 def test_processes_pass_the_same_test(pytester: pytest.Pytester) -> None:
     """A shorter partition allows a lower speedup, at which a busy machine does not delay a vote too long."""
     pytester.makepyfile(STORY.replace("run_for(600)", "run_for(200)"))
@@ -149,6 +150,7 @@ def test_wait_idle_ignores_landed_and_stopped_agents(pytester: pytest.Pytester) 
 
 
 @pytest.mark.lab
+@pytest.mark.any_user
 def test_processes_are_killed_paused_rebooted_and_come_back(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(FAULTS)
     run(pytester, "--ucp-backend", "process", "--ucp-keep", "kept").assert_outcomes(passed=1)

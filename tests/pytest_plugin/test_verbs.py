@@ -192,6 +192,7 @@ def test_late_rogue_node_knows_earlier_messages(pytester: pytest.Pytester, tmp_p
 
 @pytest.mark.lab
 @pytest.mark.parametrize("told", ["hold('Commit Block')", "replay('Commit Block')"])
+@pytest.mark.any_user
 def test_action_that_needs_virtual_time_is_refused_and_the_run_continues(pytester: pytest.Pytester, told: str) -> None:
     pytester.makepyfile(f"""
     import pytest

@@ -85,7 +85,7 @@ def test_false_messages_never_break_characteristics_2_and_3(lies: list[Message],
         assert not agent.state.idle or set(agent.state.completed) <= {block.block_hash for block in agent.state.chain}
 
 
-@settings(max_examples=120)
+@settings(max_examples=60)
 @given(
     agents=st.integers(1, 7),
     loss=st.sampled_from([0.0, 0.1, 0.3, 0.6, 1.0]),

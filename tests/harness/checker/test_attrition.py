@@ -37,6 +37,7 @@ def summary_of(faults: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
     return [(fault["what"], fault.get("agents"), fault.get("disk")) for fault in faults]
 
 
+@pytest.mark.any_user
 def test_attrition_is_the_same_with_processes_and_in_virtual_time(tmp_path: Path) -> None:
     scenario, out = write_scenario(tmp_path, **STORY, vehicles={"kind": "embedded"}), tmp_path / "run"
     done = harness("run", scenario, "--seed", 5, "--out", out)

@@ -115,6 +115,7 @@ def test_datagram_that_was_read_needs_a_line_in_the_trace(whole: Path, tmp_path:
 
 
 @pytest.mark.lab
+@pytest.mark.any_user
 def test_agent_that_stops_reading_is_found(tmp_path: Path) -> None:
     program = tmp_path / "agent.py"
     program.write_text(STOPS_READING)

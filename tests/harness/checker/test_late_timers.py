@@ -139,6 +139,7 @@ def test_busy_machine_accuses_no_agent(tmp_path: Path, busy_machine: None) -> No
 
 
 @pytest.mark.lab
+@pytest.mark.any_user
 def test_agent_with_a_longer_voting_timer_is_found(tmp_path: Path) -> None:
     program = tmp_path / "agent.py"
     program.write_text(VOTES_LATE)

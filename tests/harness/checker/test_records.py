@@ -294,7 +294,7 @@ def test_captures_show_messages_that_a_trace_lacks(tmp_path: Path) -> None:
 LISTS = st.sampled_from(["take one out", "double one", "swap two"])
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_no_block_can_be_moved_in_any_record(
     whole: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject

@@ -43,6 +43,7 @@ def test_virtual_time_stays_paused_until_a_command_continues_it(tmp_path: Path) 
 
 
 @pytest.mark.lab
+@pytest.mark.any_user
 def test_run_of_processes_accepts_events_and_cannot_pause(tmp_path: Path) -> None:
     out = tmp_path / "run"
     active = Running(write_scenario(tmp_path, duration_s=100_000), out, "--by-hand")

@@ -39,6 +39,7 @@ def results_of(vectors: list[VectorSet], place: Path, *command: str, keep: Path 
     return conform(asked, place, lambda count, total: None, vectors)
 
 
+@pytest.mark.any_user
 def test_right_agent_passes_all_vectors(idle: list[VectorSet], tmp_path: Path) -> None:
     results = results_of(idle, tmp_path / "lab", *OURS)
     assert not results.failures, [case.wrong for case in results.failures]

@@ -29,6 +29,7 @@ def played(case: str, place: Path, *command: str) -> CaseResult:
 
 
 @pytest.mark.parametrize("case", [INPUTS, HEADER, STEPS, AGREE])
+@pytest.mark.any_user
 def test_records_of_reference_pass(case: str, tmp_path: Path) -> None:
     result = played(case, tmp_path, sys.executable, "-P", "-m", "ucp.node")
     assert result.verdict == "passed", result.reason

@@ -48,7 +48,7 @@ def flights(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
-@settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=5, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(flight=flights(), seed=st.integers(0, 1000))
 def test_complete_record_is_reproduced(flight: dict[str, Any], seed: int) -> None:
     with TemporaryDirectory() as kept:

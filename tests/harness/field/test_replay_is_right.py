@@ -55,7 +55,7 @@ def assert_no_difference(directory: Path) -> None:
                 assert (sentences, found.unjudged, found.steps) == ([], 0, len(record.trace.runs)), path
 
 
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     agents=st.integers(2, 7),
     seed=st.integers(0, 2**32 - 1),

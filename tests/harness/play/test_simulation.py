@@ -105,7 +105,7 @@ def playable(timeline: list[dict[str, Any]]) -> bool:
     )
 
 
-@settings(max_examples=40, phases=(Phase.explicit, Phase.generate))  # shrinking takes minutes
+@settings(max_examples=15, phases=(Phase.explicit, Phase.generate))  # shrinking takes minutes
 @given(
     network=networks,
     timeline=timelines.filter(playable),

@@ -110,6 +110,7 @@ def test_ctrl_c_ends_the_run_with_exports_and_verdicts(tmp_path: Path) -> None:
     assert not processes(run.out)
 
 
+@pytest.mark.any_user
 def test_crashed_agent_ends_the_run_and_the_others_export(tmp_path: Path) -> None:
     run = Running(write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": "none"}), tmp_path / "run")
     run.wait_for_mission(1, 2, 3)
@@ -191,6 +192,7 @@ def test_run_directory_is_never_overwritten(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["precious"]
 
 
+@pytest.mark.any_user
 def test_simultaneous_runs_do_not_receive_each_other(tmp_path: Path) -> None:
     runs = []
     for name in ("a", "b"):

@@ -78,6 +78,7 @@ def test_virtual_time_refuses_vehicle_faults(tmp_path: Path) -> None:
 
 
 @pytest.mark.lab
+@pytest.mark.any_user
 def test_run_continues_and_reports_faults_that_no_vehicle_simulated(tmp_path: Path) -> None:
     goes_home = {"parameters": {"BATT_FS_LOW_ACT": 2}}
     written = write_scenario(tmp_path, **{**scenario(FAULTS, each={2: goes_home}), "duration_s": 80, "speedup": 20})

@@ -113,6 +113,7 @@ def test_buttons_of_the_page_control_the_run(browser: Browser, tmp_path: Path) -
 
 
 @pytest.mark.lab
+@pytest.mark.any_user
 def test_vehicle_faults_can_be_caused_by_hand(browser: Browser, tmp_path: Path) -> None:
     def befall(vehicle: int, what: str) -> None:
         browser.evaluate(f"watch.hand.choose({vehicle})")

@@ -123,6 +123,7 @@ def test_against_compares_with_an_earlier_night(tmp_path: Path) -> None:
 
 @pytest.mark.lab
 @pytest.mark.parametrize("keep", ["violated", "all"])
+@pytest.mark.any_user
 def test_processes_fly_a_matrix_and_leave_what_the_file_asks_for(tmp_path: Path, keep: str) -> None:
     scenario = {"agents": 2, "duration_s": 60, "speedup": 60, "vehicles": {"kind": "none"}}
     asked = written(tmp_path, scenario=scenario, loss=[0.0], seeds=2, backend="process", keep=keep)
