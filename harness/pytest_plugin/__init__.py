@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from harness.pytest_plugin.swarm_in_test import Swarm
 
 MARKERS = (
-    "swarm(agents=5, backend='sim', seed=1, ...): configure the fixture `swarm` with any keys of a scenario",
-    "scenario(file, backend='sim', seed=1): the scenario of the fixture `scenario`, relative to the test's directory",
+    "swarm(agents=5, backend='sim', seed=1, variant=None, ...): configure the fixture `swarm` with any keys of a "
+    "scenario",
+    "scenario(file, backend='sim', seed=1, variant=None): the scenario of the fixture `scenario`. Paths are relative "
+    "to the test's directory",
 )
 
 
@@ -58,6 +60,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         metavar="[ID=]COMMAND",
         action="append",
         help="Agent of all runs, instead of that of scenarios; ID= limits it to one agent. Repeatable.",
+    )
+    group.addoption(
+        "--ucp-variant",
+        type=Path,
+        metavar="FILE",
+        help="Python file with a protocol variant, for agents and judge of all runs.",
     )
     group.addoption(
         "--ucp-rewrite", action="store_true", help="Write the present behaviour of the agents into *.story files."

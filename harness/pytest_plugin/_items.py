@@ -53,8 +53,8 @@ class ScenarioItem(pytest.Item):
             options = Options.of(self.config)
             options.refuse(self._backend)
             self._directory = new_directory(self, options)
-            finished = play(self._scenario, self._seed, self._backend, self._directory)
-        self.stash[TRIAL] = Trial(self._scenario, lambda _: finished)
+            finished = play(self._scenario, self._seed, self._backend, self._directory, options.variant)
+        self.stash[TRIAL] = Trial(self._scenario, lambda _: finished, options.variant)
 
     def teardown(self) -> None:
         if self._directory is not None and TRIAL in self.stash and self.stash[TRIAL].passed:
@@ -97,10 +97,9 @@ class StoryItem(pytest.Item):
                 self._skip_what_needs_virtual_time()
             scenario = options.applied_to(self._story.in_virtual_time if virtual else self._story.scenario)
             self._directory = new_directory(self, options)
-            finished = play(
-                scenario, 1 if options.seed is None else options.seed, self._backend, self._directory, delivers_all=True
-            )
-        self.stash[TRIAL] = Trial(scenario, lambda _: finished)
+            seed = 1 if options.seed is None else options.seed
+            finished = play(scenario, seed, self._backend, self._directory, options.variant, delivers_all=True)
+        self.stash[TRIAL] = Trial(scenario, lambda _: finished, options.variant)
         if finished.played.outcome != "completed":
             return  # the judgement of the run reports the reason
         archive = RunArchive(finished.directory)

@@ -23,9 +23,13 @@ from harness.scenario.expect import Expect
 
 
 class Trial:
-    """The run of a test. `finish` ends and judges it. If its argument is true, it waits until the agents are idle."""
+    """The run of a test. `finish` ends and judges it. If its argument is true, it waits until the agents are idle.
 
-    def __init__(self, scenario: Scenario, finish: Callable[[bool], Run]) -> None:
+    `variant` is the file of the protocol variant of the run, or None.
+    """
+
+    def __init__(self, scenario: Scenario, finish: Callable[[bool], Run], variant: Path | None) -> None:
+        self._variant = variant
         self._expect = scenario.expect or Expect()
         self._quirks = scenario.quirks
         self._finish = finish
@@ -40,7 +44,7 @@ class Trial:
         if finished.played.outcome == "not supported":
             pytest.skip(finished.played.outcome_detail or "not supported")
         if lines := self._unexpected(finished):
-            pytest.fail("\n".join([*lines, *_report_lines(finished)]), pytrace=False)
+            pytest.fail("\n".join([*lines, *self._report_lines(finished)]), pytrace=False)
         self.passed = True
 
     def end_of_failed_test(self) -> str:
@@ -49,7 +53,7 @@ class Trial:
             finished = self._finish(False)
         except HarnessError as error:
             return str(error)
-        return "\n".join([*self._unexpected(finished), *_report_lines(finished)])
+        return "\n".join([*self._unexpected(finished), *self._report_lines(finished)])
 
     def _unexpected(self, finished: Run) -> list[str]:
         played = finished.played
@@ -72,17 +76,17 @@ class Trial:
         ran = in_sentence(programs(finished.record))
         return [*lines, *([f"deliberate mistakes: {wrong}"] if wrong else []), *([ran] if ran else [])]
 
+    def _report_lines(self, finished: Run) -> list[str]:
+        """Return lines with the path of the report, and the command that plays the run again."""
+        variant = [] if self._variant is None else ["--variant", str(self._variant)]
+        command = ["ucp-harness", "run", str(finished.directory), "--backend", str(finished.record.backend), *variant]
+        return [f"report: {finished.report}", f"again, with seed {finished.record.seed}: {shlex.join(command)}"]
+
     def _other_chains(self, finished: Run) -> list[str]:
         if not self._expect.chains:
             return []
         exports = RunArchive(finished.directory).exports.by_agent
         return [*self._expect.unexpected_chains({agent: export.top_chain_hash for agent, export in exports.items()})]
-
-
-def _report_lines(finished: Run) -> list[str]:
-    """Return lines with the path of the report, and the command that plays the run again."""
-    again = shlex.join(["ucp-harness", "run", str(finished.directory), "--backend", str(finished.record.backend)])
-    return [f"report: {finished.report}", f"again, with seed {finished.record.seed}: {again}"]
 
 
 @contextmanager

@@ -26,14 +26,16 @@ class Options:
     image_from_host: bool
     """True to make containers from this machine's files."""
     programs: Programs
+    variant: Path | None
+    """Absolute path of the file with a protocol variant."""
     rewrite: bool
     """True to rewrite stories instead of comparing them."""
 
     @classmethod
     def of(cls, config: pytest.Config) -> "Options":
         """Return the options of a pytest session. Raises ScenarioError."""
-        backend, seed, speedup, keep = (
-            config.getoption(f"--ucp-{name}") for name in ("backend", "seed", "speedup", "keep")
+        backend, seed, speedup, keep, variant = (
+            config.getoption(f"--ucp-{name}") for name in ("backend", "seed", "speedup", "keep", "variant")
         )
         if seed is not None and seed < 0:
             raise ScenarioError(f"--ucp-seed is {seed}: use a number from 0 on")
@@ -45,6 +47,7 @@ class Options:
             config.getoption("--ucp-kernel") == "uml",
             config.getoption("--ucp-image-from-host"),
             programs_of(config.getoption("--ucp-agent") or []),
+            variant and config.invocation_params.dir / variant,
             config.getoption("--ucp-rewrite"),
         )
 
