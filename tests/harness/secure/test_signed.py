@@ -239,6 +239,28 @@ def test_block_that_a_captured_key_signs_is_found_in_other_exports(home: Path, r
     assert len([each for each in judgement["evidence"] if "does not match the head" in each["detail"]]) == 2
 
 
+def test_block_that_its_maker_denies_stays_signed_elsewhere(run: Path, home: Path) -> None:
+    """Vehicle 1 signs an export without one of its blocks, which vehicle 2 holds."""
+    keys = KeySet.derived(hashlib.sha256(b"keys of seed 1").digest(), (1, 2, 3), seals=True)
+    path = home / "1.chain.json"
+    export = json.loads(path.read_text())
+    denied = export["completed"][0]
+    kept = [block for block in export["chain"] if block["block_hash"] != denied]
+    agent = Agent(1, (1, 2, 3), base64.b64decode(export["inception"]["block_data"]))
+    blocks = [Block(each["agent_id"], each["timestamp_us"], base64.b64decode(each["event_data"])) for each in kept]
+    completed = [bytes.fromhex(name) for name in export["completed"] if name in {each["block_hash"] for each in kept}]
+    agent.boot(StoredState(completed, blocks), 0.0)
+    signatures = {bytes.fromhex(each["block_hash"]): base64.b64decode(each["signature"]) for each in kept}
+    head = head_of(agent.state, bytes(16), 9, export["exported_at_us"], ())
+    signer = Ed25519PrivateKey.from_private_bytes(keys.vehicles[1])
+    document = export_chain(agent.state, export["exported_at_us"], signatures)
+    path.write_text(json.dumps({**document, "head": head.sign(signer, keys.public.mission)}))
+    done = harness("consolidate", home, "--keys", run, "-o", home / "record.jsonl")
+    assert done.returncode == 0, done.stderr
+    lines = map(json.loads, (home / "record.jsonl").read_text().splitlines())
+    assert [line["agent_id"] for line in lines if line.get("block_hash") == denied] == [1]
+
+
 def test_removed_signatures_and_keys_are_unsigned_for_a_reader_with_keys(home: Path, run: Path) -> None:
     def strip(export: dict[str, Any]) -> None:
         del export["head"]
