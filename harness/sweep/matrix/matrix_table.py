@@ -118,6 +118,9 @@ def explanation(record: MatrixRecord) -> str:
     seeds = len(record.matrix.seed_list)
     if seeds == 1:
         return "Each cell has one run, so there are no intervals."
+    counts = [cell.runs for cell in record.cells]
+    if record.outcome == "completed" and counts and min(counts) < max(counts):
+        return f"Means of {min(counts)} to {max(counts)} runs per cell, with 95 % intervals."
     return f"Means of {seeds} runs per cell, with 95 % intervals. All cells have the same seeds."
 
 
