@@ -2,9 +2,9 @@
 
 A clone of this repository gets two or three commits a day. Most of them change no behaviour. On some days one of them
 plants a regression, and the next day reverts it. Each night plays a matrix in virtual time with the code of its day,
-and compares it with the baseline as the nightly workflow does. The result is one row for each night: what was planted,
-how the night reported it, and which commit it named. Two of three regressions in timing are in the core, where the step
-judge sees them too. The third is in the simulated network, where only figures and changed runs can show it.
+and compares it with the baseline as the nightly workflow does. The result has one row for each night: the planted
+regression, the report of the night, and the named commit. Two of three regressions in timing are in the core, where the
+step judge sees them too. The third is in the simulated network, where only figures and changed runs can show it.
 """
 
 import argparse
@@ -115,8 +115,19 @@ def play(project: Project, work: Path, night: int, seeds: int, bisect: str) -> d
     out, baseline = work / f"out-{night}", work / "baseline.json"
     against = ["--against", str(baseline), "--bisect", bisect] if baseline.exists() else []
     subprocess.run(
-        [sys.executable, "-P", "-m", "harness.cli", "matrix", "nightly.yaml", "--out", str(out), "--nights", "nights"]
-        + against,
+        [
+            sys.executable,
+            "-P",
+            "-m",
+            "harness.cli",
+            "matrix",
+            "nightly.yaml",
+            "--out",
+            out,
+            "--nights",
+            "nights",
+            *against,
+        ],
         cwd=work,
         env={**os.environ, "PYTHONPATH": str(project.directory)},
         stdout=subprocess.DEVNULL,
@@ -144,14 +155,19 @@ def reported(record: dict[str, Any], planted: str | None) -> list[str]:
     return [", ".join(worse), f"{changed} of {pairs}" if changed else "", str(violated or ""), first, verdict]
 
 
+def print_row(fields: list[str]) -> None:
+    sys.stdout.write(row(fields) + "\n")
+    sys.stdout.flush()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--nights", type=int, default=14)
     parser.add_argument("--seeds", type=int, default=30)
     parser.add_argument("--bisect", default="5m", help="Time for the search of commits in each night.")
     arguments = parser.parse_args()
-    print(row(["night", "planted", "worse figures", "changed runs", "violations", "first changed handler", "named"]))
-    print(row(["--:", "---", "---", "---", "---", "---", "---"]), flush=True)
+    print_row(["night", "planted", "worse figures", "changed runs", "violations", "first changed handler", "named"])
+    print_row(["--:", "---", "---", "---", "---", "---", "---"])
     with TemporaryDirectory(prefix="ucp-nights-") as directory:
         work = Path(directory)
         project, last = Project(work / "project"), ""
@@ -164,7 +180,7 @@ def main() -> None:
             project.commit_harmless(night, 2)
             record = play(project, work, night, arguments.seeds, arguments.bisect)
             subject = plant.subject if plant else ""
-            print(row([str(night), subject, *reported(record, last or None)]), flush=True)
+            print_row([str(night), subject, *reported(record, last or None)])
 
 
 if __name__ == "__main__":
