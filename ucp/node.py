@@ -108,10 +108,11 @@ class Node:
         return agent_factory(mission, directory, report_write_error)
 
     def run(self) -> int:
-        """Run until the process receives SIGTERM or SIGINT. Return the exit status, which is 1 if the chain could not
-        be exported.
+        """Run until the process receives SIGTERM, SIGINT or SIGHUP. Return the exit status, which is 1 if the chain
+        could not be exported.
         """
-        self._loop.stop_on(signal.SIGTERM, signal.SIGINT)
+        ending = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+        self._loop.stop_on(*(number for number in ending if signal.getsignal(number) is not signal.SIG_IGN))
         self._loop.watch(self._socket, readable=self._receive)
         self._control.start()
         self._log_line(f"agent {self.mission.agent_id} of {list(self.mission.roster)} ready")

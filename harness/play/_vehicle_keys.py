@@ -5,7 +5,6 @@ during the run. The run directory contains no secret.
 """
 
 import os
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.errors import ScenarioError, extra
+from harness.play._memory_directory import memory_directory, no_core_files
 from harness.scenario import Scenario
 from ucp.sealed import seal_to
 
@@ -168,8 +168,8 @@ def key_directories(scenario: Scenario) -> Iterator[KeyDirectories]:
     if keys is None:
         yield KeyDirectories(None, Path())
         return
-    with tempfile.TemporaryDirectory(prefix="ucp-keys-") as directory:
-        directories = KeyDirectories(keys, Path(directory))
+    with memory_directory("ucp-keys-") as directory, no_core_files():
+        directories = KeyDirectories(keys, directory)
         for vehicle in directories.directories.values():
             vehicle.mkdir()
         yield directories

@@ -98,8 +98,9 @@ def run(
     - `delivers_all`: in virtual time, traces also record messages that have no effect, as traces of processes do.
     - `interventions`: faults that the user requests during the run. They belong to this scenario.
 
-    Ctrl-C and SIGTERM end the mission early. The run is then exported and checked as far as it went. Ctrl-C during the
-    check raises InterruptedRunError. The function also works inside a running event loop, for example in a notebook.
+    Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end the mission early. The run is then exported and checked as far as it went.
+    Ctrl-C during the check raises InterruptedRunError. The function also works inside a running event loop, for example
+    in a notebook.
     Raises HarnessError if the run cannot start: the scenario does not suit the backend, the machine lacks something, or
     `out` is not empty.
     """
@@ -266,6 +267,9 @@ def _outcome_of(run: Coroutine[Any, Any, RunOutcome], interrupted: asyncio.Event
             return playing.result()
 
 
+_ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+
+
 async def _until_interrupted(
     interrupted: asyncio.Event,
     backend: Backend,
@@ -277,8 +281,9 @@ async def _until_interrupted(
     **options: Any,
 ) -> RunOutcome:
     loop = asyncio.get_running_loop()
-    handled = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    handled = _ENDING_SIGNALS if threading.current_thread() is threading.main_thread() else ()
     before = {number: signal.getsignal(number) for number in handled}
+    before = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}  # as under nohup
     for number in before:
         loop.add_signal_handler(number, interrupted.set)
     try:

@@ -13,6 +13,7 @@ from typing import Any
 
 from ucp.mission import Mission, MissionError
 from ucp.sealed import sealed_to
+from ucp.secure._no_dumps import forbid_core_dumps
 from ucp.secure.bundle import BUNDLE_SCHEMA, KEY_BYTES, Bundle, load_bundle, write_bundle
 from ucp.secure.envelope import BOOT_BYTES
 from ucp.secure.keyfile import KeyFileError, key_in
@@ -30,6 +31,7 @@ def agent_factory(
     cannot be written to disk. Raises MissionError.
     """
     assert mission.security is not None, "the mission is secured"
+    forbid_core_dumps()
     path = directory / mission.security.bundle
     try:
         bundle = load_bundle(path)
