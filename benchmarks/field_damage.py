@@ -351,7 +351,7 @@ def run_reconstruct(home: Path, concluded: Concluded, whole: Undamaged) -> None:
     concluded.differs = made.difference.sentence if made.difference else None
     concluded.reasons = [f"agent {agent.agent_id} {agent.why}" for agent in made.agents if agent.why]
     for sentence in [*concluded.reasons, *made.remarks]:
-        if ACCUSATION.search(sentence):
+        if ACCUSATION.search(sentence) and not sentence.startswith("either "):
             concluded.accusations.append(f"reconstruct: {sentence}")
     claimed: dict[str, str] = made.document["expect"].get("chains", {})
     if {*map(int, claimed)} != {*made.reproduced} & {*made.simulated.evidence.exports}:

@@ -21,6 +21,7 @@ from harness.field.reconstruct._rehearsal import (
     same_sent,
 )
 from harness.field.reconstruct._timetable import Timetable
+from harness.field.replay import PERHAPS
 from harness.play.core_version import edited_files
 from harness.run.simulate import Simulated
 from ucp.quirks import QUIRKS
@@ -189,6 +190,9 @@ class SoloSimulations:
         parts: Incarnations = judged.with_known_states(incarnations) if judged.lost else incarnations
         in_parts = rehearse(header, parts) if judged.lost else whole
         if in_parts.deviation is None:
+            named = self._explain_by_quirk(header, incarnations, whole.deviation) if whole.deviation else None
+            if named is not None:
+                return named
             self._remarks.append(f"agent {agent_id} deviates without effect: {finding}")
             self._note_lost(in_parts, judged)
             return in_parts
@@ -216,6 +220,8 @@ class SoloSimulations:
             self._remarks.append(EARLY_TIMERS.format(agent_id=agent_id))
             return early
         around = rehearse(header, judged.with_known_states(incarnations))
+        if whole.deviation is not None:
+            self._name_alternative(header, incarnations, judged, whole.deviation)
         if around.deviation is None and around.stopped is None:
             self._note_lost(around, judged)
             return around
@@ -225,6 +231,24 @@ class SoloSimulations:
         last = max((played.input.line for played in best.played), default=1)
         self.why[agent_id] = f"is played up to trace line {last}, and the lost inputs cannot be inferred: {why}"
         return best
+
+    def _name_alternative(
+        self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, at: ProtocolDeviation
+    ) -> None:
+        """Add a remark if a single damaged line and a known error explain the trace equally well."""
+        doubt = next((sentence for sentence in judged.lost if f" {PERHAPS} " in sentence), None)
+        if doubt is None:
+            return
+        names = [
+            quirk.name
+            for quirk in QUIRKS.values()
+            if not (quirk.chance or at.algorithms.isdisjoint(quirk.algorithms))
+            and (rehearsal := rehearse(header, incarnations, {quirk.name: True})).deviation is None
+            and rehearsal.stopped is None
+        ]
+        if names:
+            which = " or ".join(names)
+            self._remarks.append(f"either agent {header.agent_id} behaves as with {which}, or {doubt}")
 
     def _note_lost(self, rehearsal: SoloSimulation, judged: JudgedTrace) -> None:
         if rehearsal.stopped is not None:

@@ -7,7 +7,7 @@ steps of the other agents at the same time. `prompt` is the interactive command 
 """
 
 from harness.field.replay._agent_record import Record
-from harness.field.replay._player import RecordPlayer, ReplayResult
+from harness.field.replay._player import PERHAPS, RecordPlayer, ReplayResult
 from harness.field.replay._record_search import open_record, open_records
 
-__all__ = ["Record", "RecordPlayer", "ReplayResult", "open_record", "open_records"]
+__all__ = ["PERHAPS", "Record", "RecordPlayer", "ReplayResult", "open_record", "open_records"]

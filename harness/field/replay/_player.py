@@ -33,6 +33,9 @@ MAX_DOUBTS = 3
 MAX_TRIED = 20
 """Maximum number of deviations for which damage is tried as an explanation."""
 
+PERHAPS = "perhaps"
+"""A word in the reasons why steps are not judged, before the damage that may explain a deviation."""
+
 _OF_TIMERS = frozenset(handler.name for handler in ON_TIMER.values())
 
 
@@ -301,7 +304,7 @@ class _DoubtingPlayer(RecordPlayer):
             assert isinstance(entry.content, HandlerRun)
             line, following = (entry.line, entry.content), list(islice(self._following(), LINES_AFTER))
             damage = damage_that_explains(before._follower, deviations[0], line, following, self.record)
-            self.found[self.position] = damage and f"perhaps {damage} (otherwise: {deviations[0].sentence(_short)}),"
+            self.found[self.position] = damage and f"{PERHAPS} {damage} (otherwise: {deviations[0].sentence(_short)}),"
         return self.found[self.position]
 
     def _following(self) -> Iterator[tuple[int, HandlerRun]]:

@@ -15,14 +15,18 @@ from harness.archive.traces import read_trace
 from harness.checker import Result, check, gather
 from harness.checker.lost_lines import lost_lines
 from harness.checker.missing_incarnations import may_be_of_missing_incarnation
+from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.trace_header import checked
 from harness.field.ingest import ingest_files
+from harness.field.reconstruct import reconstruct
 from harness.field.replay import RecordPlayer, open_record
 from harness.field.replay.field_evidence import field_evidence
 from tests.harness.field.flights import flown, trace_of
 from tests.harness.virtual import scenario
 from ucp.agent import Agent
 from ucp.events import LoggableEvent
+from ucp.messages import BlockAddResponse
+from ucp.trigger import MessageTrigger
 
 FLIGHT: dict[str, Any] = {
     "agents": 3,
@@ -174,3 +178,41 @@ def test_lost_timer_callback_is_named_before_its_effects(run: Path, tmp_path: Pa
         found.first.sentence(str)
     )
     assert len(found.deviations) == 1
+
+
+def test_lost_message_excuses_no_difference_if_records_exclude_it(
+    whole: tuple[Path, Undamaged], tmp_path: Path
+) -> None:
+    shutil.copytree(whole[0], tmp_path / "home")
+    record = open_record(tmp_path / "home", 1)
+    received = next(run for run in record.trace.runs if isinstance(run.trigger, MessageTrigger))
+    sender, _, message = decoded(received.input)
+    unsent = BlockAddResponse(bytes(32), True, None)
+    assert record.may_have_arrived(sender, message, received.t)
+    assert not record.may_have_arrived(sender, unsent, received.t)
+    (tmp_path / "home" / "1.pcapng").unlink()
+    without_capture = open_record(tmp_path / "home", 1)
+    assert without_capture.may_have_arrived(sender, message, received.t)
+    assert not without_capture.may_have_arrived(sender, unsent, received.t)
+    (tmp_path / "home" / f"{sender}.trace.jsonl").unlink()
+    assert open_record(tmp_path / "home", 1).may_have_arrived(sender, unsent, received.t)
+
+
+def test_wrong_core_is_named_although_its_trace_has_unknown_parts(tmp_path: Path) -> None:
+    """The block that agent 2 holds twice makes its state unknown, so the line of the mistake lies before a gap."""
+    wrong = scenario(**FLIGHT, quirks={"commit_others_twice": {"agents": [2]}})
+    bring_home(wrong, 1, "sim", tmp_path / "run", tmp_path / "home")
+    made = reconstruct(ingest_files([tmp_path / "home"]).largest(), "again")
+    assert any("agent 2 behaves as with commit_others_twice" in remark for remark in made.remarks), made.remarks
+
+
+def test_reconstruct_prints_both_explanations_of_a_doubtful_step(tmp_path: Path) -> None:
+    """Without the traces of the others, a lost vote explains the step as well as the wrong core."""
+    flight = FLIGHT | {"timeline": [], "capture": False, "quirks": {"tie_is_majority": {"agents": [2]}}}
+    bring_home(scenario(**flight), 2, "sim", tmp_path / "run", tmp_path / "home")
+    for other in (1, 3):
+        (tmp_path / "home" / f"{other}.trace.jsonl").unlink()
+    made = reconstruct(ingest_files([tmp_path / "home"]).largest(), "again")
+    either = next(remark for remark in made.remarks if remark.startswith("either agent 2 behaves as with "))
+    assert " tie_is_majority " in either
+    assert re.search(r", or before line \d+ perhaps a line is missing \(otherwise: ", either)
