@@ -11,7 +11,7 @@ import contextlib
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -193,11 +193,16 @@ class Node:
     def _feed(self, feed: Callable[[float], None]) -> None:
         """Give the agent one input. Then write its records, broadcast its messages, and set its next timer.
 
-        Store and trace come before the broadcast, because the process can be killed in between.
+        Store and trace come before the broadcast, because the process can be killed in between. A dropped datagram
+        changes neither the store nor a timer, and any sender can cause many of them, so the rest is left out then.
         """
         feed(self.clock.now())
-        self._record_entries([*self._within_quota(self.agent.trace())])
-        for datagram in self.agent.datagrams_to_send():
+        entries, datagrams = self.agent.trace(), self.agent.datagrams_to_send()
+        if not datagrams and entries and all(isinstance(entry, DroppedDatagram) for entry in entries):
+            self._write_trace(self._within_quota(entries))
+            return
+        self._record_entries([*self._within_quota(entries)])
+        for datagram in datagrams:
             try:
                 self._socket.sendto(datagram, (self.mission.network.broadcast, self.mission.network.port))
                 self.bytes_sent += len(datagram)
@@ -220,8 +225,11 @@ class Node:
             self._store.write([change for run in runs for change in run.changes], secured)
             if self._store.problem:
                 self._log_line(f"the store ends here: {self._store.problem}")
-        if self._trace.problem is None:
-            self._trace.write("".join(entry.to_line() for entry in entries))
+        self._write_trace(entries)
+
+    def _write_trace(self, entries: Iterable[Entry]) -> None:
+        if self._trace.problem is None and (lines := "".join(entry.to_line() for entry in entries)):
+            self._trace.write(lines)
             if self._trace.problem:
                 self._log_line(f"the trace ends here: {self._trace.problem}")
 
