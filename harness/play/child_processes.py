@@ -19,6 +19,21 @@ GRACE_S = 0.5
 RETRY_S = 0.02
 MAX_ROUNDS = 20
 """Number of times that children are ended, because they may start others meanwhile."""
+_PASSED_ON = {
+    *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "TERM", "TMPDIR", "TZ", "LANG", "LANGUAGE", "VIRTUAL_ENV"),
+    *("CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH"),
+}
+_PASSED_ON_PREFIXES = ("LC_", "LD_", "PYTHON", "UCP_", "XDG_", "ROS_", "RMW_", "AMENT_", "CYCLONEDDS_", "FASTRTPS_")
+
+
+def passed_on(environ: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment variables that programs of a run get: those that they need to start.
+
+    The user's environment may contain secrets, such as tokens, and an agent may be a program of another author.
+    """
+    return {
+        name: value for name, value in environ.items() if name in _PASSED_ON or name.startswith(_PASSED_ON_PREFIXES)
+    }
 
 
 class ChildProcesses:
@@ -30,7 +45,7 @@ class ChildProcesses:
     def environment(self, inherited: Mapping[str, str]) -> dict[str, str]:
         """Return the environment variables with which the agent must be started. They identify its child processes."""
         name, _, value = self._mark.decode().partition("=")
-        return {**inherited, name: value}
+        return {**passed_on(inherited), name: value}
 
     def pids(self) -> list[int]:
         """Return the IDs of the agent's processes that still run."""

@@ -17,6 +17,7 @@ from harness.archive.channel_journal import CHANNEL_FILE
 from harness.archive.directory import RunDirectory
 from harness.errors import MachineError
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
+from harness.play.child_processes import passed_on
 from harness.play.process._channel_node import CONTROL, VALUE
 from harness.scenario import Scenario
 from netem.conditions import NetworkConditions
@@ -54,7 +55,7 @@ class ChannelProcess:
             None,
             [sys.executable, "-P", "-m", "harness.play.process._channel_node", CHANNEL_FILE, str(PORT)],
             cwd=self._rundir.path,
-            env=dict(os.environ),
+            env=passed_on(os.environ),
             stdout=log,
             stderr=log,
             role="channel",

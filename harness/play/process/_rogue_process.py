@@ -13,6 +13,7 @@ from typing import Any
 from harness.archive.directory import ROGUE_CONTROL, RunDirectory
 from harness.errors import MachineError
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
+from harness.play.child_processes import passed_on
 from harness.scenario import Scenario
 from harness.scenario.changes import TimedInjection
 from netem.lab import Lab, LabProcess
@@ -43,7 +44,7 @@ class RogueProcess:
             self.vehicle,
             [sys.executable, "-P", "-m", "harness.play.rogue"],
             cwd=self._rundir.path,
-            env=dict(os.environ),
+            env=passed_on(os.environ),
             stdout=log,
             stderr=log,
         )

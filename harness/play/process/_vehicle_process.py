@@ -10,6 +10,7 @@ from typing import Any
 
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
+from harness.play.child_processes import passed_on
 from harness.play.process._run_lab import MissionLab, Program
 from harness.scenario.vehicles import Flight
 from netem.radio import Place
@@ -66,7 +67,7 @@ class VehicleProcess:
             self.vehicle_id,
             launch.argv,
             cwd=self._directory,
-            env={**os.environ, **launch.env},
+            env={**passed_on(os.environ), **launch.env},
             stdout=self._output,
             stderr=self._output,
             role="vehicle",

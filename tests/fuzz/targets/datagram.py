@@ -12,7 +12,7 @@ from harness.archive.packets.pcap import CaptureFile
 from tests.fuzz.finding import require
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import MAX_DATAGRAM_BYTES, MalformedDatagramError, datagram_bytes, decode
-from ucp.scapy import LAYERS, UCP
+from ucp.scapy import LAYERS, UCP, SecuredUCP
 from ucp.telemetry import describe
 
 
@@ -37,7 +37,9 @@ def _run(data: bytes) -> None:
     try:
         datagram = decode(data)
     except MalformedDatagramError:
-        require(packet is None or type(packet.lastlayer()) in (Raw, UCP), "scapy accepts what the codec refuses")
+        sealed = isinstance(packet, SecuredUCP)  # of a secured mission: this codec reads plain datagrams only
+        accepted = packet is not None and not sealed and type(packet.lastlayer()) not in (Raw, UCP)
+        require(not accepted, "scapy accepts what the codec refuses")
         return
     require(datagram.encode() == data and len(data) <= MAX_DATAGRAM_BYTES, "accepted, and written otherwise")
     require(datagram_bytes(datagram.message) == len(data), "its length is not what it is said to be")

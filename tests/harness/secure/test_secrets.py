@@ -63,13 +63,17 @@ def test_files_of_a_run_contain_no_secret(home: KeyDirectory, tmp_path: Path) ->
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_files_of_a_failed_run_of_processes_contain_no_secret(home: KeyDirectory, tmp_path: Path) -> None:
+def test_files_of_a_failed_run_of_processes_contain_no_secret(
+    home: KeyDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Agent 2 is a program that prints all its input and ends."""
+    monkeypatch.setenv("TOKEN_OF_THE_USER", "a token")
     tells = ["sh", "-c", "cat *.mission.json; printenv; exit 3"]
     asked = scenario(tmp_path, home, agent_command={"2": tells}, capture=False, speedup=20, duration_s=40, timeline=[])
     status, left = run(asked, "--backend", "process")
     assert status == 1, left[0]
-    assert any(b"bundle" in content for name, content in left if name.endswith("2.log"))
+    assert any(b"bundle" in content and b"PATH=" in content for name, content in left if name.endswith("2.log"))
+    assert not any(b"a token" in content for _, content in left)
     assert told(secrets(home, EPOCHS), left) == []
 
 
