@@ -25,6 +25,7 @@ from harness.proof.model._snapshot import (
     UncoveredError,
     check_that_nothing_is_lost,
     put_back,
+    reverse_dictionaries,
     set_counts,
     take,
 )
@@ -306,19 +307,22 @@ class LocalStates(KnownStates):
     def _check_counts(
         self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, results: tuple[tuple[int, ...], Started]
     ) -> None:
-        """Raise UncoveredError if the step differs at another time, or after more reconciles or messages."""
+        """Raise UncoveredError if the step differs at another time, after more reconciles or messages, or with
+        dictionaries in reverse order.
+        """
         for count, now_s in OTHER_COUNTS:
             agent = self._counting[agent_id]
             put_back(agent, before)
             set_counts(agent, count, now_s)
+            reverse_dictionaries(agent)
             with suppress(Exception):  # the step itself reports an exception
                 give(agent)
                 end_at_once(agent)
             if self._results(agent) != results or take(agent, after).items() != after.items():
                 raise UncoveredError(
-                    "a step of an agent depends on the mission time, or on how often it has done something before "
-                    f"({', '.join(COUNTED)}); a state of the proof has neither, so keep what the step needs in an "
-                    "attribute of its own"
+                    "a step of an agent depends on the mission time, on the order of a dictionary, or on how often it "
+                    f"has done something before ({', '.join(COUNTED)}); a state of the proof has none of them, so keep "
+                    "what the step needs in an attribute of its own"
                 )
 
     def message(self, message: Message) -> int:

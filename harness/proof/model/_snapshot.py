@@ -113,6 +113,12 @@ def set_counts(agent: Agent, count: int, now_s: float) -> None:
     state["sent"] = Counter(dict.fromkeys(MESSAGE_NAMES, count) if count else ())
 
 
+def reverse_dictionaries(agent: Agent) -> None:
+    """Reverse the order of each dictionary in the agent's state. A key of a state has no such order."""
+    state = vars(agent.state)
+    state.update({name: dict(reversed(value.items())) for name, value in state.items() if type(value) is dict})
+
+
 def _is_part(part: Any, value: Any) -> bool:
     """Return true if the value equals the stored part of a state."""
     if isinstance(part, _TimerState | _ChainState):
