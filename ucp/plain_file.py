@@ -21,6 +21,8 @@ MAX_JSON_WEIGHT = 250_000
 """Maximum weight of a JSON text. A list or an object weighs 5, and any other value 1, as their memory does. A value of
 the wrong type takes 400 bytes in the error of a validation, so the largest weight takes about 100 MiB."""
 
+_CHUNK_BYTES = 64 * 1024
+
 
 def open_plain_file(path: Path) -> io.BufferedReader:
     """Open a regular file for reading.
@@ -45,10 +47,12 @@ def read_plain_file(path: Path, most_bytes: int) -> bytes:
     """Return the content of a regular file. Raises OSError, also if it has more than `most_bytes`."""
     with open_plain_file(path) as file:
         size = os.fstat(file.fileno()).st_size
-        content = file.read(most_bytes + 1) if size <= most_bytes else b""
+        content = bytearray()
+        while size <= most_bytes and len(content) <= most_bytes and (part := file.read(_CHUNK_BYTES)):
+            content += part  # a single read would allocate `most_bytes` at once
     if size > most_bytes or len(content) > most_bytes:
         raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes")
-    return content
+    return bytes(content)
 
 
 def read_text(path: Path, most_bytes: int) -> str:

@@ -33,7 +33,7 @@ class BoundedFile(io.BufferedReader):
         file.
         """
         self._content = _Content(path, most_bytes)
-        super().__init__(self._content, _CHUNK_BYTES)
+        super().__init__(self._content, 16 * 1024)
 
     @property
     def packed(self) -> bool:
