@@ -15,7 +15,7 @@ from random import Random
 from harness.proof import Bounds
 from harness.proof.coverage import ExistingStates, ReachedStates, existing
 from harness.scenario import Scenario
-from harness.sweep.explore.guided._hunt import Candidate, Hunt
+from harness.sweep.explore.guided._hunt import CandidateRun, Hunt
 from harness.sweep.explore.guided._hunt_trial import initial_documents, play_trial
 
 LOSS = {"network": {"loss": 0.15}}
@@ -49,7 +49,7 @@ def hunted(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, R
     ends_s = time.process_time() + budget_s
     limits, begun = initial_documents(scenario, range(first_seed, first_seed + 4))
     hunt = Hunt(limits, Random(first_seed))
-    playing = hunt.begin([Candidate(*each) for each in begun], 1)
+    playing = hunt.begin([CandidateRun(*each) for each in begun], 1)
     while time.process_time() < ends_s:
         if next(playing, None) is None:
             playing = hunt.round(1)

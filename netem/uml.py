@@ -149,7 +149,7 @@ def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
         (folder / "command").write_text(_command(argv, cwd, env))
         (folder / "init").write_text(_init(folder / "command"))
         (folder / "init").chmod(0o755)
-        guest = _Guest(kernel, folder, _uml_registers.preload(folder) if _uml_registers.needed(kernel) else {})
+        guest = _RunningKernel(kernel, folder, _uml_registers.preload(folder) if _uml_registers.needed(kernel) else {})
         try:
             with _forwarding_interrupts(guest):
                 return guest.follow()
@@ -185,7 +185,7 @@ def _init(command: Path) -> str:
     )
 
 
-class _Guest:
+class _RunningKernel:
     """A running User Mode Linux. The caller must call `end`.
 
     Its consoles write to files in `folder`, which are read while they grow. Pipes are unsuitable, because this kernel's
@@ -283,7 +283,7 @@ def _exit_status(received: bytes) -> int | None:
 
 
 @contextlib.contextmanager
-def _forwarding_interrupts(guest: _Guest) -> Iterator[None]:
+def _forwarding_interrupts(guest: _RunningKernel) -> Iterator[None]:
     """Forward Ctrl-C and SIGTERM to the virtual machine as a typed Ctrl-C. Only the main thread can do this."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:

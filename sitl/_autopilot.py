@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl._failsafes import STATION, WIND, WIND_FROM, Failsafe, Failsafes
-from sitl._kinematics import Course, Fall, Motion, Point, RestSegment, Segment, end_of
+from sitl._kinematics import Fall, Motion, PlannedMotion, Point, RestSegment, Segment, end_of
 from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl.modes import BOOT_MODES, MODES
 from sitl.vehicle import READY_S, Home, VehicleType
@@ -68,7 +68,7 @@ class Autopilot:
         self._in_mission = False
         self._then: Callable[[], None] = self._stand
         self._goal: tuple[Point, float] | None = None  # in GUIDED: target and speed
-        self._course = Course(0.0, [RestSegment(Motion(yaw_rad=math.radians(home.heading_deg)))])
+        self._course = PlannedMotion(0.0, [RestSegment(Motion(yaw_rad=math.radians(home.heading_deg)))])
 
     @property
     def _model(self) -> MotionModel:
@@ -275,7 +275,7 @@ class Autopilot:
 
     def _begin(self, segments: Sequence[Segment], then: Callable[[], None]) -> None:
         """Begin a movement, and call `then` at its end."""
-        self._course, self._then, self._goal = Course(self.now_s, segments), then, None
+        self._course, self._then, self._goal = PlannedMotion(self.now_s, segments), then, None
 
     def _act(self) -> None:
         """Begin the movement of the current flight mode. The vehicle must be armed."""

@@ -16,10 +16,10 @@ from sitl._mission_upload import SPEED_TYPES, on_earth
 from sitl._pilot_link import PilotLink
 from sitl._route import Waypoint, is_near, landing_begins, limit_s
 from sitl._take_off import TakeOff
-from sitl.procedure import Commander, HopelessError, Step
+from sitl.procedure import Commander, HopelessError, ProcedureStep
 from sitl.vehicle import VehicleType
 
-GUIDED = Step("mode GUIDED")
+GUIDED = ProcedureStep("mode GUIDED")
 
 STANDING_MS = 0.3
 POSITION_ONLY = (
@@ -42,7 +42,7 @@ class GuidedFlight:
     def __init__(self, link: PilotLink, vehicle_type: VehicleType, waypoints: Sequence[Waypoint]) -> None:
         self._to = Commander(link, vehicle_type)
         self._waypoints = waypoints
-        self._legs = [Step(waypoint.leg, limit_s(waypoints, at)) for at, waypoint in enumerate(waypoints)]
+        self._legs = [ProcedureStep(waypoint.leg, limit_s(waypoints, at)) for at, waypoint in enumerate(waypoints)]
         self._home = link.home
         self._take_off: TakeOff | None = TakeOff(link, vehicle_type, waypoints[0].place.up_m)
         self._landing: MissionFlight | None = None
@@ -51,7 +51,7 @@ class GuidedFlight:
         self._sent_to: int | None = None  # the waypoint that the vehicle was last sent to
         self._there_s: float | None = None  # since when it has been there
 
-    def next_step(self) -> Step | None:
+    def next_step(self) -> ProcedureStep | None:
         if self._take_off is not None:
             if step := self._take_off.next_step():
                 return step
@@ -77,7 +77,7 @@ class GuidedFlight:
             self._done, self._there_s = self._done + 1, None
         return None
 
-    def ask(self, step: Step) -> None:
+    def ask(self, step: ProcedureStep) -> None:
         if self._take_off is not None:
             self._take_off.ask(step)
         elif self._landing is not None:

@@ -9,13 +9,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sitl._mission_upload import Mission, MissionUpload
 from sitl._pilot_link import PilotLink
 from sitl._route import Waypoint, limit_s
-from sitl.procedure import ARM, HEARTBEAT, READY, Commander, HopelessError, Step
+from sitl.procedure import ARM, HEARTBEAT, READY, Commander, HopelessError, ProcedureStep
 from sitl.vehicle import VehicleType
 
-GUIDED = Step("mode GUIDED")
-AUTO = Step("mode AUTO")
-UPLOAD = Step("the upload of its mission")
-START = Step("the start of its mission")
+GUIDED = ProcedureStep("mode GUIDED")
+AUTO = ProcedureStep("mode AUTO")
+UPLOAD = ProcedureStep("the upload of its mission")
+START = ProcedureStep("the start of its mission")
 STARTS = (mavlink.MAV_CMD_MISSION_START, mavlink.MAV_CMD_DO_SET_MODE)
 
 
@@ -32,13 +32,13 @@ class MissionFlight:
     ) -> None:
         self._to = Commander(link, vehicle_type)
         self._waypoints = waypoints
-        self._legs = [Step(waypoint.leg, limit_s(waypoints, at)) for at, waypoint in enumerate(waypoints)]
+        self._legs = [ProcedureStep(waypoint.leg, limit_s(waypoints, at)) for at, waypoint in enumerate(waypoints)]
         self._mission = Mission(waypoints, link.home, link.sysid, vehicle_type)
         self._upload = MissionUpload(link, self._mission)
         self._under_way = under_way
         self._done = 0  # waypoints
 
-    def next_step(self) -> Step | None:
+    def next_step(self) -> ProcedureStep | None:
         state = self._to.state
         if state.mode is None:
             return HEARTBEAT
@@ -73,11 +73,11 @@ class MissionFlight:
             self._done += 1
             self._under_way = True
 
-    def _before_armed(self) -> Step | None:
+    def _before_armed(self) -> ProcedureStep | None:
         mode = GUIDED if self._to.vehicle_type == "copter" else AUTO
         return self._to.arming() if self._to.in_mode("GUIDED" if mode is GUIDED else "AUTO") else mode
 
-    def ask(self, step: Step) -> None:
+    def ask(self, step: ProcedureStep) -> None:
         if step in (AUTO, START) and self._to.refused(STARTS):
             # ArduCopter 3.5 forgets a mission that it was given before it had booted
             self._upload = MissionUpload(self._to.link, self._mission)

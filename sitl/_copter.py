@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import NEAR_M, Line, Motion, Point, RestSegment, Segment, end_of
+from sitl._kinematics import NEAR_M, Motion, Point, RestSegment, Segment, StraightLine, end_of
 
 CRUISE_MS = 10.0  # WPNAV_SPEED
 CLIMB_MS = 2.5  # WPNAV_SPEED_UP
@@ -34,7 +34,7 @@ class Copter:
     def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
         top = Point(start.north_m, start.east_m, max(start.up_m, altitude_m))
         spin_up = [RestSegment(start, SPIN_UP_S)] if start.up_m < NEAR_M else []
-        return [*spin_up, Line(start, top, CLIMB_MS, VERTICAL_ACCEL_MS2)]
+        return [*spin_up, StraightLine(start, top, CLIMB_MS, VERTICAL_ACCEL_MS2)]
 
     def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
         level_m = math.dist(start.point[:2], place[:2])
@@ -48,7 +48,7 @@ class Copter:
             limits.append((abs(climb_m), CLIMB_MS if climb_m > 0 else DESCENT_MS, VERTICAL_ACCEL_MS2))
         speed = min(limit * length_m / part_m for part_m, limit, _ in limits)
         accel = min(limit * length_m / part_m for part_m, _, limit in limits)
-        return [RestSegment(start, self.turning_s), Line(start, place, speed, accel)]
+        return [RestSegment(start, self.turning_s), StraightLine(start, place, speed, accel)]
 
     def loiter(
         self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
@@ -62,9 +62,9 @@ class Copter:
         segments: list[Segment] = [*there, RestSegment(above, self.settling_s)]
         if above.up_m > LAND_SLOWLY_M:
             low = place._replace(up_m=LAND_SLOWLY_M)
-            segments.append(Line(above, low, DESCENT_MS, VERTICAL_ACCEL_MS2, to_ms=LANDING_MS))
+            segments.append(StraightLine(above, low, DESCENT_MS, VERTICAL_ACCEL_MS2, to_ms=LANDING_MS))
         ground = place._replace(up_m=0.0)
-        segments.append(Line(end_of(segments), ground, LANDING_MS, VERTICAL_ACCEL_MS2, LANDING_MS, LANDING_MS))
+        segments.append(StraightLine(end_of(segments), ground, LANDING_MS, VERTICAL_ACCEL_MS2, LANDING_MS, LANDING_MS))
         return [*segments, RestSegment(end_of(segments), 0.0)]
 
     def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:

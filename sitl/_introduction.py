@@ -13,15 +13,15 @@ from itertools import islice
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl._pilot_link import PilotLink
-from sitl.procedure import HEARTBEAT, Step
+from sitl.procedure import HEARTBEAT, ProcedureStep
 
 PATIENCE = 10
 """Number of heartbeats without an answer after which a request is given up."""
 MOST_AT_ONCE = 50
 
-_VERSION = Step("its version")
-_LIST = Step("its list of parameters", 180.0)
-_GIVEN = Step("the parameters that it was given")
+_VERSION = ProcedureStep("its version")
+_LIST = ProcedureStep("its list of parameters", 180.0)
+_GIVEN = ProcedureStep("the parameters that it was given")
 
 
 class VehicleIntroduction:
@@ -32,10 +32,10 @@ class VehicleIntroduction:
     def __init__(self, link: PilotLink, given: Mapping[str, float]) -> None:
         self._link = link
         self._given = given
-        self._asked: Counter[Step] = Counter()
+        self._asked: Counter[ProcedureStep] = Counter()
         self._listed = 0
 
-    def next_step(self) -> Step | None:
+    def next_step(self) -> ProcedureStep | None:
         link = self._link
         if not link.heartbeats:
             return HEARTBEAT
@@ -46,7 +46,7 @@ class VehicleIntroduction:
         }
         return next((step for step, lacking in lacks.items() if lacking and self._asked[step] < PATIENCE), None)
 
-    def ask(self, step: Step) -> None:
+    def ask(self, step: ProcedureStep) -> None:
         link = self._link
         self._asked[step] += 1
         if step is _VERSION:

@@ -72,7 +72,7 @@ class RestSegment:
         return self._motion
 
 
-class Line:
+class StraightLine:
     """A straight line: the speed changes from `from_ms` to `speed_ms`, and at the end to `to_ms`, with `accel_ms2`.
 
     On a short line the profile is triangular. The line must be long enough for the change from `from_ms` to `to_ms`.
@@ -112,7 +112,7 @@ class Line:
         return Motion(*place, north_ms, east_ms, up_ms, yaw_rad=self._yaw_rad)
 
 
-class Arc:
+class CircularArc:
     """A part of a level circle at constant speed. `turn_rad` is positive clockwise, and may be infinite."""
 
     def __init__(self, start: Motion, centre: tuple[float, float], turn_rad: float, speed_ms: float) -> None:
@@ -139,7 +139,7 @@ class Arc:
         )
 
 
-class Climbing:
+class ClimbingSegment:
     """A level segment, with a climb or descent at `rate_ms` to the altitude `up_m`."""
 
     def __init__(self, level: Segment, up_m: float, rate_ms: float) -> None:
@@ -180,7 +180,7 @@ class Fall:
         )
 
 
-class Course:
+class PlannedMotion:
     """A sequence of segments that begins at `begin_s`. Times are seconds of any one clock."""
 
     def __init__(self, begin_s: float, segments: Sequence[Segment]) -> None:
@@ -203,7 +203,7 @@ class Course:
 class CoursePart:
     """A part of a motion, from `begin_s` to `end_s` on its clock."""
 
-    def __init__(self, course: Course, begin_s: float, end_s: float) -> None:
+    def __init__(self, course: PlannedMotion, begin_s: float, end_s: float) -> None:
         self._course, self._begin_s = course, begin_s
         self.duration_s = end_s - begin_s
 

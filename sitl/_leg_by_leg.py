@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from sitl._kinematics import Course, CoursePart, Motion, Segment, end_of
+from sitl._kinematics import CoursePart, Motion, PlannedMotion, Segment, end_of
 from sitl._models import AT_ONCE
 from sitl._route import CLIMBED, Waypoint, is_near, limit_s, to_go_m
 from sitl.vehicle import VehicleType
@@ -23,15 +23,15 @@ def leg_by_leg(
     """
     model, motion, goal = AT_ONCE[vehicle_type], start, None
     flown: list[Segment] = []
-    course, now_s = Course(0.0, model.ascent(start, waypoints[0].place.up_m)), 0.0
+    course, now_s = PlannedMotion(0.0, model.ascent(start, waypoints[0].place.up_m)), 0.0
     for index, waypoint in enumerate(waypoints):
         if waypoint.kind == "land":
-            course, now_s = Course(0.0, model.land(motion, motion.point)), 0.0
+            course, now_s = PlannedMotion(0.0, model.land(motion, motion.point)), 0.0
             made_s = course.end_s
         else:
             if waypoint.kind != "take_off" and (waypoint.place, waypoint.speed_ms) != goal:
                 goal = waypoint.place, waypoint.speed_ms
-                course, now_s = Course(0.0, model.loiter(motion, *goal, math.inf)), 0.0
+                course, now_s = PlannedMotion(0.0, model.loiter(motion, *goal, math.inf)), 0.0
             made_s = _made_s(course, now_s, waypoint, vehicle_type, now_s + limit_s(waypoints, index))
         if math.isinf(made_s):
             break
@@ -40,7 +40,9 @@ def leg_by_leg(
     return flown, CoursePart(course, now_s, math.inf)
 
 
-def _made_s(course: Course, since_s: float, waypoint: Waypoint, vehicle_type: VehicleType, limit_s: float) -> float:
+def _made_s(
+    course: PlannedMotion, since_s: float, waypoint: Waypoint, vehicle_type: VehicleType, limit_s: float
+) -> float:
     """Return the time at which the motion completes a waypoint, or infinity if it does not do so before `limit_s`."""
     now_s = since_s
     while now_s < limit_s:

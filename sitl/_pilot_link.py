@@ -16,7 +16,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl._tlog import TelemetryLog
-from sitl._vehicle_state import Battery, Position, VehicleState, Version
+from sitl._vehicle_state import Battery, ReportedPosition, VehicleState, Version
 from sitl.parameters import MAX_PARAMETERS
 from sitl.vehicle import Home
 
@@ -312,7 +312,7 @@ class PilotLink(asyncio.Protocol):
             self._knows_its_height = abs(says_m - height_m) < HEIGHTS_DIFFER_M
         if self._knows_its_height:  # the altitude above the sea is frozen once a copter of 4.7 has lost its GPS
             height_m = says_m
-        self.state.position = Position(
+        self.state.position = ReportedPosition(
             message.lat / 1e7,
             message.lon / 1e7,
             self.home.alt_m + height_m,

@@ -12,7 +12,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from sitl._kinematics import NEAR_M, Arc, Climbing, Line, Motion, Point, RestSegment, Segment, end_of
+from sitl._kinematics import (
+    NEAR_M,
+    CircularArc,
+    ClimbingSegment,
+    Motion,
+    Point,
+    RestSegment,
+    Segment,
+    StraightLine,
+    end_of,
+)
 
 CRUISE_MS = 22.0  # AIRSPEED_CRUISE
 OVER_GROUND = (
@@ -106,7 +116,7 @@ class Plane:
         glide = _back_and_on(start, touchdown, before, LANDING_MS, sink_ms, 0.0)
         ground = replace(end_of(glide), up_m=0.0)
         stand = _ahead(ground, ROLL_OUT_M + PAST_M)
-        return [*glide, Line(ground, stand, LANDING_MS, ROLL_OUT_ACCEL_MS2, from_ms=LANDING_MS)]
+        return [*glide, StraightLine(ground, stand, LANDING_MS, ROLL_OUT_ACCEL_MS2, from_ms=LANDING_MS)]
 
 
 def _until_heading_for(there: Point, centre: Point, here: Motion) -> float:
@@ -145,10 +155,10 @@ class _Path:
 
     def straight_to(self, place: Point) -> None:
         end = place._replace(up_m=self._end.up_m)
-        self._add(Line(self._end, end, self.speed_ms, RUNWAY_ACCEL_MS2, self.speed_ms, self.speed_ms))
+        self._add(StraightLine(self._end, end, self.speed_ms, RUNWAY_ACCEL_MS2, self.speed_ms, self.speed_ms))
 
     def arc(self, centre: tuple[float, float], turn_rad: float) -> None:
-        self._add(Arc(self._end, centre, turn_rad, self.speed_ms))
+        self._add(CircularArc(self._end, centre, turn_rad, self.speed_ms))
 
     def fly_by(self, place: Point, reached_m: float, rather_left_m: float = 0.0) -> None:
         """Turn towards `place` by the shorter turn, and fly straight until the distance is `reached_m`.
@@ -175,14 +185,14 @@ class _Path:
         return _bearing_rad(self._end.point, place)
 
     def _add(self, level: Segment) -> None:
-        self.segments.append(Climbing(level, self._up_m, self._rate_ms))
+        self.segments.append(ClimbingSegment(level, self._up_m, self._rate_ms))
         if math.isfinite(level.duration_s):
             self._end = end_of(self.segments)
 
 
 def _lift_off(start: Motion, altitude_m: float, straight_to_m: float) -> tuple[Sequence[Segment], _Path]:
     """Return the motion on the ground before take-off, and a path that climbs to `altitude_m`."""
-    run = Line(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
+    run = StraightLine(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
     path = _Path(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
     path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
     return [RestSegment(start, SPOOL_UP_S), run], path

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import Line, Motion, Point, RestSegment, Segment, end_of
+from sitl._kinematics import Motion, Point, RestSegment, Segment, StraightLine, end_of
 
 CRUISE_MS = 5.0  # CRUISE_SPEED
 ACCEL_MS2 = 1.0  # ATC_ACCEL_MAX
@@ -34,7 +34,7 @@ class Rover:
     def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
         end = place._replace(up_m=start.up_m)
         passes_ms = min(CORNER_MS, math.sqrt(2 * ACCEL_MS2 * math.dist(start.point, end)))
-        there = Line(start, end, speed_ms, ACCEL_MS2, to_ms=min(passes_ms, speed_ms))
+        there = StraightLine(start, end, speed_ms, ACCEL_MS2, to_ms=min(passes_ms, speed_ms))
         if not there.duration_s:
             return [there]
         turn_rad = abs((there.at(0.0).yaw_rad - start.yaw_rad + math.pi) % math.tau - math.pi)

@@ -10,15 +10,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl._pilot_link import LOW_M, PilotLink
 from sitl._route import CLIMBED
-from sitl.procedure import ARM, HEARTBEAT, Commander, Step
+from sitl.procedure import ARM, HEARTBEAT, Commander, ProcedureStep
 from sitl.vehicle import VehicleType
 
 SLOWEST_CLIMB_MS = 0.5
 
-PARAMETER = Step("parameter TKOFF_ALT")
-TAKE_OFF = Step("the take-off command")
-FALL = Step("the fall")
-FORCED_DISARM = Step("disarming by force")
+PARAMETER = ProcedureStep("parameter TKOFF_ALT")
+TAKE_OFF = ProcedureStep("the take-off command")
+FALL = ProcedureStep("the fall")
+FORCED_DISARM = ProcedureStep("disarming by force")
 
 FORCE = 21196  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: in flight, too
 TKOFF_ALT = "TKOFF_ALT"
@@ -32,11 +32,11 @@ class TakeOff:
     def __init__(self, link: PilotLink, vehicle_type: VehicleType, altitude_m: float) -> None:
         self._to = Commander(link, vehicle_type)
         self._altitude_m = altitude_m
-        self._climb = Step("the climb", 60.0 + altitude_m / SLOWEST_CLIMB_MS)
+        self._climb = ProcedureStep("the climb", 60.0 + altitude_m / SLOWEST_CLIMB_MS)
         self._mode = "TAKEOFF" if vehicle_type == "plane" else "GUIDED"
-        self._in_mode = Step(f"mode {self._mode}")
+        self._in_mode = ProcedureStep(f"mode {self._mode}")
 
-    def next_step(self) -> Step | None:
+    def next_step(self) -> ProcedureStep | None:
         link, state = self._to.link, self._to.state
         if state.mode is None:
             return HEARTBEAT
@@ -54,7 +54,7 @@ class TakeOff:
             return self._climb
         return None
 
-    def ask(self, step: Step) -> None:
+    def ask(self, step: ProcedureStep) -> None:
         link = self._to.link
         if step is PARAMETER:
             link.set_parameter(TKOFF_ALT, self._altitude_m)
@@ -76,7 +76,7 @@ class FlightTermination:
         self._link = link
         self._disarmed_at: float | None = None
 
-    def next_step(self) -> Step | None:
+    def next_step(self) -> ProcedureStep | None:
         link, state = self._link, self._link.state
         if state.mode is None:
             return HEARTBEAT
@@ -89,6 +89,6 @@ class FlightTermination:
             return FALL
         return None
 
-    def ask(self, step: Step) -> None:
+    def ask(self, step: ProcedureStep) -> None:
         if step is FORCED_DISARM:
             self._link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
-class Position:
+class ReportedPosition:
     """A reported position in degrees, with its height in metres above sea level and above home.
 
     The movement is in metres per second north, east and up. The heading is in degrees clockwise from north, None if
@@ -59,7 +59,7 @@ class VehicleState:
     version: Version | None = None
     armed: bool = False
     ready_to_arm: bool | None = None
-    position: Position | None = None  # as it last said while its estimate was good
+    position: ReportedPosition | None = None  # as it last said while its estimate was good
     has_moved: bool = False  # it was armed and off its home
     battery: Battery | None = None
     time_s: float | None = None  # simulated, since boot

@@ -38,7 +38,7 @@ class NotSimulatedError(VehicleError):
 
 
 @dataclass(frozen=True)
-class Circumstance:
+class SimulatedFailure:
     """An event to simulate, such as a GPS failure. `what` completes "simulate ...". Each of `ways` contains parameters.
 
     `station_is_heard` begins or ends the vehicle's contact with its ground station. None leaves it unchanged.
@@ -49,38 +49,38 @@ class Circumstance:
     station_is_heard: bool | None = None
 
 
-GPS_LOST = Circumstance("the loss of its GPS", GPS_OFF)
-GPS_REGAINED = Circumstance("a GPS that is back", GPS_ON)
-COMPASS_LOST = Circumstance("the loss of its compasses", (dict.fromkeys(_COMPASSES, 1.0), {_COMPASSES[0]: 1.0}))
-COMPASS_REGAINED = Circumstance("compasses that are back", (dict.fromkeys(_COMPASSES, 0.0), {_COMPASSES[0]: 0.0}))
-MOTOR_STOPPED = Circumstance("the failure of a motor", ({"SIM_ENGINE_MUL": 0.0, "SIM_ENGINE_FAIL": 1.0},))
+GPS_LOST = SimulatedFailure("the loss of its GPS", GPS_OFF)
+GPS_REGAINED = SimulatedFailure("a GPS that is back", GPS_ON)
+COMPASS_LOST = SimulatedFailure("the loss of its compasses", (dict.fromkeys(_COMPASSES, 1.0), {_COMPASSES[0]: 1.0}))
+COMPASS_REGAINED = SimulatedFailure("compasses that are back", (dict.fromkeys(_COMPASSES, 0.0), {_COMPASSES[0]: 0.0}))
+MOTOR_STOPPED = SimulatedFailure("the failure of a motor", ({"SIM_ENGINE_MUL": 0.0, "SIM_ENGINE_FAIL": 1.0},))
 """SIM_ENGINE_FAIL 1 stops one motor: the second if the value is an output number, the first if it is a mask."""
 
-RC_LOST = Circumstance("the loss of its remote control", ({"SIM_RC_FAIL": 1.0},))
+RC_LOST = SimulatedFailure("the loss of its remote control", ({"SIM_RC_FAIL": 1.0},))
 """SIM_RC_FAIL 1 means no pulses from the receiver."""
-RC_REGAINED = Circumstance("a remote control that is back", ({"SIM_RC_FAIL": 0.0},))
-STATION_LOST = Circumstance("the loss of its ground station", ({},), station_is_heard=False)
-STATION_REGAINED = Circumstance("a ground station that is back", ({},), station_is_heard=True)
+RC_REGAINED = SimulatedFailure("a remote control that is back", ({"SIM_RC_FAIL": 0.0},))
+STATION_LOST = SimulatedFailure("the loss of its ground station", ({},), station_is_heard=False)
+STATION_REGAINED = SimulatedFailure("a ground station that is back", ({},), station_is_heard=True)
 _AROUND_HOME = {"FENCE_RADIUS": FENCE_M, "FENCE_ENABLE": 1.0}
-FENCE_BREACHED = Circumstance(
+FENCE_BREACHED = SimulatedFailure(
     "a breach of its fence",
     ({"FENCE_TYPE": 3.0, "FENCE_ALT_MAX": FENCE_M, **_AROUND_HOME}, {"FENCE_TYPE": 2.0, **_AROUND_HOME}),
 )
 """FENCE_TYPE 3 is a maximum altitude and a circle around home. 2 is the circle alone, for a rover."""
-FENCE_LIFTED = Circumstance("a flight without a fence", ({"FENCE_ENABLE": 0.0},))
+FENCE_LIFTED = SimulatedFailure("a flight without a fence", ({"FENCE_ENABLE": 0.0},))
 
 
-def battery(volts: float) -> Circumstance:
+def battery(volts: float) -> SimulatedFailure:
     """Return the event that the battery has this voltage from now on."""
-    return Circumstance(f"a battery of {volts:g} V", ({"SIM_BATT_VOLTAGE": volts},))
+    return SimulatedFailure(f"a battery of {volts:g} V", ({"SIM_BATT_VOLTAGE": volts},))
 
 
-def wind(speed_ms: float, from_deg: float) -> Circumstance:
+def wind(speed_ms: float, from_deg: float) -> SimulatedFailure:
     """Return the event that wind blows at this speed, from a direction in degrees clockwise from north."""
-    return Circumstance(f"wind of {speed_ms:g} m/s", ({"SIM_WIND_SPD": speed_ms, "SIM_WIND_DIR": from_deg},))
+    return SimulatedFailure(f"wind of {speed_ms:g} m/s", ({"SIM_WIND_SPD": speed_ms, "SIM_WIND_DIR": from_deg},))
 
 
-async def bring_about(link: PilotLink, circumstance: Circumstance) -> Mapping[str, float]:
+async def bring_about(link: PilotLink, circumstance: SimulatedFailure) -> Mapping[str, float]:
     """Make the vehicle simulate an event. Return the parameters that were set. Raises NotSimulatedError."""
     ways, limit_s = circumstance.ways, ANSWER_S / min(1.0, link.speedup)
     for way in ways:

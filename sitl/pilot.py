@@ -23,11 +23,11 @@ from sitl._pilot_link import PilotLink
 from sitl._route import route
 from sitl._take_off import FlightTermination, TakeOff
 from sitl._vehicle_state import VehicleState
-from sitl.circumstances import Circumstance, bring_about
+from sitl.circumstances import SimulatedFailure, bring_about
 from sitl.modes import mode_name
 from sitl.parameters import ParameterError, unknown
 from sitl.plan import By, Plan
-from sitl.procedure import ArmingPreparation, HopelessError, Procedure, Step
+from sitl.procedure import ArmingPreparation, HopelessError, PilotProcedure, ProcedureStep
 from sitl.vehicle import FlightError, Home, VehicleType
 
 SILENCE_S = 10.0  # of our time; a vehicle says something every simulated second
@@ -59,7 +59,7 @@ class Pilot:
         self.vehicle_id = sysid if vehicle_id is None else vehicle_id
         self._terminated = self._handed_over = False
         self._befallen = False
-        self._awaited: Step | None = None
+        self._awaited: ProcedureStep | None = None
 
     @property
     def state(self) -> VehicleState:
@@ -78,11 +78,11 @@ class Pilot:
         """End the connection and complete the telemetry log. May be called twice, and before `start`."""
         await self.link.close()
 
-    def ascent(self, altitude_m: float) -> Procedure:
+    def ascent(self, altitude_m: float) -> PilotProcedure:
         """Return the procedure for a take-off to `altitude_m` metres above home. A rover only arms, in GUIDED mode."""
         return TakeOff(self.link, self.vehicle_type, altitude_m)
 
-    def flight(self, plan: Plan, by: By) -> Procedure:
+    def flight(self, plan: Plan, by: By) -> PilotProcedure:
         """Return the procedure for a flight plan. Raises PlanError if this type of vehicle cannot fly it."""
         waypoints = route(plan, self.vehicle_type, self.link.home.heading_deg)
         flight = MissionFlight if by == "mission" else GuidedFlight
@@ -97,7 +97,7 @@ class Pilot:
         if phrase := unknown(given, self.link.parameters):
             raise ParameterError(f"vehicle {self.vehicle_id} knows {phrase}")
 
-    async def get_ready(self, flight: Procedure) -> None:
+    async def get_ready(self, flight: PilotProcedure) -> None:
         """Execute the steps before arming. Return when all of them have stayed complete for READY_FOR_S seconds.
 
         ArduPilot repeats its checks, and has further ones in other modes. It may therefore report ready and then not
@@ -105,7 +105,7 @@ class Pilot:
         """
         await self._pursue(ArmingPreparation(flight, self.state))
 
-    async def fly(self, flight: Procedure) -> None:
+    async def fly(self, flight: PilotProcedure) -> None:
         """Execute the procedure until its last step is complete. Raises FlightError."""
         await self._pursue(flight)
 
@@ -117,7 +117,7 @@ class Pilot:
         self._terminated = True
         await self._pursue(FlightTermination(self.link))
 
-    async def befall(self, circumstance: Circumstance) -> Mapping[str, float]:
+    async def befall(self, circumstance: SimulatedFailure) -> Mapping[str, float]:
         """Make the vehicle simulate an event such as a GPS failure. Return the parameters that were set.
 
         The vehicle may now act on its own. If it then leaves its mode, disarms, or misses a time limit, the current
@@ -133,7 +133,7 @@ class Pilot:
             self.link.station_is_heard = circumstance.station_is_heard
         return values
 
-    def shortfall(self, flight: Procedure) -> str | None:
+    def shortfall(self, flight: PilotProcedure) -> str | None:
         """Return a sentence if the vehicle should have left its home position and has not, otherwise None."""
         if self.state.has_moved or self._terminated or self._handed_over or self._befallen:
             return None
@@ -148,10 +148,10 @@ class Pilot:
         """Wait, and raise FlightError when the vehicle is silent or disconnects. Return after `terminate_flight`."""
         await self._pursue(_Listening())
 
-    async def _pursue(self, procedure: Procedure) -> None:
+    async def _pursue(self, procedure: PilotProcedure) -> None:
         """Request each step of the procedure at every heartbeat until all steps are complete."""
         clocks = _StepClocks(self.link)
-        asked: tuple[Step, int] | None = None
+        asked: tuple[ProcedureStep, int] | None = None
         while (step := self._next_step(procedure)) is not None:
             self._awaited = step
             if self._is_over(procedure):
@@ -174,7 +174,7 @@ class Pilot:
             except TimeoutError:
                 continue
 
-    def _is_over(self, procedure: Procedure) -> bool:
+    def _is_over(self, procedure: PilotProcedure) -> bool:
         """Return true if the procedure need not continue, because the flight was ended or another pilot flies the
         vehicle.
         """
@@ -184,7 +184,7 @@ class Pilot:
         handed_over = self._handed_over or (self._befallen and left)
         return self._terminated or (handed_over and not isinstance(procedure, _Listening))
 
-    def _next_step(self, procedure: Procedure) -> Step | None:
+    def _next_step(self, procedure: PilotProcedure) -> ProcedureStep | None:
         try:
             return procedure.next_step()
         except HopelessError as error:
@@ -198,7 +198,7 @@ class Pilot:
         boots = not link.state.ready_to_arm and not link.has_armed  # it may acknowledge and forget
         return stale or boots
 
-    def _failed(self, procedure: Procedure, awaited: str, reason: str) -> FlightError:
+    def _failed(self, procedure: PilotProcedure, awaited: str, reason: str) -> FlightError:
         state = self.state
         words = f"its last words: {state.texts[-1]!r}" if state.texts else "it never said why"
         return FlightError(
@@ -212,12 +212,12 @@ class _Listening:
     """A procedure without steps, which only receives messages."""
 
     purpose = "stay in touch"
-    _step = Step("its next word", math.inf)
+    _step = ProcedureStep("its next word", math.inf)
 
-    def next_step(self) -> Step:
+    def next_step(self) -> ProcedureStep:
         return self._step
 
-    def ask(self, step: Step) -> None:
+    def ask(self, step: ProcedureStep) -> None:
         pass
 
 
@@ -226,9 +226,9 @@ class _StepClocks:
 
     def __init__(self, link: PilotLink) -> None:
         self._link = link
-        self._flown_s: defaultdict[Step, float] = defaultdict(float)
-        self._waited_s: defaultdict[Step, float] = defaultdict(float)
-        self._step: Step | None = None  # that was waited for until now
+        self._flown_s: defaultdict[ProcedureStep, float] = defaultdict(float)
+        self._waited_s: defaultdict[ProcedureStep, float] = defaultdict(float)
+        self._step: ProcedureStep | None = None  # that was waited for until now
         self._time_s = link.state.time_s
         self._at = time.monotonic()
         self.patience_s = 0.0  # of our time: then it is worth looking again, even if nothing is heard
@@ -245,7 +245,7 @@ class _StepClocks:
                 return f"{what} for {now - at:.1f} s"
         return None
 
-    def overdue(self, step: Step) -> str | None:
+    def overdue(self, step: ProcedureStep) -> str | None:
         """Return the reason if a time limit of the step has passed, otherwise None."""
         link, now = self._link, time.monotonic()
         if self._step is not None:

@@ -24,32 +24,32 @@ READY_LIMIT_S = 180.0  # ArduPilot calibrates, and waits for its estimates to ag
 
 
 @dataclass(frozen=True)
-class Step:
+class ProcedureStep:
     """A step of a procedure, with its name for error messages and its time limit in simulated seconds."""
 
     name: str
     limit_s: float = STEP_LIMIT_S
 
 
-HEARTBEAT = Step("the first heartbeat")
-READY = Step("ready to arm", READY_LIMIT_S)
-ARM = Step("arming")
-STAY_READY = Step("ready to arm, and not only for a moment", READY_LIMIT_S)
+HEARTBEAT = ProcedureStep("the first heartbeat")
+READY = ProcedureStep("ready to arm", READY_LIMIT_S)
+ARM = ProcedureStep("arming")
+STAY_READY = ProcedureStep("ready to arm, and not only for a moment", READY_LIMIT_S)
 
 
 class HopelessError(Exception):
     """An error: the flight cannot continue. The message contains the reason."""
 
 
-class Procedure(Protocol):
+class PilotProcedure(Protocol):
     """A procedure that a pilot executes. `purpose` completes the phrase "did not ..."."""
 
     purpose: str
 
-    def next_step(self) -> Step | None:
+    def next_step(self) -> ProcedureStep | None:
         """Return the first incomplete step, or None if all are complete. Raises HopelessError."""
 
-    def ask(self, step: Step) -> None:
+    def ask(self, step: ProcedureStep) -> None:
         """Request a step from the vehicle. The pilot calls this once per heartbeat until the step is complete."""
 
 
@@ -58,12 +58,12 @@ class ArmingPreparation:
 
     purpose = "get ready"
 
-    def __init__(self, flight: Procedure, state: VehicleState) -> None:
+    def __init__(self, flight: PilotProcedure, state: VehicleState) -> None:
         self._flight = flight
         self._state = state
         self._since_s: float | None = None  # simulated
 
-    def next_step(self) -> Step | None:
+    def next_step(self) -> ProcedureStep | None:
         step, now_s = self._flight.next_step(), self._state.time_s
         if step is not None and step is not ARM:
             self._since_s = None
@@ -74,7 +74,7 @@ class ArmingPreparation:
             return STAY_READY
         return None
 
-    def ask(self, step: Step) -> None:
+    def ask(self, step: ProcedureStep) -> None:
         if step is not STAY_READY:
             self._flight.ask(step)
 
@@ -93,7 +93,7 @@ class Commander:
     def set_mode(self, name: str) -> None:
         self.link.ask_for_mode(MODES[self.vehicle_type][name])
 
-    def arming(self) -> Step | None:
+    def arming(self) -> ProcedureStep | None:
         """Return the next step of arming, or None if the vehicle is armed."""
         if self.state.armed:
             return None

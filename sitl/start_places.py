@@ -28,7 +28,7 @@ class PlaceError(VehicleError):
     """An error: a location is missing, or a file of locations cannot be read."""
 
 
-class Offset(NamedTuple):
+class HomeOffset(NamedTuple):
     """An offset in metres from the first home position. A heading of None means the heading of the first one."""
 
     east_m: float
@@ -62,9 +62,9 @@ def named(name: str, beside: Path | None, environ: Mapping[str, str]) -> Home:
     raise PlaceError(f"no such location in {', '.join(map(str, files))}{meant}")
 
 
-def swarm(path: Path) -> dict[int, Offset]:
+def swarm(path: Path) -> dict[int, HomeOffset]:
     """Return the offsets of a swarm by number, from 0. Raises VehicleError."""
-    offsets: dict[int, Offset] = {}
+    offsets: dict[int, HomeOffset] = {}
     for number, key, values in _lines(path):
         where = f"{path}, line {number}"
         if not (key.isascii() and key.isdecimal() and int(key[:9]) <= MAX_INSTANCE):
@@ -72,7 +72,7 @@ def swarm(path: Path) -> dict[int, Offset]:
         numbers = _numbers(values)
         if numbers is None or len(numbers) not in (3, 4):
             raise PlaceError(f"{where}: {values[:MAX_SHOWN]!r} is not EAST,NORTH,UP,HEADING in metres and degrees")
-        offsets.setdefault(int(key), Offset(*numbers))
+        offsets.setdefault(int(key), HomeOffset(*numbers))
     if not offsets:
         raise PlaceError(f"{path} has no offsets in it: write INSTANCE=EAST,NORTH,UP,HEADING")
     return offsets

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import Course, Motion, RestSegment, Segment, end_of
+from sitl._kinematics import Motion, PlannedMotion, RestSegment, Segment, end_of
 from sitl._leg_by_leg import leg_by_leg
 from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl._route import Waypoint, landing_begins, route
@@ -22,7 +22,7 @@ from sitl.vehicle import VehicleType
 class Track:
     """The computed path of one vehicle, in mission seconds and metres. It never ends."""
 
-    course: Course
+    course: PlannedMotion
     home_offset: tuple[float, float, float]
 
     def at(self, t_s: float) -> tuple[float, float, float]:
@@ -60,7 +60,7 @@ def track(
     else:
         fly = _mission if by == "mission" else _guided
         segments = fly(route(plan, vehicle_type, heading_deg), vehicle_type, start)
-    return Track(Course(begin_s, segments), home_offset)
+    return Track(PlannedMotion(begin_s, segments), home_offset)
 
 
 def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:

@@ -15,7 +15,7 @@ from harness.proof._progress_bar import Ended
 from harness.proof.bounds import Bounds
 from harness.proof.graph._exploration import explore
 from harness.proof.model._any_sender import collect
-from harness.proof.model._flaws import Flaw
+from harness.proof.model._flaws import PropertyViolation
 from harness.proof.model._global_states import ModelSwarm
 from harness.proof.questions import _convergence
 from ucp.agent import HANDLERS
@@ -60,7 +60,7 @@ def wrong_step(quirk: str, most_s: float = MOST_S) -> WrongStep | str:
     return "not decided" if undecided else "none"
 
 
-def _first_flaw(bounds: Bounds, most_s: float) -> tuple[Flaw | None, int, Ended]:
+def _first_flaw(bounds: Bounds, most_s: float) -> tuple[PropertyViolation | None, int, Ended]:
     """Return the violation nearest to the initial state, and its distance."""
     if bounds.network == "any":
         collected = collect(bounds, most_bytes=MOST_BYTES, most_s=most_s)

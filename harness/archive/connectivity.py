@@ -45,7 +45,7 @@ class Topology:
 
 
 @dataclass(frozen=True, slots=True)
-class Losses:
+class LossRates:
     """The mean and the highest loss rate (0 to 1) of links between living vehicles from mission second `at_s` on.
 
     Links with a loss of 1 are not counted, because they are no links.
@@ -82,7 +82,7 @@ class Connectivity:
 
     vehicles: tuple[int, ...]
     states: list[Topology]
-    losses: list[Losses]
+    losses: list[LossRates]
     """The losses over time, rounded to a tenth of a per cent. Consecutive entries differ."""
     reboots: list[tuple[float, int]]
     """Mission second and agent ID of each stop of an agent whose vehicle flew on."""
@@ -165,11 +165,11 @@ class NetworkReplay:
         elif fault.adds_vehicle:
             self.lost -= set(line.agents)
 
-    def losses(self, at_s: float) -> Losses:
+    def losses(self, at_s: float) -> LossRates:
         """Return the mean and the highest loss rate of the current links."""
         lost = [loss for pair in self._scripted if self._is_up(pair) for loss in self._directions(pair)]
         mean = sum(lost) / len(lost) if lost else 0.0
-        return Losses(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
+        return LossRates(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
 
     def by_link(self) -> dict[Link, float]:
         """Return the current loss rate of each link in each direction. It is 1.0 if no message passes."""
@@ -232,7 +232,7 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
     lines = JsonLines(path, NetworkLine)
     network = NetworkReplay(vehicles)
     states: list[Topology] = []
-    losses: list[Losses] = []
+    losses: list[LossRates] = []
     reboots: list[tuple[float, int]] = []
     cut: dict[Pair, list[float]] = {}
     lost: dict[int, list[float]] = {}

@@ -95,7 +95,7 @@ class Commit:
 
 
 @dataclass(frozen=True, slots=True)
-class Tie:
+class Phase2Tie:
     """A tie at the end of reconcile phase 2. `branch` names its result."""
 
     agent: int
@@ -114,7 +114,7 @@ class ActivityStart(NamedTuple):
     detail: str
 
 
-HistoryEvent = ActivityStart | Vote | Reconcile | Tie | Commit
+HistoryEvent = ActivityStart | Vote | Reconcile | Phase2Tie | Commit
 """A change of an agent's history that one handler run causes."""
 
 
@@ -141,7 +141,7 @@ class History:
     votes: list[Vote]
     reconciles: list[Reconcile]
     commits: list[Commit]
-    ties: list[Tie]
+    ties: list[Phase2Tie]
     messages: list[Message] | None
 
 
@@ -183,7 +183,7 @@ def _append(history: History, steps: Iterable[HistoryEvent]) -> None:
                 history.votes.append(step)
             case Reconcile():
                 history.reconciles.append(step)
-            case Tie():
+            case Phase2Tie():
                 history.ties.append(step)
             case Commit():
                 history.commits.append(step)
@@ -236,7 +236,7 @@ class HistoryReader:
     def _continue_reconcile(self, run: HandlerRun) -> Iterator[HistoryEvent]:
         """Yield the parts of the history that a handler run during a reconcile begins or ends."""
         if run.branch.startswith("tie:"):
-            yield Tie(self._agent, run.t, run.branch)
+            yield Phase2Tie(self._agent, run.t, run.branch)
         if run.handler == "reconcile_finalize" and run.branch == "done":
             yield from self._end_reconcile(run.t, done=True)
         elif name := PHASES.get(run.handler):

@@ -20,7 +20,7 @@ COMPLETES = "build_data_block"
 
 
 @dataclass(frozen=True, slots=True)
-class Observation:
+class TraceObservation:
     """An observation of the checker at one line of a trace. The first line has number 1."""
 
     line: int
@@ -52,19 +52,19 @@ class Incarnation:
     sent: int = 0
     unknown: bool = False
     """True if the trace has unknown operations. From the first on, the held blocks are unknown."""
-    impossible: list[Observation] = field(default_factory=list)
+    impossible: list[TraceObservation] = field(default_factory=list)
     """Impossible changes, such as the removal of a block that is not there."""
-    second_copies: list[Observation] = field(default_factory=list)
-    idle_too_early: list[Observation] = field(default_factory=list)
+    second_copies: list[TraceObservation] = field(default_factory=list)
+    idle_too_early: list[TraceObservation] = field(default_factory=list)
     """Idle states with own blocks outside of the chain, or with blocks in the deque or on the stack."""
-    wrong_lengths: list[Observation] = field(default_factory=list)
+    wrong_lengths: list[TraceObservation] = field(default_factory=list)
     """The first state whose lengths contradict the changes."""
-    wrong_tops: list[Observation] = field(default_factory=list)
+    wrong_tops: list[TraceObservation] = field(default_factory=list)
     """The first top chain hash that differs from that of the chain (eq. 3.2)."""
-    flags: list[Observation] = field(default_factory=list)
+    flags: list[TraceObservation] = field(default_factory=list)
     """Impossible flags."""
-    back_in_time: list[Observation] = field(default_factory=list)
-    out_of_sequence: list[Observation] = field(default_factory=list)
+    back_in_time: list[TraceObservation] = field(default_factory=list)
+    out_of_sequence: list[TraceObservation] = field(default_factory=list)
 
     def numbered_runs(self) -> Iterator[tuple[int, HandlerRun]]:
         """Yield the handler runs together with their line numbers."""
@@ -100,18 +100,20 @@ def _replay_incarnation(incarnation: Incarnation, inception: str | None) -> Inca
                     what = (
                         f"a reconcile {'begins' if reconciling else 'ends'} in a handler other than Algorithms 7 and 20"
                     )
-                    incarnation.flags.append(Observation(line, run, what))
+                    incarnation.flags.append(TraceObservation(line, run, what))
             if state.idle and reconciling:
-                incarnation.flags.append(Observation(line, run, "idle and reconciling at once"))
+                incarnation.flags.append(TraceObservation(line, run, "idle and reconciling at once"))
         if state.idle and held.has_blocks_aside and not incarnation.unknown:
             incarnation.idle_too_early.append(held.idle_too_early(line, run))
         if not now <= run.t <= LATEST_S:
-            incarnation.back_in_time.append(Observation(line, run, f"the time goes back from {now:g} s to {run.t:g} s"))
+            incarnation.back_in_time.append(
+                TraceObservation(line, run, f"the time goes back from {now:g} s to {run.t:g} s")
+            )
         now = run.t
         for message in run.sent:
             if message.seq != sequence:
                 what = f"sent message number {message.seq}, but the next number is {sequence}"
-                incarnation.out_of_sequence.append(Observation(line, run, what))
+                incarnation.out_of_sequence.append(TraceObservation(line, run, what))
                 sequence = message.seq
             sequence += 1
             incarnation.sent += 1
@@ -145,15 +147,15 @@ class _HeldBlocks:
             place = self._places[operation[:-1]]
             if operation[-1] == "-":
                 if impossible := self._take(operation[:-1], place, block):
-                    incarnation.impossible.append(Observation(line, run, impossible, block))
+                    incarnation.impossible.append(TraceObservation(line, run, impossible, block))
             else:
                 if run.handler == COMPLETES and block not in self._completed:
                     incarnation.impossible.append(
-                        Observation(line, run, "a block joins the deque before the agent completed it", block)
+                        TraceObservation(line, run, "a block joins the deque before the agent completed it", block)
                     )
                 self._put(operation[:-1], place, block)
                 if self._copies[block] > 1:
-                    incarnation.second_copies.append(Observation(line, run, "", block))
+                    incarnation.second_copies.append(TraceObservation(line, run, "", block))
         self.has_blocks_aside = bool(self._not_in_chain or incarnation.deque or incarnation.stack)
 
     def _put(self, name: str, place: list[str], block: str) -> None:
@@ -196,20 +198,20 @@ class _HeldBlocks:
                 f"records that {_lengths(state.chain, state.deque, state.stack)}, but its changes so far lead to "
                 f"{_lengths(len(incarnation.chain), len(incarnation.deque), len(incarnation.stack), '')}"
             )
-            incarnation.wrong_lengths.append(Observation(line, run, what))
+            incarnation.wrong_lengths.append(TraceObservation(line, run, what))
             return False
         if self._chain_hashes is not None and state.top != self._chain_hashes[-1].hex():
             what = f"the top chain hash {state.top[:12]} does not match the {state.chain} blocks of the chain (eq. 3.2)"
             incarnation.wrong_tops.append(
-                Observation(line, run, what, incarnation.chain[-1] if incarnation.chain else None)
+                TraceObservation(line, run, what, incarnation.chain[-1] if incarnation.chain else None)
             )
             return False
         return True
 
-    def idle_too_early(self, line: int, run: HandlerRun) -> Observation:
+    def idle_too_early(self, line: int, run: HandlerRun) -> TraceObservation:
         incarnation = self._incarnation
         what = f"{len(incarnation.deque)} blocks to be committed and {len(incarnation.stack)} on the reconcile stack"
-        return Observation(line, run, what, next(iter(self._not_in_chain), None))
+        return TraceObservation(line, run, what, next(iter(self._not_in_chain), None))
 
 
 def _digest(block_hash: str) -> bytes:

@@ -12,7 +12,7 @@ from rich.text import Text
 from harness.archive.archive import RunArchive
 from harness.commands.terminal import complain, output, print_json
 from harness.report.agent_programs import in_sentence
-from harness.report.difference import AgentDifference, ComparedStep, Difference, FirstDifference, compare
+from harness.report.difference import AgentDifference, ComparedStep, FirstDifference, RunDifference, compare
 from harness.run.provenance import differing_versions
 from ucp.trigger import MessageTrigger, Trigger
 
@@ -47,7 +47,7 @@ def diff_command(
         raise typer.Exit(DIFFERENT)
 
 
-def _lines(difference: Difference) -> Iterator[str]:
+def _lines(difference: RunDifference) -> Iterator[str]:
     """Yield the lines of the result. A is the first run and B the second run."""
     for differing in difference.keys:
         yield f"{differing.key}: {_value(differing.a)} in A, {_value(differing.b)} in B"
@@ -63,7 +63,7 @@ def _lines(difference: Difference) -> Iterator[str]:
             yield from _differences(difference)
 
 
-def _programs(difference: Difference) -> Iterator[str]:
+def _programs(difference: RunDifference) -> Iterator[str]:
     """Yield lines about the agents' programs. There are none if all agents of both runs are the harness's own."""
     a, b = difference.programs["a"], difference.programs["b"]
     if a == b:
@@ -72,7 +72,7 @@ def _programs(difference: Difference) -> Iterator[str]:
         yield from (f"in {run} {in_sentence(ran) or ONLY_REFERENCE_AGENTS}" for run, ran in (("A", a), ("B", b)))
 
 
-def _differences(difference: Difference) -> Iterator[str]:
+def _differences(difference: RunDifference) -> Iterator[str]:
     first = difference.first
     if first is not None:
         first_difference = difference.agents[first].run

@@ -11,10 +11,10 @@ from harness.archive.packets import packets_text
 from harness.archive.packets.block_names import BlockNames, run_directories
 from harness.archive.packets.capture_files import Captures, capture_files, read_captures
 from harness.archive.packets.channel_losses import channel_losses
-from harness.archive.packets.exchanges import Exchanges, count_losses, loss_matrix
+from harness.archive.packets.exchanges import RequestAnswers, count_losses, loss_matrix
 from harness.archive.packets.packets_document import document
 from harness.archive.packets.packets_text import Paint, TransmissionText
-from harness.archive.packets.selection import Selection, exchanges_about, in_order
+from harness.archive.packets.selection import MessageFilter, exchanges_about, in_order
 from harness.archive.packets.transmissions import join
 from harness.commands._shared_options import BundleOption, opener_of
 from harness.commands.terminal import complain, output, print_lines
@@ -47,7 +47,7 @@ def packets_command(
 
     Vehicles that lost the datagram are named, too.
     """
-    selection = Selection(sender, receiver, message, between)
+    selection = MessageFilter(sender, receiver, message, between)
     captures = read_captures(capture_files(paths), opener_of(bundle))
     if captures.used:
         print_lines(_output_lines(captures, selection, follow, lost, as_json, run_directories(paths)))
@@ -58,10 +58,10 @@ def packets_command(
 
 
 def _output_lines(
-    captures: Captures, selection: Selection, follow: str | None, lost: bool, as_json: bool, runs: list[Path]
+    captures: Captures, selection: MessageFilter, follow: str | None, lost: bool, as_json: bool, runs: list[Path]
 ) -> Iterator[str]:
     everything = join(captures)
-    exchanges, names = Exchanges(everything), BlockNames(everything, runs)
+    exchanges, names = RequestAnswers(everything), BlockNames(everything, runs)
     selected = list(selection.filter(everything, captures))
     shown = [transmission for transmission in selected if transmission.lost_by] if lost else selected
     chapters = None if follow is None else list(exchanges_about(names.find(follow), shown, exchanges))

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from harness.conformance._alphabet import INPUTS, TIMER, AgentInput
-from harness.conformance._observation import Observation, RecordedDatagram
+from harness.conformance._observation import RecordedDatagram, TestedStep
 from harness.conformance._reference_model import AGENT, INITIAL_DATA, ROSTER, ReferenceModel
 from harness.conformance._state_space import SettingsVariant, key_of, state_of
 from harness.play.process.agent_mission import NO_QUIRKS
@@ -26,7 +26,7 @@ class AgentUnderTest(ABC):
         self.reference_follows = True
         """False if the machine was late, and the reference could not follow the agent to its state."""
 
-    async def step(self, given: AgentInput) -> Observation | None:
+    async def step(self, given: AgentInput) -> TestedStep | None:
         """Give the input to the agent and to the reference, and return the comparison of their behaviour.
 
         Return None if the input is impossible in the current state.
@@ -41,7 +41,7 @@ class AgentUnderTest(ABC):
         return then if then is None else replace(then, key=key, hidden_run=before.outcome.runs[0])
 
     @abstractmethod
-    async def _step(self, given: AgentInput) -> Observation | None: ...
+    async def _step(self, given: AgentInput) -> TestedStep | None: ...
 
     @property
     @abstractmethod

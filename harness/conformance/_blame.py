@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from harness.conformance._alphabet import INPUTS, TIMER
-from harness.conformance._observation import Observation
+from harness.conformance._observation import TestedStep
 from harness.conformance._reference_model import ExpectedRun
 from harness.conformance._state_space import VectorKey
 from harness.conformance._suite import ConfirmedFailure, VariantResult
@@ -116,7 +116,7 @@ class BlameEvidence:
             nothing_counted and observation.unexpected and self._passed[_branch(first)]
         )
 
-    def _holds_other_blocks(self, observation: Observation) -> ExpectedRun | None:
+    def _holds_other_blocks(self, observation: TestedStep) -> ExpectedRun | None:
         """Return the handler run that should have changed the blocks, if the agent's status shows wrong blocks.
         Otherwise return None.
 
@@ -170,7 +170,7 @@ class BlameEvidence:
         return min(runs, key=lambda run: self._passed[_branch(run)])
 
 
-def _took_another_decision(observation: Observation) -> ExpectedRun | None:
+def _took_another_decision(observation: TestedStep) -> ExpectedRun | None:
     """Return the handler run of the expired timer, if a different decision in it explains all unexpected messages."""
     first, *then = observation.outcome.runs
     if first.handler not in BEGINNING_OF_COUNT or not observation.unexpected:
@@ -187,7 +187,7 @@ def _messages_after(event: LocalEvent) -> set[str]:
     return _names(handler.sends).union(*[_messages_after(then) for then in handler.triggers if then in _LEADING_EVENTS])
 
 
-def _sends_other_content(observation: Observation) -> ExpectedRun | None:
+def _sends_other_content(observation: TestedStep) -> ExpectedRun | None:
     """Return the handler run that sent the right messages with wrong content. Return None if a block or a type is wrong
     too.
     """

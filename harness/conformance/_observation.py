@@ -80,7 +80,7 @@ class RecordedDatagram:
 
 
 @dataclass(frozen=True)
-class Observation:
+class TestedStep:
     """One step of the agent under test: the input, the expected answer, and the actual answer."""
 
     key: VectorKey
@@ -116,7 +116,7 @@ def compare(
     datagrams: Iterable[bytes],
     status: Mapping[str, Any],
     wrong: Iterable[str],
-) -> Observation:
+) -> TestedStep:
     """Compare the agent's datagrams and status after an input with those of the reference after the same input.
 
     `wrong` contains sentences about known deviations.
@@ -144,7 +144,7 @@ def compare(
     wrong_timer = _timer_expired_early(model, outcome.sent, received, status) if sentences else None
     if wrong_timer is not None:
         sentences.append(f"its timer {wrong_timer} seems to have expired already")
-    return Observation(
+    return TestedStep(
         key_of(before, given),
         outcome,
         given.name,

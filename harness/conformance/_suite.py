@@ -14,7 +14,7 @@ from typing import Any
 
 from harness.conformance._agent_under_test import Start
 from harness.conformance._alphabet import INPUTS
-from harness.conformance._observation import Observation, RecordedDatagram
+from harness.conformance._observation import RecordedDatagram, TestedStep
 from harness.conformance._reference_model import ExpectedRun, ReferenceModel
 from harness.conformance._state_space import (
     COUNTING_HANDLERS,
@@ -64,7 +64,7 @@ class ConfirmedFailure:
     variant: str
     path: tuple[str, ...]
     """All inputs since the start of the agent. The agent answered the last one wrongly."""
-    observation: Observation
+    observation: TestedStep
     exchanges: tuple[RecordedDatagram, ...]
     """All datagrams since the start of the agent."""
     needs_earlier_round: bool = False

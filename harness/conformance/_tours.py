@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from harness.conformance._agent_under_test import AgentUnderTest
 from harness.conformance._alphabet import INPUTS, TIMER
-from harness.conformance._observation import Observation, RecordedDatagram
+from harness.conformance._observation import RecordedDatagram, TestedStep
 from harness.conformance._reference_model import ReferenceModel
 from harness.conformance._state_space import AgentState, SettingsVariant, Transition, VectorKey, key_of, state_of
 
@@ -38,7 +38,7 @@ class SuspectedFailure:
 
     path: tuple[str, ...]
     """All inputs since the start of the agent. The agent answered the last one wrongly."""
-    observation: Observation
+    observation: TestedStep
     exchanges: tuple[RecordedDatagram, ...]
     """All datagrams since the start of the agent."""
 

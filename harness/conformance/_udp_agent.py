@@ -23,8 +23,8 @@ from harness.conformance._observation import (
     COMPARED,
     MAX_EARLY_TIMERS,
     KnownNames,
-    Observation,
     RecordedDatagram,
+    TestedStep,
     compare,
     datagram_text,
 )
@@ -156,7 +156,7 @@ class UdpAgent(AgentUnderTest):
         deadline = self.model.agent.next_timer()
         return deadline is not None and self._wall_s(deadline) - time.time() < self._timing.margin_s
 
-    async def _step(self, given: AgentInput) -> Observation | None:
+    async def _step(self, given: AgentInput) -> TestedStep | None:
         model = self.model
         before, deadline, expired = state_of(model), model.agent.next_timer(), next_timer_name(model)
         action = given.make(model)

@@ -19,7 +19,7 @@ from typing import Any
 
 from harness.conformance._agent_under_test import AgentUnderTest, Start
 from harness.conformance._alphabet import AgentInput
-from harness.conformance._observation import KnownNames, Observation, RecordedDatagram, compare, datagram_text
+from harness.conformance._observation import KnownNames, RecordedDatagram, TestedStep, compare, datagram_text
 from harness.conformance._reference_model import ExpectedRun, ReferenceModel, TimerExpiry
 from harness.conformance._state_space import STEP_S, SettingsVariant, next_timer_name, state_of
 from harness.conformance._udp_lab import (
@@ -211,7 +211,7 @@ class VirtualTimeAgent(AgentUnderTest):
         else:
             self._idle.append(self._program)
 
-    async def _step(self, given: AgentInput) -> Observation | None:
+    async def _step(self, given: AgentInput) -> TestedStep | None:
         model = self.model
         before, deadline = state_of(model), model.agent.next_timer()
         action = given.make(model)

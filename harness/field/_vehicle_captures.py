@@ -20,7 +20,7 @@ NANOSECONDS = 1_000_000_000
 
 
 @dataclass(slots=True)
-class Sighting:
+class CapturedDatagram:
     """A datagram at the network interface of a vehicle. `at_s` is the mission second on the vehicle's clock."""
 
     at_s: float
@@ -36,7 +36,7 @@ class AgentCapture:
 
     epoch_us: float
     speedup: float
-    sightings: list[Sighting] = field(default_factory=list)
+    sightings: list[CapturedDatagram] = field(default_factory=list)
     unreadable: int = 0
     """Number of sealed datagrams that no given key decrypts."""
 
@@ -67,7 +67,7 @@ def read_capture(path: Path, agent_id: int, epoch_us: int | None, opener: "Opene
         outbound = direction == OUTBOUND or (not direction and sender == agent_id)
         if outbound == (sender == agent_id):
             at_s = (frame.time_ns - epoch_ns) / NANOSECONDS * capture.speedup
-            capture.sightings.append(Sighting(at_s, outbound, sender, sequence, datagram))
+            capture.sightings.append(CapturedDatagram(at_s, outbound, sender, sequence, datagram))
     capture.sightings.sort(key=lambda sighting: sighting.at_s)
     return capture
 

@@ -10,12 +10,12 @@ from harness.archive.directory import default_path
 from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED, HarnessError
 from harness.proof._progress_bar import Ended, ExplorationBudget, ExplorationFigures, LimitReachedError, Progress
 from harness.proof.bounds import Bounds, BoundsError
-from harness.proof.examples._example import Example, keep, play
+from harness.proof.examples._example import ViolationExample, keep, play
 from harness.proof.examples._path_script import NO_CLOCKS, PathScript
 from harness.proof.graph._exploration import StateGraph, explore
 from harness.proof.graph._workers import Workers
 from harness.proof.model._any_sender import collect
-from harness.proof.model._flaws import Flaw
+from harness.proof.model._flaws import PropertyViolation
 from harness.proof.model._global_states import AGENTS, ZONE, ModelSwarm
 from harness.proof.model._snapshot import ReductionError, UncoveredError
 from harness.proof.questions import _convergence as liveness
@@ -99,20 +99,20 @@ class Proof:
     bounds: Bounds
     figures: ExplorationFigures
     ended: Ended
-    flaw: Flaw | None
+    flaw: PropertyViolation | None
     liveness: ConvergenceResult | None = None
     whole_ended: Ended = "complete"
-    example: Example | None = None
-    fork: Example | None = None
+    example: ViolationExample | None = None
+    fork: ViolationExample | None = None
     """The nearest idle state with several chains. It violates no property, and stays as it is until an agent votes."""
-    reluctant: Example | None = None
+    reluctant: ViolationExample | None = None
     """The nearest state that needs more than one further vote to reach one chain. None if none is known."""
     forms: list[str] = field(default_factory=list)
     """The forms of all livelocks, each as the timers of its states."""
     livelocks: list[Livelock] = field(default_factory=list)
     """One livelock of each form, replayed as a run. They may come from an exploration that is not complete."""
     way: list[str] = field(default_factory=list)
-    shown: dict[str, Example | None] = field(default_factory=dict)
+    shown: dict[str, ViolationExample | None] = field(default_factory=dict)
     """Characteristic of `OF_CAPTORS` -> the nearest violation that an attacker can cause. None in the network `any`."""
 
     @property
@@ -327,7 +327,7 @@ def _show(proof: Proof, graph: StateGraph, path: Path, name: str) -> None:
         proof.reluctant = _example(graph, live.reluctant, sentence, beside, f"{name} votes")
 
 
-def _example(graph: StateGraph, number: int, sentence: str, path: Path, name: str) -> Example:
+def _example(graph: StateGraph, number: int, sentence: str, path: Path, name: str) -> ViolationExample:
     way = graph.path(number)
     script = PathScript(graph, way)
     played = play(script.document(name))

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from harness.proof._proof import PLAYED, Proof
 from harness.proof.bounds import Bounds
-from harness.proof.examples._example import Example
+from harness.proof.examples._example import ViolationExample
 
 WHY = {
     "flaw": "the search stopped at the first flaw",
@@ -63,7 +63,7 @@ def _tighter(bounds: Bounds) -> list[str]:
     return options
 
 
-def _played(example: Example) -> Iterator[str]:
+def _played(example: ViolationExample) -> Iterator[str]:
     for key, judgement in example.judged.items():
         yield f"    played: {key} {judgement.verdict}, {judgement.reason}"
     if not example.judged:

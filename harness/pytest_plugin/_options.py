@@ -13,7 +13,7 @@ from harness.scenario.load import parse
 
 
 @dataclass(frozen=True)
-class Options:
+class SessionOptions:
     """The options of a pytest session. An option that is not given is None."""
 
     backend: BackendName | None
@@ -32,7 +32,7 @@ class Options:
     """True to rewrite stories instead of comparing them."""
 
     @classmethod
-    def of(cls, config: pytest.Config) -> "Options":
+    def of(cls, config: pytest.Config) -> "SessionOptions":
         """Return the options of a pytest session. Raises ScenarioError."""
         backend, seed, speedup, keep, variant = (
             config.getoption(f"--ucp-{name}") for name in ("backend", "seed", "speedup", "keep", "variant")

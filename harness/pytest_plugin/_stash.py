@@ -7,6 +7,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from harness.pytest_plugin._judged_run import Trial
+    from harness.pytest_plugin._judged_run import PluginRun
 
-TRIAL: pytest.StashKey[Trial] = pytest.StashKey()
+TRIAL: pytest.StashKey[PluginRun] = pytest.StashKey()

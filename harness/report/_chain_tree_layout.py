@@ -57,7 +57,7 @@ class PlacedMark:
 
 
 @dataclass(slots=True)
-class Layout:
+class ChainTreeLayout:
     root: PlacedMark
     width: float
     height: float
@@ -95,7 +95,7 @@ class _Outline:
         return large
 
 
-def lay_out(root: ChainTreeMark) -> Layout:
+def lay_out(root: ChainTreeMark) -> ChainTreeLayout:
     placed = _sized(root)
     placed_marks = list(placed.walk())
     offsets = _offsets(placed_marks)
@@ -110,7 +110,7 @@ def lay_out(root: ChainTreeMark) -> Layout:
     for item in placed_marks:
         item.x -= left
         item.y = floor - item.row * ROW_HEIGHT - item.height
-    return Layout(placed, right - left, floor + MARGIN)
+    return ChainTreeLayout(placed, right - left, floor + MARGIN)
 
 
 def _sized(root: ChainTreeMark) -> PlacedMark:

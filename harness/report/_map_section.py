@@ -13,8 +13,8 @@ from harness.report import map_svg
 from harness.report.facts import link_qualities
 from harness.report.map_parts import (
     MAX_SEGMENTS,
-    Extent,
     Flight,
+    GroundRectangle,
     NetworkDivision,
     divisions,
     extent,
@@ -126,7 +126,7 @@ def _moment(
     tracks: Tracks,
     network: Connectivity,
     flown: Sequence[Flight],
-    area_extent: Extent,
+    area_extent: GroundRectangle,
     ink: Mapping[int, AgentColours],
     types: Mapping[int, VehicleType],
 ) -> MapMoment:
@@ -199,7 +199,7 @@ def _legend_of_moments(moments: Sequence[MapMoment], types: set[VehicleType]) ->
     return entries + [(map_svg.sample(vehicle_type), vehicle_type) for vehicle_type in shapes]
 
 
-def _description(tracks: Tracks, area_extent: Extent, moments: Sequence[MapMoment]) -> str:
+def _description(tracks: Tracks, area_extent: GroundRectangle, moments: Sequence[MapMoment]) -> str:
     """Return a text that describes the map for readers who cannot see it."""
     count = len(tracks.by_vehicle)
     states = "; ".join(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from harness.archive.connectivity import Connectivity, Losses, Pair, quality
+from harness.archive.connectivity import Connectivity, LossRates, Pair, quality
 from harness.archive.run_record import ChannelRecord, FaultRecord, NetworkState, OperatorCommand, RunRecord
 from harness.play.backends import in_virtual_time
 from harness.present import text
@@ -122,7 +122,7 @@ def _named(pairs: Sequence[Pair]) -> str:
     return f"{names} and {len(pairs) - NAMED_PAIRS} more" if len(pairs) > NAMED_PAIRS else names
 
 
-def _in_words(losses: Losses) -> str:
+def _in_words(losses: LossRates) -> str:
     mean, worst = text.percent(losses.mean), text.percent(losses.worst)
     return mean if mean == worst else f"{mean}, the worst link {worst}"
 

@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from markupsafe import Markup
 
-from harness.archive.history import CUT_SHORT, Commit, History, Phase, Reconcile, Tie, Vote
+from harness.archive.history import CUT_SHORT, Commit, History, Phase, Phase2Tie, Reconcile, Vote
 from harness.archive.run_record import FaultRecord
 from harness.present.svg import n
 from harness.report._timeline_plot import (
@@ -49,7 +49,7 @@ _VOTE_HEIGHT, _PHASES_HEIGHT = 7, 10
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class TimelinePicture:
     drawing: Markup
     lane_height: int
     legend: list[tuple[Markup, str]]
@@ -69,7 +69,7 @@ def draw(
     names: Mapping[str, str],
     end_s: float,
     description: str,
-) -> Picture:
+) -> TimelinePicture:
     lane_height = _TALL if len(agents) <= MANY_AGENTS else _LOW
     votes, reconciles = _longest(history.votes), _longest(history.reconciles)
     notes = [
@@ -106,7 +106,7 @@ def draw(
     view = [*grounds, draw_background(shades, [fault for fault in faults if not fault.agents], height), *lanes]
     arrows = Markup('<svg class="arrows" width="100%" height="{}"></svg>').format(height)
     drawing = plot(view, [arrows, *marks], height, end_s, description)
-    return Picture(drawing, lane_height, _legend(history, faults, shades, by_phase=by_phase), notes)
+    return TimelinePicture(drawing, lane_height, _legend(history, faults, shades, by_phase=by_phase), notes)
 
 
 def _legend(
@@ -253,7 +253,7 @@ def _commit(group: Sequence[Commit], lane_height: int, names: Mapping[str, str])
     )
 
 
-def _tie(tie: Tie, lane_height: int) -> Markup:
+def _tie(tie: Phase2Tie, lane_height: int) -> Markup:
     """Draw a dot as a line of length 0 with round ends. It stays round when the picture is stretched."""
     return Markup('<path class="tie" d="M{} {}h0"><title>{}</title></path>').format(
         format_number(tie.at_s),

@@ -12,7 +12,7 @@ from harness.scenario import Scenario
 
 
 @dataclass(frozen=True)
-class Program:
+class AgentProgram:
     """The program of one or more agents. `command` is None for the harness's own agent.
 
     `version` is the version that the agents reported, or None.
@@ -33,12 +33,12 @@ class Program:
         return {"agents": self.agents, "command": self.command, "version": self.version}
 
 
-def programs(record: RunRecord) -> list[Program]:
+def programs(record: RunRecord) -> list[AgentProgram]:
     """Return the programs in the order of their first agents. The list is empty if all agents are the harness's own."""
     return [] if record.scenario is None else asked_for(record.scenario, record.agents)
 
 
-def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[Program]:
+def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[AgentProgram]:
     """Return the programs that a scenario requests for its agents.
 
     `agents` are the records of the agents, if the scenario was played.
@@ -50,8 +50,8 @@ def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingPro
         command, agent = scenario.command_of(agent_id), agents.get(str(agent_id))
         ran = tuple(command) if command else None, agent.version if agent else None
         alike.setdefault(ran, []).append(agent_id)
-    return [Program(tuple(alike_agents), command, version) for (command, version), alike_agents in alike.items()]
+    return [AgentProgram(tuple(alike_agents), command, version) for (command, version), alike_agents in alike.items()]
 
 
-def in_sentence(ran: Iterable[Program]) -> str:
+def in_sentence(ran: Iterable[AgentProgram]) -> str:
     return "; ".join(program.in_words for program in ran)

@@ -17,7 +17,7 @@ from harness.report._chain_tree_layout import (
     FONT_SIZE,
     LINE_HEIGHT,
     SMALL_FONT_SIZE,
-    Layout,
+    ChainTreeLayout,
     PlacedMark,
     lay_out,
 )
@@ -90,7 +90,7 @@ class ChainTreePicture:
                 endings.append(f"{_agents(placed.mark.holders)} {where}")
         return f"{_agents(agents)}: all share {shared}. Chains end: {'; '.join(endings)}."
 
-    def _draw(self, layout: Layout, form: str, paper: Markup) -> Markup:
+    def _draw(self, layout: ChainTreeLayout, form: str, paper: Markup) -> Markup:
         links, threads, dots = [], [], []
         shapes = []
         for placed in layout.root.walk():

@@ -203,7 +203,7 @@ INVISIBLE_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Extent:
+class GroundRectangle:
     """A rectangle on the ground, in metres north and east of the field's centre."""
 
     south_m: float
@@ -220,11 +220,11 @@ class Extent:
         return self.north_m - self.south_m
 
 
-def extent(fixes: Sequence[PositionFix]) -> Extent:
+def extent(fixes: Sequence[PositionFix]) -> GroundRectangle:
     """Return a rectangle around the positions. There must be at least one position."""
     north, east = [fix.north_m for fix in fixes], [fix.east_m for fix in fixes]
     shortest = max(MIN_SPAN_M, MIN_ASPECT * max(max(north) - min(north), max(east) - min(east)))
-    return Extent(*_widen(min(north), max(north), shortest), *_widen(min(east), max(east), shortest))
+    return GroundRectangle(*_widen(min(north), max(north), shortest), *_widen(min(east), max(east), shortest))
 
 
 def _widen(low: float, high: float, shortest: float) -> tuple[float, float]:
@@ -234,10 +234,10 @@ def _widen(low: float, high: float, shortest: float) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Projection:
+class MapProjection:
     """A projection of `land` into a rectangle of pixels. `left` and `top` are its upper left corner."""
 
-    land: Extent
+    land: GroundRectangle
     left: float
     top: float
     room_width: float

@@ -16,11 +16,11 @@ from harness.present import text as words
 from harness.present.colours import AgentColours
 from harness.present.svg import FONT, n
 from harness.report.map_parts import (
-    Extent,
     Flight,
+    GroundRectangle,
+    MapProjection,
     NetworkDivision,
     Point,
-    Projection,
     TrackSegment,
     letter,
     listed,
@@ -38,7 +38,7 @@ Box = tuple[float, float, float, float]
 
 
 def tags(
-    tagged: Sequence[tuple[int, Point]], crosses: Sequence[Point], to_px: Projection, ink: Mapping[int, AgentColours]
+    tagged: Sequence[tuple[int, Point]], crosses: Sequence[Point], to_px: MapProjection, ink: Mapping[int, AgentColours]
 ) -> Markup:
     """Draw tags with vehicle IDs that overlap neither each other nor the `crosses`.
 
@@ -90,7 +90,7 @@ def _tag(vehicle: int, box: Box, place: Point, ink: AgentColours) -> Markup:
     )
 
 
-def _inside(box: Box, to_px: Projection) -> bool:
+def _inside(box: Box, to_px: MapProjection) -> bool:
     left, top, right, bottom = box
     return (
         left >= to_px.left
@@ -133,12 +133,12 @@ def css_class(division: NetworkDivision | None, vehicle: int) -> str:
 def draw_tracks(
     flights: Sequence[Flight],
     reboots: Sequence[tuple[PositionFix, int]],
-    land: Extent,
+    land: GroundRectangle,
     ink: Mapping[int, AgentColours],
     description: str,
 ) -> Markup:
     """Draw the map. `reboots` contains positions and agents of reboots, and `description` describes the picture."""
-    to_px = Projection(land, _LEFT, _TOP, _ROOM_WIDTH, _ROOM_HEIGHT)
+    to_px = MapProjection(land, _LEFT, _TOP, _ROOM_WIDTH, _ROOM_HEIGHT)
     return Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
         ' aria-labelledby="tracks-title tracks-desc" font-family="{font}" font-size="12">'
@@ -160,13 +160,13 @@ def draw_moment(
     lost: Sequence[PositionFix],
     links: Mapping[tuple[int, int], float],
     division: NetworkDivision | None,
-    land: Extent,
+    land: GroundRectangle,
     ink: Mapping[int, AgentColours],
     types: Mapping[int, VehicleType],
     description: str,
 ) -> Markup:
     """Draw the living vehicles, the loss rates of their links, and the places where vehicles were lost."""
-    to_px = Projection(land, 1, 1, _MOMENT_WIDTH, _MOMENT_HEIGHT)
+    to_px = MapProjection(land, 1, 1, _MOMENT_WIDTH, _MOMENT_HEIGHT)
     at = {vehicle: to_px(fix) for vehicle, fix in swarm.items()}
     dots = (_dot(vehicle, place, division, ink[vehicle], types.get(vehicle, "copter")) for vehicle, place in at.items())
     tagged = list(at.items()) if len(at) <= MOST_TAGGED_AT_A_MOMENT else []
@@ -247,7 +247,7 @@ def sample(which: str) -> Markup:
     return Markup('<svg width="34" height="16" aria-hidden="true">{}</svg>').format(shape)
 
 
-def frame(to_px: Projection) -> Markup:
+def frame(to_px: MapProjection) -> Markup:
     """Draw the grid with labels in metres, the scale bar, and a north arrow."""
     left, top = to_px.left, to_px.top
     right, bottom = left + to_px.width, top + to_px.height
@@ -283,7 +283,7 @@ def frame(to_px: Projection) -> Markup:
     )
 
 
-def _track_paths(segments: Sequence[TrackSegment], to_px: Projection) -> Markup:
+def _track_paths(segments: Sequence[TrackSegment], to_px: MapProjection) -> Markup:
     """Draw the flight paths. Those in groups of connected vehicles are on top."""
     lines = thin([[to_px(fix) for fix in segment.fixes] for segment in segments], MAX_POINTS)
     classes = [css_class(segment.division, segment.vehicle) for segment in segments]
@@ -314,7 +314,7 @@ def _connection_text(division: NetworkDivision | None, vehicle: int) -> str:
 def _marks(
     flights: Sequence[Flight],
     reboots: Iterable[tuple[PositionFix, int]],
-    to_px: Projection,
+    to_px: MapProjection,
     ink: Mapping[int, AgentColours],
 ) -> Markup:
     """Draw the starts, reboots and ends of flight paths, with tags at the ends."""

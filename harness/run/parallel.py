@@ -97,7 +97,7 @@ def raise_error(outcome: R | HarnessError) -> R:
     return outcome
 
 
-class Worker(Generic[T, R]):
+class WorkerProcess(Generic[T, R]):
     """A process that executes tasks until it is killed. It also ends with its parent process."""
 
     def __init__(self, work: Callable[[T], R]) -> None:
@@ -132,8 +132,8 @@ class _Pool(Generic[T, R]):
 
     def __init__(self, work: Callable[[T], R], jobs: int, count: Callable[[Any], Any], in_order: bool) -> None:
         self._work, self._jobs, self._count, self._in_order = work, jobs, count, in_order
-        self._idle: list[Worker[T, R]] = []
-        self._busy: dict[Connection, tuple[int, Worker[T, R]]] = {}
+        self._idle: list[WorkerProcess[T, R]] = []
+        self._busy: dict[Connection, tuple[int, WorkerProcess[T, R]]] = {}
 
     def outcomes(self, tasks: Iterable[T]) -> Iterator[tuple[T, R | FailedTask]]:
         numbered = enumerate(tasks)
@@ -163,7 +163,7 @@ class _Pool(Generic[T, R]):
 
     def _begin(self, number: int, task: T) -> None:
         with signals_blocked():  # an interruption here would leave a worker that `stop` does not know
-            worker = self._idle.pop() if self._idle else Worker(self._work)
+            worker = self._idle.pop() if self._idle else WorkerProcess(self._work)
             self._busy[worker.connection] = number, worker
         with contextlib.suppress(BrokenPipeError):  # a killed worker is noticed when its connection is read
             worker.connection.send(task)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 from harness.scenario._network import NetworkModel, NetworkValues, Scope, conditions_of, overlay, scope_in_words
-from harness.scenario.timeline import EMPTY_LAYER, Layer, Schedule, TimelineEntry
+from harness.scenario.timeline import EMPTY_LAYER, Schedule, TemporaryChange, TimelineEntry
 from netem.conditions import NetworkConditions
 
 Groups = tuple[frozenset[int], ...]
@@ -27,7 +27,7 @@ class NetworkState:
     roster: tuple[int, ...]
     lasting: NetworkValues
     """Lasting conditions, of the scenario and of its timeline so far."""
-    layers: list[Layer]
+    layers: list[TemporaryChange]
     """The current layer of each schedule."""
     partition: Groups = ()
     temporary: list[TimelineEntry] = field(default_factory=list)
@@ -98,7 +98,7 @@ def network_steps(
             begins[entry.at_s].append(number)
             if entry.for_s is not None:
                 ends[entry.ends_at_s].append(number)
-    scheduled: dict[float, list[tuple[int, str, Layer]]] = defaultdict(list)
+    scheduled: dict[float, list[tuple[int, str, TemporaryChange]]] = defaultdict(list)
     for number, schedule in enumerate(schedules):
         for at_s, what, layer in schedule.steps(roster, end_s):
             scheduled[at_s].append((number, what, layer))

@@ -159,7 +159,7 @@ Pairs = frozenset[tuple[int, int]]
 
 
 @dataclass(frozen=True)
-class Layer:
+class TemporaryChange:
     """A temporary change of the network by a schedule. An empty layer changes nothing."""
 
     values: NetworkValues = field(default_factory=dict)
@@ -168,9 +168,9 @@ class Layer:
     """Pairs of a sender and a receiver. All messages from this sender to this receiver are lost."""
 
 
-EMPTY_LAYER = Layer()
+EMPTY_LAYER = TemporaryChange()
 
-LayerStep = tuple[float, str, Layer]
+LayerStep = tuple[float, str, TemporaryChange]
 """Mission second, name of the change, and the layer from this second on."""
 
 
@@ -309,9 +309,9 @@ class Schedule(Model):
             count += 1
         return steps
 
-    def _layer(self, roster: Sequence[int], rng: Random) -> Layer:
+    def _layer(self, roster: Sequence[int], rng: Random) -> TemporaryChange:
         if self.repeat is not None:
-            return Layer(self.repeat.changes(), self.repeat.groups)
+            return TemporaryChange(self.repeat.changes(), self.repeat.groups)
         assert self.nemesis is not None, "a schedule is one of three"
         return NEMESES[self.nemesis](rng.sample(list(roster), len(roster)))
 
@@ -321,19 +321,21 @@ def _ramp(ramp: Ramp, from_s: float, until: float, every: float) -> list[LayerSt
     steps: list[LayerStep] = []
     for number in range(count + 1):
         share = number / count
-        steps.append((from_s + (until - from_s) * share, "ramp", Layer(ramp.at(share))))
+        steps.append((from_s + (until - from_s) * share, "ramp", TemporaryChange(ramp.at(share))))
     return steps
 
 
-def _halves(shuffled: list[int]) -> Layer:
-    return Layer(partition=(frozenset(shuffled[: len(shuffled) // 2]), frozenset(shuffled[len(shuffled) // 2 :])))
+def _halves(shuffled: list[int]) -> TemporaryChange:
+    return TemporaryChange(
+        partition=(frozenset(shuffled[: len(shuffled) // 2]), frozenset(shuffled[len(shuffled) // 2 :]))
+    )
 
 
-def _isolate(shuffled: list[int]) -> Layer:
-    return Layer(partition=(frozenset(shuffled[:1]),))
+def _isolate(shuffled: list[int]) -> TemporaryChange:
+    return TemporaryChange(partition=(frozenset(shuffled[:1]),))
 
 
-def _majorities_ring(shuffled: list[int]) -> Layer:
+def _majorities_ring(shuffled: list[int]) -> TemporaryChange:
     """Return a change in which each vehicle receives only its neighbours on a ring. These form a different majority for
     each vehicle.
     """
@@ -342,21 +344,21 @@ def _majorities_ring(shuffled: list[int]) -> Layer:
     heard = {
         (shuffled[(place + step) % size], shuffled[place]) for place in range(size) for step in range(-reach, reach + 1)
     }
-    return Layer(cut=frozenset((a, b) for a in shuffled for b in shuffled if a != b and (a, b) not in heard))
+    return TemporaryChange(cut=frozenset((a, b) for a in shuffled for b in shuffled if a != b and (a, b) not in heard))
 
 
-def _bridge(shuffled: list[int]) -> Layer:
+def _bridge(shuffled: list[int]) -> TemporaryChange:
     _, *rest = shuffled
     left, right = rest[: len(rest) // 2], rest[len(rest) // 2 :]
-    return Layer(cut=frozenset(pair for a in left for b in right for pair in ((a, b), (b, a))))
+    return TemporaryChange(cut=frozenset(pair for a in left for b in right for pair in ((a, b), (b, a))))
 
 
-def _flapping(shuffled: list[int]) -> Layer:
+def _flapping(shuffled: list[int]) -> TemporaryChange:
     pair = shuffled[:2]
-    return Layer(cut=frozenset(((pair[0], pair[1]), (pair[1], pair[0])) if len(pair) == 2 else ()))
+    return TemporaryChange(cut=frozenset(((pair[0], pair[1]), (pair[1], pair[0])) if len(pair) == 2 else ()))
 
 
-NEMESES: dict[Nemesis, Callable[[list[int]], Layer]] = {
+NEMESES: dict[Nemesis, Callable[[list[int]], TemporaryChange]] = {
     "halves": _halves,
     "isolate": _isolate,
     "majorities ring": _majorities_ring,

@@ -14,7 +14,7 @@ from sitl.airframes import NOT_FLOWN, airframe
 from sitl.plan import MAX_LEGS, By, GoTo, Land, Loiter, Plan, TakeOff
 from sitl.plan import Leg as PlannedLeg
 from sitl.setup import Debugger, VehicleSetup
-from sitl.start_places import Offset
+from sitl.start_places import HomeOffset
 from sitl.vehicle import SPACING_M, Home, VehicleError, VehicleType, home_in_field
 
 VehicleKind = Literal["ardupilot", "embedded", "none"]
@@ -92,7 +92,7 @@ Parameters = Annotated[
 ]
 """Parameter -> value, or the name of a parameter file."""
 
-Offsets = dict[Annotated[int, Field(ge=0, le=start_places.MAX_INSTANCE)], Offset]
+Offsets = dict[Annotated[int, Field(ge=0, le=start_places.MAX_INSTANCE)], HomeOffset]
 SwarmOffsets = Annotated[Offsets, _from_file(lambda name, beside: start_places.swarm(beside / name), Offsets)]
 """Instance, from 0 -> offset, or the name of a file of offsets."""
 

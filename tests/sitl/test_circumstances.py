@@ -20,8 +20,8 @@ from sitl.circumstances import (
     RC_LOST,
     STATION_LOST,
     STATION_REGAINED,
-    Circumstance,
     NotSimulatedError,
+    SimulatedFailure,
     battery,
 )
 from sitl.modes import MODES
@@ -164,7 +164,7 @@ def test_parameter_name_of_an_earlier_version_is_used(tmp_path: Path) -> None:
 def test_unsupported_circumstance_gives_one_sentence(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    circumstance: Circumstance,
+    circumstance: SimulatedFailure,
     vehicle_type: VehicleType,
     sentence: str,
 ) -> None:

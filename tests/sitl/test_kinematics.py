@@ -7,7 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl._kinematics import Arc, Climbing, Course, Fall, Line, Motion, Point, RestSegment, Segment, end_of
+from sitl._kinematics import (
+    CircularArc,
+    ClimbingSegment,
+    Fall,
+    Motion,
+    PlannedMotion,
+    Point,
+    RestSegment,
+    Segment,
+    StraightLine,
+    end_of,
+)
 from sitl._models import MODELS
 from sitl._plane import LOITER_RADIUS_M
 from sitl.vehicle import VehicleType
@@ -22,7 +33,7 @@ def distance(a: Motion, b: Motion) -> float:
 
 
 def test_line_has_a_trapezoidal_speed() -> None:
-    line = Line(Motion(), Point(100, 0, 0), speed_ms=10, accel_ms2=2)
+    line = StraightLine(Motion(), Point(100, 0, 0), speed_ms=10, accel_ms2=2)
     assert line.duration_s == pytest.approx(5 + 50 / 10 + 5)
     assert (line.at(5).north_m, line.at(5).north_ms) == pytest.approx((25, 10))
     assert line.at(10).north_m == pytest.approx(75)
@@ -30,7 +41,7 @@ def test_line_has_a_trapezoidal_speed() -> None:
 
 
 def test_short_line_does_not_reach_its_speed() -> None:
-    line = Line(Motion(), Point(0, 8, 0), speed_ms=10, accel_ms2=2)
+    line = StraightLine(Motion(), Point(0, 8, 0), speed_ms=10, accel_ms2=2)
     assert line.duration_s == pytest.approx(4)
     assert line.at(2).east_ms == pytest.approx(4)
 
@@ -39,7 +50,7 @@ def test_short_line_does_not_reach_its_speed() -> None:
 def test_speed_of_a_line_is_the_derivative_of_its_position(
     end: Point, speed: float, accel: float, begins: float, ends: float
 ) -> None:
-    line = Line(Motion(up_m=end.up_m), end._replace(north_m=2000), speed, accel, begins * speed, ends * speed)
+    line = StraightLine(Motion(up_m=end.up_m), end._replace(north_m=2000), speed, accel, begins * speed, ends * speed)
     for part in (0.1, 0.5, 0.9):
         at_s = part * line.duration_s
         before, after = line.at(at_s - 1e-3), line.at(at_s + 1e-3)
@@ -51,7 +62,7 @@ def test_speed_of_a_line_is_the_derivative_of_its_position(
 @pytest.mark.parametrize(("turn", "end"), [(math.pi, (0, 20)), (-math.pi, (0, -20))])
 def test_clockwise_arc_turns_right(turn: float, end: tuple[float, float]) -> None:
     heading_north = Motion()
-    arc = Arc(heading_north, (0, math.copysign(10, turn)), turn, speed_ms=5)
+    arc = CircularArc(heading_north, (0, math.copysign(10, turn)), turn, speed_ms=5)
     assert arc.at(0).yaw_rad % math.tau == pytest.approx(0, abs=1e-9)
     assert arc.at(arc.duration_s).point[:2] == pytest.approx(end, abs=1e-9)
     assert arc.at(arc.duration_s).north_ms == pytest.approx(-5)
@@ -59,7 +70,7 @@ def test_clockwise_arc_turns_right(turn: float, end: tuple[float, float]) -> Non
 
 
 def test_climb_ends_at_its_altitude() -> None:
-    climb = Climbing(Line(Motion(up_m=10), Point(100, 0, 10), 10, 100), up_m=20, rate_ms=2)
+    climb = ClimbingSegment(StraightLine(Motion(up_m=10), Point(100, 0, 10), 10, 100), up_m=20, rate_ms=2)
     assert (climb.at(2).up_m, climb.at(2).up_ms) == (14, 2)
     assert (climb.at(9).up_m, climb.at(9).up_ms) == (20, 0)
 
@@ -71,8 +82,8 @@ def test_fall_ends_at_the_speed_of_free_fall() -> None:
 
 
 def test_course_joins_its_segments() -> None:
-    line = Line(Motion(), Point(10, 0, 0), 10, 10)
-    course = Course(100, [RestSegment(Motion(), 5), line, RestSegment(end_of([line]))])
+    line = StraightLine(Motion(), Point(10, 0, 0), 10, 10)
+    course = PlannedMotion(100, [RestSegment(Motion(), 5), line, RestSegment(end_of([line]))])
     assert course.at(0) == course.at(104.9) == Motion()
     assert course.at(105 + line.duration_s / 2).north_m == pytest.approx(5)
     assert course.at(1e6).north_m == 10
@@ -106,7 +117,7 @@ def test_motion_is_continuous_and_above_ground(
             segments = model.ascent(motion, place.up_m)
         else:
             segments = model.land(motion, motion.point)
-        course = Course(now, segments)
+        course = PlannedMotion(now, segments)
         assert distance(course.at(now), motion) < 1e-6
         fine = [course.at(now + seconds * step / STEPS) for step in range(STEPS + 1)]
         for before, after in itertools.pairwise(fine):

@@ -15,7 +15,7 @@ import sitl._pilot_link
 import sitl._take_off
 import sitl.pilot
 from sitl._autopilot import Autopilot
-from sitl._vehicle_state import Battery, Position
+from sitl._vehicle_state import Battery, ReportedPosition
 from sitl.pilot import Pilot
 from sitl.serial_channel import ClientChannel
 from sitl.streams import heartbeat
@@ -190,6 +190,6 @@ def test_state_has_the_reported_motion_and_battery(tmp_path: Path) -> None:
         vehicle.advance(12.0)
         channel.send_due()
         pilot.link.data_received(channel.take())
-        assert pilot.state.position == Position(-35.363262, 149.165237, 584.0, 0.0, heading_deg=270.0)
+        assert pilot.state.position == ReportedPosition(-35.363262, 149.165237, 584.0, 0.0, heading_deg=270.0)
         assert pilot.state.battery == Battery(16.8, 1.0)
         assert pilot.state.item == 0

@@ -28,7 +28,7 @@ class RequestOutcome(NamedTuple):
     response: Transmission | None = None
 
 
-class Exchanges:
+class RequestAnswers:
     """The answers to each request."""
 
     def __init__(self, transmissions: Sequence[Transmission]) -> None:

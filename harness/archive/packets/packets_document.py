@@ -12,7 +12,7 @@ from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import Captures, Clock
 from harness.archive.packets.capture_reader import Capture, ListenerName
 from harness.archive.packets.channel_losses import ChannelLosses, loss_reasons
-from harness.archive.packets.exchanges import Exchanges, LinkLosses, Outcome
+from harness.archive.packets.exchanges import LinkLosses, Outcome, RequestAnswers
 from harness.archive.packets.transmissions import Origin, Transmission
 
 SCHEMA = "ucp-packets/1"
@@ -113,7 +113,7 @@ def document(
     captures: Captures,
     pairs: Iterable[LinkLosses],
     shown: Iterable[Transmission],
-    exchanges: Exchanges,
+    exchanges: RequestAnswers,
     names: BlockNames,
     losses: ChannelLosses,
 ) -> Iterator[str]:
@@ -155,7 +155,7 @@ def _capture(capture: Capture, clock: Clock) -> CaptureRecord:
     )
 
 
-def _datagram(transmission: Transmission, exchanges: Exchanges, names: BlockNames) -> DatagramRecord:
+def _datagram(transmission: Transmission, exchanges: RequestAnswers, names: BlockNames) -> DatagramRecord:
     summary = transmission.summary
     answers = [
         AnswerRecord(

@@ -8,8 +8,8 @@ from harness.archive.packets.capture_files import Captures
 from harness.archive.packets.capture_reader import ListenerName
 from harness.archive.packets.channel_losses import DROPS, ChannelLosses, loss_reasons
 from harness.archive.packets.datagram import MessageSummary
-from harness.archive.packets.exchanges import Exchanges, Outcome, RequestOutcome
-from harness.archive.packets.selection import Exchange, block_arrivals
+from harness.archive.packets.exchanges import Outcome, RequestAnswers, RequestOutcome
+from harness.archive.packets.selection import AnsweredMessage, block_arrivals
 from harness.archive.packets.transmissions import Transmission
 from harness.present.text import moment
 from ucp.messages import (
@@ -118,7 +118,7 @@ def header(captures: Captures) -> str:
 
 
 def transmission_lines(
-    transmissions: Iterable[Transmission], exchanges: Exchanges, text: TransmissionText, answers_of: int | None
+    transmissions: Iterable[Transmission], exchanges: RequestAnswers, text: TransmissionText, answers_of: int | None
 ) -> Iterator[str]:
     """Yield a line for each message, and below each request its results at all vehicles or only at `answers_of`."""
     for transmission in transmissions:
@@ -129,7 +129,9 @@ def transmission_lines(
                 yield f"{_INDENT}   {text.answers(wanted)}"
 
 
-def exchange_lines(exchanges_shown: Sequence[Exchange], exchanges: Exchanges, text: TransmissionText) -> Iterator[str]:
+def exchange_lines(
+    exchanges_shown: Sequence[AnsweredMessage], exchanges: RequestAnswers, text: TransmissionText
+) -> Iterator[str]:
     """Yield lines about a block's messages, each with its answers and its missing answers.
 
     The last line lists the vehicles that the block reached.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from harness.archive.packets.capture_files import Captures
 from harness.archive.packets.datagram import CARRY_A_BLOCK
-from harness.archive.packets.exchanges import Exchanges
+from harness.archive.packets.exchanges import RequestAnswers
 from harness.archive.packets.transmissions import Transmission
 from harness.errors import CaptureError
 from ucp.messages import TYPE_CODES
@@ -15,7 +15,7 @@ MESSAGES = [message.NAME for message in TYPE_CODES]
 
 
 @dataclass(frozen=True)
-class Selection:
+class MessageFilter:
     """Conditions on messages. A condition that is None accepts every message. The case of letters in `message` is
     ignored.
 
@@ -59,7 +59,7 @@ class Selection:
         )
 
 
-class Exchange(NamedTuple):
+class AnsweredMessage(NamedTuple):
     """A message that is not an answer, together with those answers to it that concern the selected block."""
 
     first: Transmission
@@ -67,18 +67,18 @@ class Exchange(NamedTuple):
 
 
 def exchanges_about(
-    block_hash: bytes, transmissions: Iterable[Transmission], exchanges: Exchanges
-) -> Iterator[Exchange]:
+    block_hash: bytes, transmissions: Iterable[Transmission], exchanges: RequestAnswers
+) -> Iterator[AnsweredMessage]:
     """Yield all messages about a block, with their answers, in the order of sending."""
     answer_numbers: set[int] = set()
     for transmission in transmissions:
         answers = [answer for answer in exchanges.responses(transmission) if answer.summary.block_hash == block_hash]
         if (transmission.summary.block_hash == block_hash and transmission.number not in answer_numbers) or answers:
             answer_numbers.update(answer.number for answer in answers)
-            yield Exchange(transmission, answers)
+            yield AnsweredMessage(transmission, answers)
 
 
-def in_order(exchanges: Iterable[Exchange]) -> list[Transmission]:
+def in_order(exchanges: Iterable[AnsweredMessage]) -> list[Transmission]:
     """Return all messages in these groups, each once, in the order of sending."""
     by_number = {
         transmission.number: transmission
@@ -88,7 +88,7 @@ def in_order(exchanges: Iterable[Exchange]) -> list[Transmission]:
     return [by_number[number] for number in sorted(by_number)]
 
 
-def block_arrivals(exchanges: Iterable[Exchange]) -> dict[int, float]:
+def block_arrivals(exchanges: Iterable[AnsweredMessage]) -> dict[int, float]:
     """Return the mission second at which the block itself first reached each vehicle."""
     first: dict[int, float] = {}
     for transmission in in_order(exchanges):

@@ -19,7 +19,7 @@ Origin = Literal["captured", "inferred", "forged"]
 captured then, and `at_s` is the time of the first reception. `forged`: the agent that it names did not send it."""
 
 
-class Reception(NamedTuple):
+class DatagramReception(NamedTuple):
     """The reception of a datagram at one vehicle: the number of copies, and the mission seconds of the first and last
     one.
     """
@@ -44,7 +44,7 @@ class Transmission(NamedTuple):
     summary: MessageSummary
     origin: Origin
     seen_leaving: ListenerName | None
-    received: tuple[Reception, ...]
+    received: tuple[DatagramReception, ...]
     lost_by: tuple[ListenerName, ...]
     absent: tuple[ListenerName, ...]
 
@@ -124,7 +124,9 @@ def _transmissions(
             origin=_origin(datagram.sender, seen_leaving, listeners.would_record_sending(datagram.sender, time_ns)),
             seen_leaving=seen_leaving,
             received=tuple(
-                Reception(name, clock.seconds(reached[name][0]), len(reached[name]), clock.seconds(reached[name][-1]))
+                DatagramReception(
+                    name, clock.seconds(reached[name][0]), len(reached[name]), clock.seconds(reached[name][-1])
+                )
                 for name in listeners.names
                 if name in reached
             ),

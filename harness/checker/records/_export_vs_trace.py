@@ -10,7 +10,7 @@ from dataclasses import astuple
 
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Incarnation, Observation
+from harness.checker._trace_replay import Incarnation, TraceObservation
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import ROUNDED_S, Contradiction, mission_s, of_agent, slack_s
@@ -158,7 +158,7 @@ def _in_incarnation(evidence: Evidence, agent_id: int, incarnation: Incarnation)
             yield Contradiction(finding(evidence, agent_id, observation), touches)
 
 
-def finding(evidence: Evidence, agent_id: int, observation: Observation) -> Finding:
+def finding(evidence: Evidence, agent_id: int, observation: TraceObservation) -> Finding:
     """Return the observation as a piece of evidence that names the block."""
     block = observation.block_hash
     return Finding(agent_id, f"{observation.where}: {observation.what}", evidence.name(block) if block else None, block)
@@ -173,6 +173,6 @@ def _between_incarnations(
         if incarnation.runs and incarnation.runs[0].t < now - slack:
             what = f"an incarnation starts at {incarnation.runs[0].t:g} s, before the previous one ends at {now:g} s"
             line, run = next(incarnation.numbered_runs())
-            observation = Observation(line, run, what)
+            observation = TraceObservation(line, run, what)
             yield Contradiction(finding(evidence, agent_id, observation))
         now = incarnation.runs[-1].t if incarnation.runs else now

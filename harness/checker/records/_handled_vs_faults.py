@@ -16,7 +16,7 @@ from math import inf
 
 from harness.archive.connectivity import Link
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Observation
+from harness.checker._trace_replay import TraceObservation
 from harness.checker.evidence import Evidence
 from harness.checker.records._export_vs_trace import finding
 from harness.checker.records.contradiction import ROUNDED_S, Contradiction, in_virtual_time, slack_s
@@ -44,7 +44,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
             for line, run in incarnation.numbered_runs():
                 for what in (_while_stopped(run, stops), _over_a_cut(evidence, agent_id, run, cuts)):
                     if what is not None:
-                        yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)), "1")
+                        yield Contradiction(finding(evidence, agent_id, TraceObservation(line, run, what)), "1")
 
 
 def _clock_slack_s(trace: Trace) -> float:

@@ -7,7 +7,7 @@ the network duplicates messages.
 from collections import Counter
 from collections.abc import Iterator
 
-from harness.checker._trace_replay import Observation
+from harness.checker._trace_replay import TraceObservation
 from harness.checker.evidence import Evidence, Sending
 from harness.checker.records._export_vs_trace import finding
 from harness.checker.records.contradiction import Contradiction, slack_s
@@ -38,7 +38,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                     handled[key] += 1
                     if handled[key] > len(sent) and not evidence.injected.may_include(trigger):
                         what = f"handled {_named(trigger)} again, although nothing duplicates messages"
-                        yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)), "1")
+                        yield Contradiction(finding(evidence, agent_id, TraceObservation(line, run, what)), "1")
                 first_s, message = sent[0]
                 recorded = message.datagram
                 unchanged = recorded is not None and (run.input is recorded or run.input == recorded)
@@ -57,15 +57,18 @@ def _may_duplicate(evidence: Evidence) -> bool:
 
 def _find_differences(
     line: int, run: HandlerRun, trigger: MessageTrigger, sent: Sending, earliest_s: float
-) -> Iterator[tuple[Observation, str]]:
+) -> Iterator[tuple[TraceObservation, str]]:
     """Yield each difference between a handled message and the sent message, with the affected characteristic."""
     if run.t < earliest_s:
-        yield Observation(line, run, f"handled {_named(trigger)} before it was sent at {sent[0][0]:g} s"), "1"
+        yield TraceObservation(line, run, f"handled {_named(trigger)} before it was sent at {sent[0][0]:g} s"), "1"
     if run.input is not None and not _is_unchanged(run.input, sent):
-        yield Observation(line, run, f"handled {_named(trigger)}, whose content differs from the sent message"), "1"
+        yield (
+            TraceObservation(line, run, f"handled {_named(trigger)}, whose content differs from the sent message"),
+            "1",
+        )
     elif run.changes and (other := _another_block(run, trigger, sent)):
         yield (
-            Observation(
+            TraceObservation(
                 line, run, f"took this block from {_named(trigger)}, but that message carried another block", other
             ),
             "4",

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Observation
+from harness.checker._trace_replay import TraceObservation
 from harness.checker.evidence import Evidence
 from harness.checker.recorded_inputs import event_of
 from harness.checker.records._export_vs_trace import finding
@@ -53,7 +53,7 @@ def _compare_runs(evidence: Evidence, agent_id: int, latest_s: float) -> Iterato
         if incarnation.runs and incarnation.runs[-1].t > latest_s:
             line, run = next((line, run) for line, run in incarnation.numbered_runs() if run.t > latest_s)
             what = f"ran at {run.t:g} s, although the agent ended at {evidence.end_of(agent_id):g} s"
-            yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)))
+            yield Contradiction(finding(evidence, agent_id, TraceObservation(line, run, what)))
 
 
 def _compare_export(
@@ -82,7 +82,7 @@ def _compare_events(evidence: Evidence, agent_id: int, trace: Trace) -> Iterator
             logged_s = _time_of_event(run, trace)
             if logged_s is not None and abs(logged_s - run.t) > slack:
                 what = f"logged an event at {run.t:g} s, but the timestamp of the event is {logged_s:g} s"
-                yield Contradiction(finding(evidence, agent_id, Observation(line, run, what)))
+                yield Contradiction(finding(evidence, agent_id, TraceObservation(line, run, what)))
 
 
 def _time_of_event(run: HandlerRun, trace: Trace) -> float | None:

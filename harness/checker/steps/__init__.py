@@ -20,7 +20,7 @@ from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
 from harness.checker.steps._late_timers import JudgedTimers
 from harness.checker.steps.deviation import Deviation
 from harness.checker.steps.end_of_record import crash, failure
-from harness.checker.steps.follower import Follower, OptionalTraceFields
+from harness.checker.steps.follower import OptionalTraceFields, StepComparer
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
 from ucp.messages import MalformedDatagramError
 from ucp.trace import CommandEntry, DroppedDatagram
@@ -88,7 +88,7 @@ def _why(unjudged: dict[int, str]) -> str:
     return "; ".join(f"of {agents(ids)} {why}" for why, ids in by_reason.items())
 
 
-def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: Blocks) -> list[Follower]:
+def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: Blocks) -> list[StepComparer]:
     """Return an object for each incarnation of the agent (the time between two restarts) that compares it with the
     reference.
     """
@@ -97,10 +97,10 @@ def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: 
         return evidence.was_paused(header.agent_id, since, until)
 
     parts = OptionalTraceFields.of(trace)
-    return [Follower(header, parts, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
+    return [StepComparer(header, parts, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
 
 
-def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Follower]) -> None:
+def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[StepComparer]) -> None:
     """Compare each incarnation of the agent with the reference, up to the first step with an undefined name."""
     understood = not evidence.unknown.get(agent_id, {}).keys() - IGNORED_KINDS
     for follower, life in zip(followers, trace.incarnations(), strict=True):

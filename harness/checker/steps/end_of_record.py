@@ -14,7 +14,7 @@ from harness.archive.run_record import AgentRecord
 from harness.archive.traces import Trace
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
 from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.follower import Follower
+from harness.checker.steps.follower import StepComparer
 
 FAILED = ("crashed", "hung", "broken")
 """Outcomes of agents that ended against their will."""
@@ -65,7 +65,7 @@ def last_line(trace: Trace) -> tuple[int, float]:
 
 
 def unfinished(
-    follower: Follower, trace: Trace, others_until_s: float, arrivals: Iterator[Arrival] | None
+    follower: StepComparer, trace: Trace, others_until_s: float, arrivals: Iterator[Arrival] | None
 ) -> str | None:
     """Return a sentence about the end of a trace without an export, if the mission went on after it. None otherwise.
 

@@ -86,7 +86,7 @@ class AnotherHandlerError(NotHandledError):
         super().__init__(f"ran as Algorithm {ran}, but the input is for Algorithm {handler.algorithm}, {handler.name}")
 
 
-class Follower:
+class StepComparer:
     """Compares the handler runs of one agent between two restarts with the reference implementation."""
 
     def __init__(
@@ -256,7 +256,7 @@ class Follower:
         self._none_ends_before = self._soonest_end()
         return is_hidden
 
-    def copy(self) -> "Follower":
+    def copy(self) -> "StepComparer":
         """Return an independent copy of this object, without the differences found so far."""
         keep = [self._header, self._parts, self._blocks, self._was_paused, self._state, self._implementation]
         keep.append(self._on_message)

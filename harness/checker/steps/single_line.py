@@ -20,7 +20,7 @@ from typing import Protocol
 from harness.checker.recorded_inputs import NotOnRecordError, decoded, event_of
 from harness.checker.reference.state import State
 from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.follower import LOGS, Follower
+from harness.checker.steps.follower import LOGS, StepComparer
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import (
     BlockAddResponse,
@@ -54,7 +54,7 @@ MAX_LOCAL = 4
 
 
 def damage_that_explains(
-    before: Follower, deviation: Deviation, line: Line, following: Sequence[Line], others: OtherRecords
+    before: StepComparer, deviation: Deviation, line: Line, following: Sequence[Line], others: OtherRecords
 ) -> str | None:
     """Return the damage to a trace that explains the difference, such as "a line is missing", or None.
 
@@ -75,7 +75,7 @@ def damage_that_explains(
     return None
 
 
-def _agrees(follower: Follower, lines: Sequence[Line]) -> bool:
+def _agrees(follower: StepComparer, lines: Sequence[Line]) -> bool:
     for number, run in lines:
         follower.follow(number, run)
         if follower.deviations or follower.lost:
@@ -87,7 +87,7 @@ def _agrees(follower: Follower, lines: Sequence[Line]) -> bool:
 
 
 def _is_one_character_off(
-    before: Follower, deviation: Deviation, line: Line, following: Sequence[Line], others: OtherRecords
+    before: StepComparer, deviation: Deviation, line: Line, following: Sequence[Line], others: OtherRecords
 ) -> bool:
     number, run = line
     text = run.to_line()
@@ -98,7 +98,7 @@ def _is_one_character_off(
 
 
 def _as_it_may_have_been(
-    before: Follower, deviation: Deviation, run: HandlerRun, others: OtherRecords
+    before: StepComparer, deviation: Deviation, run: HandlerRun, others: OtherRecords
 ) -> Iterator[HandlerRun]:
     if deviation.expected is not None and deviation.run is run and not _was_received(before, run, others):
         other = copy(deviation.expected)
@@ -130,7 +130,7 @@ def _as_it_may_have_been(
                 yield other
 
 
-def _was_received(before: Follower, run: HandlerRun, others: OtherRecords) -> bool:
+def _was_received(before: StepComparer, run: HandlerRun, others: OtherRecords) -> bool:
     """Return true if another agent received a message exactly as this line shows it. Then the line is not damaged."""
     for sent in run.sent:
         if sent.datagram is not None:
@@ -157,7 +157,7 @@ def _is_malformed(run: HandlerRun) -> bool:
 # A missing line
 
 
-def _damage_to_events(before: Follower, run: HandlerRun) -> str | None:
+def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
     """Compare the events of the completed block with the logged events. Return the damage that explains a difference,
     or None.
     """
@@ -179,7 +179,7 @@ def _damage_to_events(before: Follower, run: HandlerRun) -> str | None:
     return None
 
 
-def _with_a_line_more(before: Follower, run: HandlerRun, others: OtherRecords) -> Iterator[Follower]:
+def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
     """Yield copies of the reference in the states that one lost trace line may have led to."""
     trial = before.copy()
     for _ in range(MAX_LOCAL):

@@ -37,7 +37,7 @@ from harness.field.adapters.adapter import (
 )
 from harness.field.ingest._file_owners import summarise_capture
 from harness.field.ingest._file_search import files_of
-from harness.field.ingest._ingest import Flight, IngestResult, Omission, Remark
+from harness.field.ingest._ingest import FileRemark, Flight, IngestResult, UnusedPart
 from harness.field.ingest._logged_events import SUFFIX as LOGGED_SUFFIX
 from harness.field.ingest._logged_events import EventLine
 from harness.field.ingest._sorting import RecordSorter
@@ -96,7 +96,7 @@ class ImportRemark(BaseModel):
 
     @property
     def sentence(self) -> str:
-        return Remark(Path(self.path), self.why, self.line, self.counts).sentence
+        return FileRemark(Path(self.path), self.why, self.line, self.counts).sentence
 
 
 class ImportRecord(BaseModel):
@@ -146,7 +146,7 @@ def write_import(result: IngestResult, sources: Sequence[Path], out: Path) -> Im
     return record
 
 
-def _remark(remark: Remark) -> ImportRemark:
+def _remark(remark: FileRemark) -> ImportRemark:
     return ImportRemark(path=_printable(remark.path), line=remark.line, counts=remark.counts, why=remark.why)
 
 
@@ -260,7 +260,7 @@ def import_records(
     all files. `report_progress` receives a text at each step. Raises FieldError if a source does not exist or nothing
     is usable, and RunDirectoryError if `out` cannot be written.
     """
-    left_out: list[Omission] = []
+    left_out: list[UnusedPart] = []
     adapters = [*adapters]
     sorter = RecordSorter(left_out)
     streams: dict[Path, _RecordingReader] = {}
@@ -301,7 +301,7 @@ class _RecordingReader:
     It sorts the observations of the adapter by kind.
     """
 
-    def __init__(self, path: Path, adapter: Adapter, scratch: Path, left_out: list[Omission]) -> None:
+    def __init__(self, path: Path, adapter: Adapter, scratch: Path, left_out: list[UnusedPart]) -> None:
         self._path = path
         self._adapter = adapter
         self._scratch = scratch
@@ -311,7 +311,7 @@ class _RecordingReader:
         self._line_counts: Counter[int] = Counter()
         self._earlier_places = 0  # number of places in the earlier files
         self._has_records = False
-        self._listed: list[Omission] = []
+        self._listed: list[UnusedPart] = []
         self._rejected = 0
 
     def read_file(self, path: Path, sorter: RecordSorter) -> None:
@@ -400,12 +400,12 @@ class _RecordingReader:
             self._reject("it contains no records of agents", None)
         self._left_out += self._listed
         if rest := self._rejected - len(self._listed):
-            self._left_out.append(Omission(self._path, f"{rest} more places in it hold no usable record"))
+            self._left_out.append(UnusedPart(self._path, f"{rest} more places in it hold no usable record"))
 
     def _reject(self, why: str, where: int | None) -> None:
         self._rejected += 1
         if len(self._listed) < _MAX_LISTED:
-            self._listed.append(Omission(self._path, why, where, self._adapter.counts))
+            self._listed.append(UnusedPart(self._path, why, where, self._adapter.counts))
 
 
 def _text(text: str | bytes) -> str:

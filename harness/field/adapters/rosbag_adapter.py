@@ -30,7 +30,7 @@ from harness.field.adapters.bags import (
     BagMessage,
     messages,
 )
-from harness.field.adapters.bags._decompression import Damage, message_data
+from harness.field.adapters.bags._decompression import UnreadablePart, message_data
 
 METADATA = "metadata.yaml"
 _METADATA_BEGINS = b"rosbag2_bagfile_information"
@@ -70,7 +70,7 @@ class RosBag(Adapter):
         other_topics: Counter[str] = Counter()
         number = 0
         for message in messages(source):
-            if isinstance(message, Damage):
+            if isinstance(message, UnreadablePart):
                 yield Unusable(message.why, number + 1, of_a_trace=True)
                 continue
             number = message.number

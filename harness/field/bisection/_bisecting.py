@@ -9,7 +9,7 @@ from typing import Any, Literal
 from harness.errors import RunDirectoryError
 from harness.field.bisection._playing import SubjectPlayer, UntestableError
 from harness.field.bisection.outcome import Outcome, differences
-from harness.report.difference import Difference, compare
+from harness.report.difference import RunDifference, compare
 from harness.run.code_state import Commit, GitBisection, RepositoryError, SuspectCommits
 
 
@@ -39,7 +39,7 @@ class BisectionResult:
     tried: list[CommitTrial] = field(default_factory=list)
     changes: list[str] = field(default_factory=list)
     """Differences between the outcome after the change and that of the good commit."""
-    first_difference: Difference | None = None
+    first_difference: RunDifference | None = None
     """The first difference between the two runs, for a scenario in virtual time."""
 
     def to_json(self) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def _try(
     return CommitTrial(commit, "bad", changes[0])
 
 
-def _first_difference(good_run: Path, run: Path) -> Difference | None:
+def _first_difference(good_run: Path, run: Path) -> RunDifference | None:
     try:
         return compare(good_run, run)
     except RunDirectoryError:  # One of the runs crashed and is incomplete.

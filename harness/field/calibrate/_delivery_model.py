@@ -85,7 +85,7 @@ class DeliveryModel:
         return math.exp(2 * _NORMAL.inv_cdf(0.9) * self.spread)
 
 
-class Interval(NamedTuple):
+class ConfidenceInterval(NamedTuple):
     """A confidence interval with the confidence level `LEVEL`."""
 
     low: float
@@ -100,7 +100,7 @@ class FittedModel:
     """A fitted model. `intervals` contains a confidence interval for each fitted parameter, by name."""
 
     model: DeliveryModel
-    intervals: dict[str, Interval]
+    intervals: dict[str, ConfidenceInterval]
     attempts: int
     clusters: int
     log_likelihood: float
@@ -307,13 +307,13 @@ def _intervals(
     free: Sequence[int],
     scales: Mapping[int, tuple[float, float]],
     freedom: Mapping[int, float],
-) -> dict[str, Interval]:
+) -> dict[str, ConfidenceInterval]:
     intervals = {}
     for parameter in free:
         if parameter < 2:
             half = student(freedom.get(parameter, 3.0)) * scales.get(parameter, (10.0, 10.0))[0]
             half = min(half, 20.0)
-            intervals[PARAMETERS[parameter]] = Interval(
+            intervals[PARAMETERS[parameter]] = ConfidenceInterval(
                 math.exp(values[parameter] - half), math.exp(values[parameter] + half)
             )
             continue
@@ -322,7 +322,9 @@ def _intervals(
         most = 0.5 * quantile * quantile * max([1.0, *ratios])
         low, high = _profile(rows, values, likelihood - most, free, parameter)
         intervals[PARAMETERS[parameter]] = (
-            Interval(1 - math.exp(-low), 1 - math.exp(-high)) if parameter == 2 else Interval(low, high)
+            ConfidenceInterval(1 - math.exp(-low), 1 - math.exp(-high))
+            if parameter == 2
+            else ConfidenceInterval(low, high)
         )
     return intervals
 
@@ -366,17 +368,17 @@ def student(freedom: float) -> float:
     )
 
 
-def wilson(delivered: float, attempts: float) -> Interval:
+def wilson(delivered: float, attempts: float) -> ConfidenceInterval:
     """Return the confidence interval of a share of independent draws (Wilson, JASA 22, 1927). Without draws, it is 0 to
     1.
     """
     if not attempts:
-        return Interval(0.0, 1.0)
+        return ConfidenceInterval(0.0, 1.0)
     z = _NORMAL.inv_cdf(0.5 + LEVEL / 2)
     share, extra = delivered / attempts, z * z / attempts
     middle = (share + extra / 2) / (1 + extra)
     half = z * math.sqrt(share * (1 - share) / attempts + extra / (4 * attempts)) / (1 + extra)
-    return Interval(max(0.0, middle - half), min(1.0, middle + half))
+    return ConfidenceInterval(max(0.0, middle - half), min(1.0, middle + half))
 
 
 def _constant_likelihood(delivered: int, attempts: int) -> float:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from harness.field.calibrate._delivery_model import Interval, student
+from harness.field.calibrate._delivery_model import ConfidenceInterval, student
 from harness.field.calibrate._positions import Positions
 
 _COUNTS_PER_DB = 1.9
@@ -27,7 +27,7 @@ class SignalFit:
     """The estimated path loss exponent with its confidence interval, from `samples` signal strengths."""
 
     exponent: float
-    interval: Interval
+    interval: ConfidenceInterval
     samples: int
 
 
@@ -45,7 +45,7 @@ def fit_signal(positions: Positions) -> SignalFit | None:
     half = student(len(minutes) - 1) * math.sqrt(variance)
     if not _PLAUSIBLE[0] <= slope <= _PLAUSIBLE[1]:
         return None
-    return SignalFit(slope, Interval(slope - half, slope + half), len(samples))
+    return SignalFit(slope, ConfidenceInterval(slope - half, slope + half), len(samples))
 
 
 def _samples(positions: Positions, number: int) -> list[Sample]:

@@ -11,9 +11,9 @@ from typing import Any
 from harness.errors import FieldError
 from harness.field.calibrate._attempts import observe, pairs_of
 from harness.field.calibrate._delivery_model import (
+    ConfidenceInterval,
     DeliveryModel,
     FittedModel,
-    Interval,
     TransmissionAttempt,
     fit,
     wilson,
@@ -65,7 +65,7 @@ class DeliveryShare:
     attempts: int
     delivered: int
     mean_distance_m: float
-    interval: Interval
+    interval: ConfidenceInterval
 
     @property
     def delivery(self) -> float:
@@ -218,7 +218,7 @@ def _share_json(share: DeliveryShare) -> dict[str, Any]:
     }
 
 
-def _between(interval: Interval, form: str) -> str:
+def _between(interval: ConfidenceInterval, form: str) -> str:
     return f"95 %: {interval.low:{form}} to {interval.high:{form}}"
 
 

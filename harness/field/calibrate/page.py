@@ -15,7 +15,7 @@ from harness.present import svg
 from harness.present.colours import inks
 from harness.present.svg import FONT, Axis, n
 from harness.report import html, map_svg
-from harness.report.map_parts import Projection, extent, thin
+from harness.report.map_parts import MapProjection, extent, thin
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 _BINS_PER_FOLD = 4
@@ -157,7 +157,7 @@ def _map(calibration: Calibration) -> Markup:
     """Draw the paths of the vehicles, and a dot for each lost message."""
     tracks = calibration.positions.tracks
     ink = inks(calibration.roster)
-    projection = Projection(extent([fix for track in tracks.values() for fix in track]), 62, 14, 800, 460)
+    projection = MapProjection(extent([fix for track in tracks.values() for fix in track]), 62, 14, 800, 460)
     lines = thin([[projection(fix) for fix in track] for track in tracks.values()], _MAX_MAP_POINTS)
     paths = []
     for vehicle, line in zip(tracks, lines, strict=True):

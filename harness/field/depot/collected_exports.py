@@ -37,7 +37,7 @@ from harness.errors import ExportError
 from harness.field.depot.mission_comparison import INCEPTION, ROSTER, ComparedFile, UnreadableFileError
 from harness.field.depot.mission_comparison import read as read_compared_file
 from harness.field.flight_logs import FlightLog, flight_log_kind, read_flight_log
-from harness.field.ingest import Omission
+from harness.field.ingest import UnusedPart
 from harness.field.ingest._file_search import files_of
 from harness.gc_pause import gc_paused
 from harness.report.logbook.book import logged_telemetry
@@ -134,7 +134,7 @@ def collect_exports(paths: Iterable[Path], keys: "PublicKeys | None" = None) -> 
     Raises FieldError if a path does not exist, and ExportError if no export is usable.
     """
     reader, read_exports, left_out = _Reader(), list[ReadExport](), list[str]()
-    skipped, context_files, flight_logs = list[Omission](), list[ComparedFile](), list[FlightLog]()
+    skipped, context_files, flight_logs = list[UnusedPart](), list[ComparedFile](), list[FlightLog]()
     paths = list(paths)
     for path in files_of(paths, skipped):
         if _is_flight_log(path):

@@ -20,7 +20,7 @@ sentence for each problem.
 
 from harness.field.flight_logs._reading import flight_log_kind, read_flight_log
 from harness.field.flight_logs._records import (
-    Arming,
+    ArmingChange,
     Battery,
     ClockJump,
     EkfStatus,
@@ -36,7 +36,7 @@ from harness.field.flight_logs._records import (
 )
 
 __all__ = [
-    "Arming",
+    "ArmingChange",
     "Battery",
     "ClockJump",
     "EkfStatus",

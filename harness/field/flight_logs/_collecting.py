@@ -70,7 +70,7 @@ class Budget:
         return self.left >= 0
 
 
-class Collector:
+class RecordCollector:
     """A collector for the records of one source, such as a vehicle."""
 
     def __init__(self, budget: Budget) -> None:

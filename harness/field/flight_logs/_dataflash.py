@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO, NamedTuple
 
 from harness.field.flight_logs import _gps_time
-from harness.field.flight_logs._collecting import Budget, Collector, LogClock
-from harness.field.flight_logs._limits import Damage, is_place
+from harness.field.flight_logs._collecting import Budget, LogClock, RecordCollector
+from harness.field.flight_logs._limits import DamagedBytes, is_place
 from harness.field.flight_logs._records import (
-    Arming,
+    ArmingChange,
     Battery,
     EkfStatus,
     GpsStatus,
@@ -79,11 +79,11 @@ class DataFlashReader:
     def __init__(self) -> None:
         budget = Budget()
         self.budget = budget
-        self.vehicle = Collector(budget)
-        self.gps_positions = Collector(budget)
+        self.vehicle = RecordCollector(budget)
+        self.gps_positions = RecordCollector(budget)
         """Positions of the GPS receiver, for logs without estimated positions."""
         self.clock = LogClock()
-        self.damage = Damage()
+        self.damage = DamagedBytes()
         self.vehicle_id: int | None = None
         self.mav_type: int | None = None
         self.problems: list[str] = []
@@ -202,12 +202,12 @@ class DataFlashReader:
 
     def _arm(self, at_us: int, values: Values) -> None:
         armed = bool(values["ArmState"])
-        self.vehicle.add_change(Arming(at_us, None, armed), armed)
+        self.vehicle.add_change(ArmingChange(at_us, None, armed), armed)
 
     def _event(self, at_us: int, values: Values) -> None:
         if values["Id"] in (_EVENT_ARMED, _EVENT_DISARMED):
             armed = values["Id"] == _EVENT_ARMED
-            self.vehicle.add_change(Arming(at_us, None, armed), armed)
+            self.vehicle.add_change(ArmingChange(at_us, None, armed), armed)
 
     def _battery(self, at_us: int, values: Values) -> None:
         instance = values["Inst"] if "Inst" in values else values.get("Instance", 0)

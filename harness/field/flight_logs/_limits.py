@@ -10,7 +10,7 @@ _ALTITUDES_M = (-1000.0, 100_000.0)
 
 
 @dataclass
-class Damage:
+class DamagedBytes:
     """The bytes of a flight log that do not belong to a message."""
 
     searches: int = 0

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 from harness.archive.bounded_file import BoundedFile
 from harness.errors import FieldError
-from harness.field.flight_logs._collecting import MAX_RECORDS, Budget, Collector, LogClock
+from harness.field.flight_logs._collecting import MAX_RECORDS, Budget, LogClock, RecordCollector
 from harness.field.flight_logs._dataflash import FMT, MAGIC, DataFlashReader
 from harness.field.flight_logs._records import (
-    Arming,
+    ArmingChange,
     Battery,
     EkfStatus,
     FlightLog,
@@ -25,7 +25,7 @@ from harness.gc_pause import gc_paused
 from ucp.telemetry import mode_name
 
 if TYPE_CHECKING:
-    from harness.field.flight_logs._limits import Damage
+    from harness.field.flight_logs._limits import DamagedBytes
 
 MAX_LOG_BYTES = 1024 * 1024 * 1024
 _BEGINNING_BYTES = 4096
@@ -99,7 +99,7 @@ def _telemetry(path: Path, file: BoundedFile) -> FlightLog:
     return FlightLog(path, "telemetry", vehicles, reader.radio.records_of(RadioStatus), reader.clock.jumps, problems)
 
 
-def _vehicle_log(collector: Collector, vehicle: int | None, mav_type: int | None) -> VehicleLog:
+def _vehicle_log(collector: RecordCollector, vehicle: int | None, mav_type: int | None) -> VehicleLog:
     modes = [
         change._replace(name=mode_name(change.number, mav_type or 0)) for change in collector.records_of(ModeChange)
     ]
@@ -108,7 +108,7 @@ def _vehicle_log(collector: Collector, vehicle: int | None, mav_type: int | None
         mav_type=mav_type,
         positions=collector.records_of(Position),
         modes=modes,
-        arming=collector.records_of(Arming),
+        arming=collector.records_of(ArmingChange),
         battery=collector.records_of(Battery),
         gps=collector.records_of(GpsStatus),
         ekf=collector.records_of(EkfStatus),
@@ -117,7 +117,7 @@ def _vehicle_log(collector: Collector, vehicle: int | None, mav_type: int | None
     )
 
 
-def _problems(problems: list[str], damage: "Damage", clock: LogClock, budget: Budget) -> list[str]:
+def _problems(problems: list[str], damage: "DamagedBytes", clock: LogClock, budget: Budget) -> list[str]:
     sentences = [*problems, *damage.sentences()]
     if budget.left < 0:
         sentences.append(f"only the first {MAX_RECORDS:,} records are kept")

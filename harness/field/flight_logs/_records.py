@@ -32,7 +32,7 @@ class ModeChange(NamedTuple):
     """The failsafe that changed the mode, such as "battery failsafe". Only DataFlash logs have it."""
 
 
-class Arming(NamedTuple):
+class ArmingChange(NamedTuple):
     """The arming or disarming of the vehicle, or its state at the beginning of the log."""
 
     at_us: int
@@ -129,7 +129,7 @@ class ClockJump(NamedTuple):
 
 
 FlightRecord: TypeAlias = (
-    Position | ModeChange | Arming | Battery | GpsStatus | EkfStatus | GpsTime | RadioStatus | Parameter
+    Position | ModeChange | ArmingChange | Battery | GpsStatus | EkfStatus | GpsTime | RadioStatus | Parameter
 )
 
 
@@ -143,7 +143,7 @@ class VehicleLog:
     """MAV_TYPE: 1 plane, 2 quadcopter, 10 rover. A DataFlash log gives 2 for every kind of copter."""
     positions: list[Position]
     modes: list[ModeChange]
-    arming: list[Arming]
+    arming: list[ArmingChange]
     battery: list[Battery]
     gps: list[GpsStatus]
     ekf: list[EkfStatus]

@@ -14,10 +14,10 @@ from typing import Any, BinaryIO
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from harness.field.flight_logs import _gps_time
-from harness.field.flight_logs._collecting import Budget, Collector, LogClock
-from harness.field.flight_logs._limits import Damage, is_place
+from harness.field.flight_logs._collecting import Budget, LogClock, RecordCollector
+from harness.field.flight_logs._limits import DamagedBytes, is_place
 from harness.field.flight_logs._records import (
-    Arming,
+    ArmingChange,
     Battery,
     EkfStatus,
     GpsStatus,
@@ -44,7 +44,7 @@ class SystemLog:
     """The records of one sender (MAVLink system) in a telemetry log."""
 
     def __init__(self, budget: Budget) -> None:
-        self.collector = Collector(budget)
+        self.collector = RecordCollector(budget)
         self.mav_type: int | None = None
         self.is_vehicle = False
 
@@ -55,9 +55,9 @@ class TelemetryReader:
     def __init__(self) -> None:
         self.budget = Budget()
         self.systems: dict[int, SystemLog] = {}
-        self.radio = Collector(self.budget)
+        self.radio = RecordCollector(self.budget)
         self.clock = LogClock()
-        self.damage = Damage()
+        self.damage = DamagedBytes()
         self.problems: list[str] = []
         self._jumps = 0
 
@@ -135,7 +135,7 @@ class TelemetryReader:
         system.is_vehicle, system.mav_type = True, values["type"]
         mode, armed = values["custom_mode"], bool(values["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         system.collector.add_change(ModeChange(at_us, None, mode, str(mode)), mode)
-        system.collector.add_change(Arming(at_us, None, armed), armed)
+        system.collector.add_change(ArmingChange(at_us, None, armed), armed)
 
     def _system_status(self, system: SystemLog, at_us: int, values: Values) -> None:
         voltage_mv, current_ca, remaining = (

@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 
 from harness.field.ingest._file_search import is_incarnation_copy
-from harness.field.ingest._ingest import Omission
+from harness.field.ingest._ingest import UnusedPart
 from harness.field.ingest._trace_incarnations import TraceIncarnation, jumps_in
 from ucp.trace import HandlerRun
 
 
 def split_into_flights(
-    incarnations: list[TraceIncarnation], left_out: list[Omission]
+    incarnations: list[TraceIncarnation], left_out: list[UnusedPart]
 ) -> Iterator[list[TraceIncarnation]]:
     """Yield groups of traces of one agent with the same header. Each group belongs to one flight.
 
@@ -25,7 +25,7 @@ def split_into_flights(
                 (incarnation.runs or incarnation.path != other_copy.path) and not is_incarnation_copy(incarnation.path)
             ):
                 left_out.append(
-                    Omission(
+                    UnusedPart(
                         incarnation.path,
                         _describe_copy(incarnation, other_copy, added_runs),
                         incarnation.first_line,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from harness.archive.exports import ExportedBlock
 from harness.archive.packets.capture_reader import Capture, Datagram
-from harness.field.ingest._ingest import Flight, Omission
+from harness.field.ingest._ingest import Flight, UnusedPart
 from ucp.block import Block
 
 if TYPE_CHECKING:
@@ -33,17 +33,17 @@ class CaptureSummary:
     """The original file. It differs from `path` if an import made the capture."""
 
 
-def summarise_capture(path: Path, left_out: list[Omission], opener: "Opener | None" = None) -> CaptureSummary | None:
+def summarise_capture(path: Path, left_out: list[UnusedPart], opener: "Opener | None" = None) -> CaptureSummary | None:
     """Read the beginning of a capture. Return None if it contains no UCP datagram. `opener` decrypts secured datagrams.
 
     Raises CaptureError if the file cannot be read.
     """
     capture, datagrams = Capture(0, path), dict[bytes, Datagram]()
     capture.read(datagrams, MAX_FRAMES_READ, opener=opener)
-    left_out += [Omission(path, problem.removeprefix(f"{path}: ")) for problem in capture.problems]
+    left_out += [UnusedPart(path, problem.removeprefix(f"{path}: ")) for problem in capture.problems]
     if not datagrams:
         what = "no frame" if not capture.frames else f"none of its first {capture.frames} frames is a UCP datagram"
-        left_out.append(Omission(path, f"a capture, but it has {what}" if not capture.frames else what))
+        left_out.append(UnusedPart(path, f"a capture, but it has {what}" if not capture.frames else what))
         return None
     mentioned = (name for each in datagrams.values() for name in (each.summary.block_hash, each.summary.chain_hash))
     hashes = frozenset(name.hex() for name in mentioned if name is not None)
@@ -54,7 +54,7 @@ PUBLIC_SCHEMA = '"ucp-keys/1"'
 """A text that each file of public keys contains."""
 
 
-def read_public_keys(path: Path, left_out: list[Omission]) -> "PublicKeys | None":
+def read_public_keys(path: Path, left_out: list[UnusedPart]) -> "PublicKeys | None":
     """Return the public keys in a file, or None if they cannot be used. Then `left_out` has the reason. Raises
     OSError.
     """
@@ -62,17 +62,17 @@ def read_public_keys(path: Path, left_out: list[Omission]) -> "PublicKeys | None
         from ucp.secure.bundle import load_public
         from ucp.secure.keyfile import KeyFileError
     except ModuleNotFoundError:
-        left_out.append(Omission(path, "public keys, which need the package cryptography (extra `secure`)"))
+        left_out.append(UnusedPart(path, "public keys, which need the package cryptography (extra `secure`)"))
         return None
     try:
         return load_public(path)
     except KeyFileError as error:
-        left_out.append(Omission(path, f"public keys, but {str(error).removeprefix(f'{path}: ')}"))
+        left_out.append(UnusedPart(path, f"public keys, but {str(error).removeprefix(f'{path}: ')}"))
         return None
 
 
 def assign_keys(
-    flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys"]], left_out: list[Omission]
+    flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys"]], left_out: list[UnusedPart]
 ) -> None:
     """Assign to each flight the public keys with which a signature in its exports is valid.
 
@@ -87,7 +87,7 @@ def assign_keys(
                 unused.pop(path, None)
                 break
     if any(signed.values()):
-        left_out += [Omission(path, "public keys of another mission, which sign no block here") for path in unused]
+        left_out += [UnusedPart(path, "public keys of another mission, which sign no block here") for path in unused]
 
 
 def _signed(flight: Flight) -> Iterator[ExportedBlock]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE
 from harness.errors import FieldError
-from harness.field.ingest._ingest import Omission
+from harness.field.ingest._ingest import UnusedPart
 
 _IMPORT_FILE = "import.json"
 MAX_FILES = 10_000
@@ -27,7 +27,7 @@ _OTHER_RUN_FILES = re.compile(r"(\d+|capture|lab|rogue)\.(log|mission\.json|cont
 _INCARNATION_DIRECTORY = re.compile(r"\d+-\d+")
 
 
-def files_of(paths: Iterable[Path], left_out: list[Omission]) -> list[Path]:
+def files_of(paths: Iterable[Path], left_out: list[UnusedPart]) -> list[Path]:
     """Return the regular files in `paths`, each once. Raises FieldError if a path does not exist."""
     files: dict[Path, Path] = {}
     by_size: dict[int, list[Path]] = {}
@@ -37,7 +37,7 @@ def files_of(paths: Iterable[Path], left_out: list[Omission]) -> list[Path]:
         for file in _walk(path, left_out, named=True):
             if len(files) == MAX_FILES:
                 left_out.append(
-                    Omission(file, f"it and all later files are not read, because at most {MAX_FILES} files are read")
+                    UnusedPart(file, f"it and all later files are not read, because at most {MAX_FILES} files are read")
                 )
                 return [*files.values()]
             try:
@@ -50,12 +50,12 @@ def files_of(paths: Iterable[Path], left_out: list[Omission]) -> list[Path]:
                 equal_file = next(equal_files, None)
             except (OSError, RuntimeError) as error:
                 why = getattr(error, "strerror", None) or "its links form a loop"
-                left_out.append(Omission(file, f"it cannot be read: {why}"))
+                left_out.append(UnusedPart(file, f"it cannot be read: {why}"))
                 continue
             if equal_file is not None and is_incarnation_copy(file):
                 continue
             if equal_file is not None:
-                left_out.append(Omission(file, f"its content equals {equal_file}"))
+                left_out.append(UnusedPart(file, f"its content equals {equal_file}"))
                 continue
             files[real] = file
             by_size.setdefault(size, []).append(file)
@@ -71,7 +71,7 @@ def is_incarnation_copy(path: Path) -> bool:
 
 
 def _walk(
-    path: Path, left_out: list[Omission], *, named: bool = False, depth: int = 0, in_run: bool = False
+    path: Path, left_out: list[UnusedPart], *, named: bool = False, depth: int = 0, in_run: bool = False
 ) -> Iterator[Path]:
     """Yield the files in a path.
 
@@ -79,10 +79,10 @@ def _walk(
     """
     try:
         if path.is_symlink() and not named:
-            left_out.append(Omission(path, "it is a link; name its target if the target belongs to the flight"))
+            left_out.append(UnusedPart(path, "it is a link; name its target if the target belongs to the flight"))
         elif path.is_dir():
             if depth > MAX_DEPTH:
-                left_out.append(Omission(path, f"it is below more than {MAX_DEPTH} directories"))
+                left_out.append(UnusedPart(path, f"it is below more than {MAX_DEPTH} directories"))
                 return
             in_run = in_run or (path / RUN_FILE).is_file()
             ignored = _HARNESS_FILES if in_run else {_IMPORT_FILE}
@@ -92,9 +92,11 @@ def _walk(
         elif path.is_file():
             yield path
         else:
-            left_out.append(Omission(path, "it is not a regular file, but a FIFO, a socket, a device or a broken link"))
+            left_out.append(
+                UnusedPart(path, "it is not a regular file, but a FIFO, a socket, a device or a broken link")
+            )
     except OSError as error:
-        left_out.append(Omission(path, f"it cannot be read: {error.strerror}"))
+        left_out.append(UnusedPart(path, f"it cannot be read: {error.strerror}"))
 
 
 def _files_first(path: Path) -> tuple[bool, int, str]:

@@ -6,18 +6,18 @@ from collections.abc import Iterable, Sequence
 from harness.field.flight_logs import FlightLog
 from harness.field.flight_logs._matching import match_logs
 from harness.field.flight_logs._summary import in_words
-from harness.field.ingest._ingest import Flight, Omission, Remark
+from harness.field.ingest._ingest import FileRemark, Flight, UnusedPart
 from ucp.events import MalformedEventsError, decode_events
 from ucp.telemetry import Position, position_of
 
 
 def assign_flight_logs(
-    flights: Sequence[Flight], logs: Iterable[FlightLog], left_out: list[Omission], remarks: list[Remark]
+    flights: Sequence[Flight], logs: Iterable[FlightLog], left_out: list[UnusedPart], remarks: list[FileRemark]
 ) -> None:
     """Assign each log to the first flight with an agent of its vehicle. Logs of other vehicles are left out."""
     fixes = [_logged_positions(flight) for flight in flights] if logs else []
     for log in logs:
-        remarks += [Remark(log.path, problem) for problem in log.problems]
+        remarks += [FileRemark(log.path, problem) for problem in log.problems]
         unmatched = []
         for number in range(len(log.vehicles)):
             why = ""
@@ -25,14 +25,14 @@ def assign_flight_logs(
                 match = match_logs([log], positions)[number]
                 if match.agent_id is not None:
                     flight.flight_logs.append(match)
-                    remarks.append(Remark(log.path, in_words(match).removeprefix(f"{log.path}: ")))
+                    remarks.append(FileRemark(log.path, in_words(match).removeprefix(f"{log.path}: ")))
                     break
                 why = why or in_words(match).removeprefix(f"{log.path}: ")
             else:
                 unmatched.append(why)
-        left_out += [Omission(log.path, why or "a flight log without a flight of agents") for why in unmatched]
+        left_out += [UnusedPart(log.path, why or "a flight log without a flight of agents") for why in unmatched]
         if not log.vehicles:
-            left_out.append(Omission(log.path, f"a {log.kind} log without a vehicle"))
+            left_out.append(UnusedPart(log.path, f"a {log.kind} log without a vehicle"))
 
 
 def _logged_positions(flight: Flight) -> dict[int, list[tuple[int, Position]]]:

@@ -19,7 +19,7 @@ from harness.archive.exports import Export
 from harness.archive.traces import Header, Trace
 from harness.field.ingest._copies import split_into_flights
 from harness.field.ingest._file_owners import CaptureSummary
-from harness.field.ingest._ingest import Flight, Omission, Remark
+from harness.field.ingest._ingest import FileRemark, Flight, UnusedPart
 from harness.field.ingest._trace_incarnations import TraceIncarnation
 from ucp.block import InceptionBlock
 from ucp.events import LoggableEvent
@@ -78,8 +78,8 @@ def group_by_flight(
     exports: Iterable[tuple[Path, Export]],
     captures: Iterable[CaptureSummary],
     logged: Iterable[tuple[Path, int, LoggableEvent]],
-    left_out: list[Omission],
-    remarks: list[Remark],
+    left_out: list[UnusedPart],
+    remarks: list[FileRemark],
 ) -> list[Flight]:
     """Return the flights. The one with the most records is first."""
     groups, without_header = _by_mission(incarnations, left_out)
@@ -99,7 +99,7 @@ def group_by_flight(
 
 
 def _by_mission(
-    incarnations: Iterable[TraceIncarnation], left_out: list[Omission]
+    incarnations: Iterable[TraceIncarnation], left_out: list[UnusedPart]
 ) -> tuple[list[_FlightRecords], list[TraceIncarnation]]:
     """Return the records of each mission with the same start time, and the traces without a header."""
     by_header: dict[tuple[_Mission, int], list[TraceIncarnation]] = defaultdict(list)
@@ -117,7 +117,7 @@ def _by_mission(
             without_header.append(incarnation)
         elif incarnation.header.agent_id not in incarnation.header.roster:
             why = f"agent {incarnation.header.agent_id} is not on the roster in its own trace"
-            left_out.append(Omission(incarnation.path, why, incarnation.first_line, incarnation.counts))
+            left_out.append(UnusedPart(incarnation.path, why, incarnation.first_line, incarnation.counts))
         else:
             by_header[_mission_of(incarnation.header), incarnation.header.agent_id].append(incarnation)
         last = incarnation
@@ -212,14 +212,14 @@ def _hashes_of(incarnation: TraceIncarnation) -> set[str]:
 
 
 def _add_without_header(
-    groups: list[_FlightRecords], incarnation: TraceIncarnation, left_out: list[Omission], remarks: list[Remark]
+    groups: list[_FlightRecords], incarnation: TraceIncarnation, left_out: list[UnusedPart], remarks: list[FileRemark]
 ) -> None:
     """Add a trace without a header to the flight with which it shares the most hashes, and give it that flight's
     header.
     """
     agent_id, hashes = incarnation.agent_id, _hashes_of(incarnation)
     if agent_id is None or not incarnation.runs:
-        left_out.append(Omission(incarnation.path, "its header is lost, so its agent is unknown"))
+        left_out.append(UnusedPart(incarnation.path, "its header is lost, so its agent is unknown"))
         return
     candidates = [records for records in groups if agent_id in records.mission.roster and records.incarnations]
     best = max(
@@ -229,7 +229,7 @@ def _add_without_header(
     )
     if best is None or not (best.hashes & hashes or incarnation.path.parent in best.directories):
         why = f"its header is lost, and no other trace belongs to a mission of agent {agent_id}"
-        left_out.append(Omission(incarnation.path, why))
+        left_out.append(UnusedPart(incarnation.path, why))
         return
     own_incarnations = best.incarnations.get(agent_id, [])
     header_owner = next(iter(own_incarnations or next(iter(best.incarnations.values()))))
@@ -245,7 +245,7 @@ def _add_without_header(
             "another of its files" if own_incarnations else f"the trace of agent {header_owner.header.agent_id}"
         )
         remarks.append(
-            Remark(
+            FileRemark(
                 incarnation.path,
                 f"its header is lost; it is read as a trace of agent {agent_id}, with the header of {header_source}",
             )
@@ -276,7 +276,7 @@ def _drift(incarnation: TraceIncarnation) -> float:
 # Exports and captures
 
 
-def _add_export(groups: list[_FlightRecords], path: Path, export: Export, left_out: list[Omission]) -> None:
+def _add_export(groups: list[_FlightRecords], path: Path, export: Export, left_out: list[UnusedPart]) -> None:
     agent_id, inception = export.agent_id, export.inception
     hashes = {block.block_hash for block in export.blocks()} | {*export.completed}
     of_mission = [
@@ -287,7 +287,7 @@ def _add_export(groups: list[_FlightRecords], path: Path, export: Export, left_o
     ]
     candidates = [each for each in of_mission if not each.mission.roster or agent_id in each.mission.roster]
     if of_mission and not candidates:
-        left_out.append(Omission(path, f"agent {agent_id} is not on the roster of its mission"))
+        left_out.append(UnusedPart(path, f"agent {agent_id} is not on the roster of its mission"))
         return
     best = max(
         candidates,
@@ -312,11 +312,11 @@ def _add_export(groups: list[_FlightRecords], path: Path, export: Export, left_o
         best.exports[agent_id] = path, export
         return
     if other[1] == export:
-        left_out.append(Omission(path, f"it is the same export as {other[0]}"))
+        left_out.append(UnusedPart(path, f"it is the same export as {other[0]}"))
         return
     earlier, later = sorted((other, (path, export)), key=lambda each: each[1].exported_at_us)
     best.exports[agent_id] = later
-    left_out.append(Omission(earlier[0], f"agent {agent_id} exported its chain again, later: {later[0]} is used"))
+    left_out.append(UnusedPart(earlier[0], f"agent {agent_id} exported its chain again, later: {later[0]} is used"))
 
 
 def _inception(records: _FlightRecords) -> str:
@@ -383,7 +383,7 @@ def _add_logged(groups: list[_FlightRecords], path: Path, agent_id: int, event: 
 # Results
 
 
-def _flight(records: _FlightRecords, remarks: list[Remark]) -> Flight:
+def _flight(records: _FlightRecords, remarks: list[FileRemark]) -> Flight:
     traces = {agent_id: _trace(incarnations) for agent_id, incarnations in sorted(records.incarnations.items())}
     for agent_id, trace in traces.items():
         remarks += _clock_remarks(agent_id, records.incarnations[agent_id], trace)
@@ -422,12 +422,12 @@ def _trace(incarnations: list[TraceIncarnation]) -> Trace:
     return trace
 
 
-def _clock_remarks(agent_id: int, incarnations: list[TraceIncarnation], trace: Trace) -> Iterator[Remark]:
+def _clock_remarks(agent_id: int, incarnations: list[TraceIncarnation], trace: Trace) -> Iterator[FileRemark]:
     jumps = [(incarnation, position) for incarnation in incarnations for position in incarnation.jumps]
     for incarnation, position in jumps[:1]:
         before, after = incarnation.runs[position - 1].t, incarnation.runs[position].t
         more = f", and {len(jumps) - 1} more times" if len(jumps) > 1 else ""
-        yield Remark(
+        yield FileRemark(
             incarnation.path,
             f"the clock of agent {agent_id} jumps from {before:.3f} s to {after:.3f} s here{more}",
             incarnation.run_lines[position],

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Remark:
+class FileRemark:
     """A remark on a file or one of its lines. `why` completes a sentence, as in "it is not of this mission"."""
 
     path: Path
@@ -33,7 +33,7 @@ class Remark:
 
 
 @dataclass(frozen=True)
-class Omission(Remark):
+class UnusedPart(FileRemark):
     """A file, or a part of a file, that is not used, with the reason."""
 
 
@@ -80,8 +80,8 @@ class IngestResult:
     """
 
     flights: list[Flight]
-    left_out: list[Omission]
-    remarks: list[Remark] = field(default_factory=list)
+    left_out: list[UnusedPart]
+    remarks: list[FileRemark] = field(default_factory=list)
 
     def largest(self) -> Flight:
         """Return the flight with the most records. Raises FieldError if no file is usable."""

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from harness.archive.bounded_file import BoundedFile
 from harness.archive.exports import AgentId, Base64
 from harness.archive.traces import MAX_LINE_BYTES, MAX_LINE_WEIGHT
-from harness.field.ingest._ingest import Omission
+from harness.field.ingest._ingest import UnusedPart
 from ucp.events import LoggableEvent
 from ucp.plain_file import check_weight
 
@@ -45,7 +45,7 @@ class EventLine(BaseModel):
         return self.model_dump_json(by_alias=True) + "\n"
 
 
-def read_logged(path: Path, left_out: list[Omission]) -> list[tuple[int, LoggableEvent]]:
+def read_logged(path: Path, left_out: list[UnusedPart]) -> list[tuple[int, LoggableEvent]]:
     """Return the events in a file, each with its agent. The list is empty for another format. Raises OSError."""
     events: list[tuple[int, LoggableEvent]] = []
     damaged: list[int] = []
@@ -62,8 +62,8 @@ def read_logged(path: Path, left_out: list[Omission]) -> list[tuple[int, Loggabl
             except ValueError:
                 damaged.append(number)
         if file.problem:
-            left_out.append(Omission(path, file.problem))
+            left_out.append(UnusedPart(path, file.problem))
     if damaged:
         more = f", and {len(damaged) - 1} more lines are" if len(damaged) > 1 else ""
-        left_out.append(Omission(path, f"it is damaged{more}", damaged[0]))
+        left_out.append(UnusedPart(path, f"it is damaged{more}", damaged[0]))
     return events

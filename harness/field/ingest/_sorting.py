@@ -19,7 +19,7 @@ from harness.field.ingest._file_owners import (
 from harness.field.ingest._file_search import files_of
 from harness.field.ingest._flight_logs import assign_flight_logs
 from harness.field.ingest._flights import group_by_flight
-from harness.field.ingest._ingest import IngestResult, Omission, Remark
+from harness.field.ingest._ingest import FileRemark, IngestResult, UnusedPart
 from harness.field.ingest._logged_events import read_logged
 from harness.field.ingest._trace_incarnations import TraceIncarnation, read_incarnations
 from harness.gc_pause import gc_paused
@@ -47,7 +47,7 @@ def ingest_files(paths: Iterable[Path], opener: "Opener | None" = None) -> Inges
     `opener` decrypts captures of a secured mission. Raises FieldError if a path does not exist. Every other problem is
     reported in `left_out` of the result.
     """
-    left_out: list[Omission] = []
+    left_out: list[UnusedPart] = []
     sorter = RecordSorter(left_out, opener)
     for path in files_of(paths, left_out):
         sorter.add_file(path)
@@ -60,7 +60,7 @@ class RecordSorter:
     It reads files of the harness, and accepts the records that adapters read from other files.
     """
 
-    def __init__(self, left_out: list[Omission], opener: "Opener | None" = None) -> None:
+    def __init__(self, left_out: list[UnusedPart], opener: "Opener | None" = None) -> None:
         self._opener = opener
         self.incarnations: list[TraceIncarnation] = []
         self.exports: list[tuple[Path, Export]] = []
@@ -72,7 +72,7 @@ class RecordSorter:
 
     def result(self) -> IngestResult:
         """Return the flights in all files so far."""
-        remarks: list[Remark] = []
+        remarks: list[FileRemark] = []
         flights = group_by_flight(self.incarnations, self.exports, self.captures, self.logged, self._left_out, remarks)
         assign_flight_logs(flights, self.flight_logs, self._left_out, remarks)
         assign_keys(flights, self._public_keys, self._left_out)
@@ -132,7 +132,7 @@ class RecordSorter:
             self._omit(path, what + str(json_error(path, error)).removeprefix(f"{path}: "), line, counts)
 
     def _omit(self, path: Path, why: str, line: int | None = None, counts: str = "line") -> None:
-        self._left_out.append(Omission(path, why, line, counts))
+        self._left_out.append(UnusedPart(path, why, line, counts))
 
 
 def _documents(text: str) -> Iterator[Any]:
@@ -159,9 +159,9 @@ def _describe_content(data: bytes) -> str:
     return f"it is not a trace, chain export or capture: {content} without UCP records"
 
 
-def _summarise(left_out: list[Omission]) -> Iterator[Omission]:
+def _summarise(left_out: list[UnusedPart]) -> Iterator[UnusedPart]:
     """Yield the omitted files. Many files of one directory with the same reason are combined."""
-    alike: dict[tuple[Path, str], list[Omission]] = {}
+    alike: dict[tuple[Path, str], list[UnusedPart]] = {}
     for each in left_out:
         alike.setdefault((each.path.parent, each.why) if each.line is None else (each.path, str(each.line)), []).append(
             each
@@ -170,6 +170,6 @@ def _summarise(left_out: list[Omission]) -> Iterator[Omission]:
         yield from group[:MAX_LISTED_ALIKE]
         if more := group[MAX_LISTED_ALIKE:]:
             names = ", ".join(each.path.name for each in more[:10]) + (", ..." if len(more) > 10 else "")
-            yield Omission(
+            yield UnusedPart(
                 more[0].path.parent, f"{len(more)} more files ({names}) are left out for the same reason: {why}"
             )

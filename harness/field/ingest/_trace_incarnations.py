@@ -16,7 +16,7 @@ from pathlib import Path
 from harness.archive.bounded_file import BoundedFile
 from harness.archive.history import LATEST_S
 from harness.archive.traces import MAX_LINE_BYTES, Gap, Header, parse_gap, parse_line
-from harness.field.ingest._ingest import Omission
+from harness.field.ingest._ingest import UnusedPart
 from harness.field.ingest._line_order import in_order
 from ucp.messages import HEADER as DATAGRAM_HEADER
 from ucp.messages import MAGIC
@@ -98,7 +98,7 @@ class TraceIncarnation:
             lines, lost_bytes = lines + last.lines, lost_bytes + last.lost_bytes
         self.gaps.append(Gap(position, lines, lost_bytes))
 
-    def put_in_order(self) -> Iterator[Omission]:
+    def put_in_order(self) -> Iterator[UnusedPart]:
         """Repair the order of lines, and drop repeated ones. Yield a sentence for each place."""
         order, places = in_order(self.runs)
         if not places:
@@ -106,7 +106,7 @@ class TraceIncarnation:
         for place in places:
             lines = self.run_lines[place.first], self.run_lines[place.last]
             what = place.why if lines[0] == lines[1] else f"{place.why} (up to {self.counts} {lines[1]})"
-            yield Omission(self.path, what, lines[0], self.counts)
+            yield UnusedPart(self.path, what, lines[0], self.counts)
         kept = sorted(order)
         self.asides = [(bisect_left(kept, position), aside) for position, aside in self.asides]
         self.gaps = [gap._replace(position=bisect_left(kept, gap.position)) for gap in self.gaps]
@@ -123,7 +123,7 @@ def jumps_in(runs: list[HandlerRun]) -> list[int]:
     return [position for position, pair in enumerate(pairwise(runs), 1) if _jumps(*pair)]
 
 
-def read_incarnations(path: Path, left_out: list[Omission]) -> list[TraceIncarnation]:
+def read_incarnations(path: Path, left_out: list[UnusedPart]) -> list[TraceIncarnation]:
     """Return the parts of a trace between restarts, in order. The list is empty if the file is not a trace. Raises
     OSError.
     """
@@ -135,7 +135,7 @@ def read_incarnations(path: Path, left_out: list[Omission]) -> list[TraceIncarna
                 break
     incarnations = reader.finish(left_out)
     if incarnations and file.problem:
-        left_out.append(Omission(path, file.problem))
+        left_out.append(UnusedPart(path, file.problem))
     return incarnations
 
 
@@ -245,7 +245,7 @@ class TraceReader:
         what = "the part before this" if not lines else "1 line" if lines == 1 else f"{lines} lines"
         self._report(number, f"{what} {'were' if lines > 1 else 'was'} lost before this file was written")
 
-    def finish(self, left_out: list[Omission]) -> list[TraceIncarnation]:
+    def finish(self, left_out: list[UnusedPart]) -> list[TraceIncarnation]:
         """Return the parts of the trace. If there are any, descriptions of damage are added to `left_out`."""
         incarnations = [life for life in self.incarnations if life.runs or life.asides or life.header]
         left_out += self._left_out() if incarnations else ()
@@ -253,23 +253,23 @@ class TraceReader:
         left_out += places[:_MAX_LISTED]
         if len(places) > _MAX_LISTED:
             left_out.append(
-                Omission(self.path, f"{len(places) - _MAX_LISTED} more places have lines in the wrong order")
+                UnusedPart(self.path, f"{len(places) - _MAX_LISTED} more places have lines in the wrong order")
             )
         return incarnations
 
-    def _left_out(self) -> Iterator[Omission]:
+    def _left_out(self) -> Iterator[UnusedPart]:
         for damage in self._damaged[:_MAX_LISTED]:
             more = f", and so is the rest up to {self._counts} {damage.last}" if damage.last > damage.first else ""
-            yield Omission(self.path, f"{damage.why}{more}", damage.first, self._counts)
+            yield UnusedPart(self.path, f"{damage.why}{more}", damage.first, self._counts)
         if rest := self._damaged[_MAX_LISTED:]:
             places = "1 more place" if len(rest) == 1 else f"{len(rest)} more places"
-            yield Omission(
+            yield UnusedPart(
                 self.path,
                 f"{places} in it {'is' if len(rest) == 1 else 'are'} damaged, the last at "
                 f"{self._counts} {rest[-1].last}",
             )
         if self._cut_off is not None:
-            yield Omission(self.path, "it is truncated at the end of the file", self._cut_off, self._counts)
+            yield UnusedPart(self.path, "it is truncated at the end of the file", self._cut_off, self._counts)
 
 
 def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:

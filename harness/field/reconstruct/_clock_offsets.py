@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from harness.field.replay._peer_messages import Delivery
+from harness.field.replay._peer_messages import DeliveredMessage
 
 MIN_RATE, MAX_RATE = 0.55, 1.8
 """Limits of a plausible clock rate."""
@@ -51,7 +51,7 @@ Point = tuple[float, float]
 
 def estimate(
     agents: Iterable[int],
-    deliveries: Iterable[Delivery],
+    deliveries: Iterable[DeliveredMessage],
     ahead_s: Mapping[int, float] = {},
 ) -> dict[int, ClockLine]:
     """Return each agent's clock relative to a common reference clock.

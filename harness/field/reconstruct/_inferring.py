@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from harness.checker.steps.trace_header import CheckedHeader
-from harness.field._vehicle_captures import AgentCapture, Sighting, seconds_of
+from harness.field._vehicle_captures import AgentCapture, CapturedDatagram, seconds_of
 from harness.field.reconstruct._agent_inputs import (
     BootedFromDisk,
     Cause,
@@ -78,8 +78,8 @@ class InferredInputs:
 class _IncarnationRecord:
     """The received datagrams, sent datagrams, and logged events of an agent between two restarts."""
 
-    received: Sequence[Sighting]
-    sent: Sequence[Sighting]
+    received: Sequence[CapturedDatagram]
+    sent: Sequence[CapturedDatagram]
     logged_events: Sequence[tuple[float, LoggableEvent]]
     is_last: bool
 
@@ -127,7 +127,7 @@ def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent])
         from_s = sent[end - 1].at_s if end else 0.0  # The next incarnation may have begun at any time after this.
 
 
-def _last_seen(received: Sequence[Sighting], last_s: float, restart_s: float) -> float:
+def _last_seen(received: Sequence[CapturedDatagram], last_s: float, restart_s: float) -> float:
     """Return a time until which the agent certainly ran. It would have answered the next query."""
     later = (sighting for sighting in received if last_s < sighting.at_s)
     questions = (sighting.at_s for sighting in later if isinstance(decode(sighting.datagram).message, ANSWERED_QUERIES))
@@ -360,7 +360,7 @@ class _InputSequence:
         if since_s + self._late_s < until_s < NEVER:
             self.pause = since_s, until_s
 
-    def _fail(self, sighting: Sighting) -> None:
+    def _fail(self, sighting: CapturedDatagram) -> None:
         message = decode(sighting.datagram).message
         self.problem = f"sent a {message.NAME} at t={sighting.at_s:.3f} s, which no recorded input explains"
 

@@ -18,7 +18,7 @@ from heapq import heappop, heappush
 from harness.field.reconstruct._agent_inputs import BootedFromDisk, DatagramReceived
 from harness.field.reconstruct._clock_offsets import MAX_RATE, MIN_RATE, ClockLine, estimate
 from harness.field.reconstruct._rehearsal import PlayedInput, SoloSimulation, TimerStart
-from harness.field.replay._peer_messages import Delivery
+from harness.field.replay._peer_messages import DeliveredMessage
 
 MIN_GAP_S = 2e-5
 """Minimum time between two inputs of an agent, and between the sending and the arrival of a message."""
@@ -144,7 +144,7 @@ class _Senders:
         """Return the time at which a datagram was sent, on the sender's clock."""
         return self._rehearsals[agent].played[self._sent_by[agent][number]].input.at_s
 
-    def deliveries(self) -> list[Delivery]:
+    def deliveries(self) -> list[DeliveredMessage]:
         """Return the datagrams that were sent exactly once, with each of their receptions."""
         found = []
         for receiver, rehearsal in self._rehearsals.items():
@@ -153,7 +153,7 @@ class _Senders:
                     sent = self.of(played.input.cause.datagram, receiver)
                     if len(sent) == 1:
                         sender, number = sent[0]
-                        found.append(Delivery(sender, receiver, self.sent_s(sender, number), played.input.at_s))
+                        found.append(DeliveredMessage(sender, receiver, self.sent_s(sender, number), played.input.at_s))
         return found
 
 

@@ -18,10 +18,10 @@ from harness.checker.lost_lines import lost_lines
 from harness.checker.missing_incarnations import lacking_traces
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.end_of_record import Arrival, sent_to, unfinished
-from harness.checker.steps.follower import Follower
+from harness.checker.steps.follower import StepComparer
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError
-from harness.field._vehicle_captures import AgentCapture, Sighting
+from harness.field._vehicle_captures import AgentCapture, CapturedDatagram
 from ucp.clock import MICROSECONDS
 from ucp.messages import MalformedDatagramError, Message, NextInSequenceResponse, decode
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
@@ -156,7 +156,7 @@ class Record:
         return sent
 
     @cached_property
-    def arrivals(self) -> list[Sighting] | None:
+    def arrivals(self) -> list[CapturedDatagram] | None:
         """The datagrams that reached the vehicle of the agent, in order. None without a capture of the vehicle."""
         capture = self.flight.capture(self.agent_id)
         return None if capture is None else [seen for seen in capture.sightings if not seen.outbound]
@@ -188,7 +188,7 @@ class Record:
         exported_s = (exported_s - self.header.offset_s) / self.header.rate
         return exported_s if exported_s >= self.end_s else None
 
-    def ends_open(self, follower: Follower) -> str | None:
+    def ends_open(self, follower: StepComparer) -> str | None:
         """Return a sentence about the end of the record, if the agent left no export and others went on.
 
         Without any export, the mission may have ended at different times, and only a due timer proves an early end.

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.deviation import Deviation
-from harness.field._vehicle_captures import Sighting
+from harness.field._vehicle_captures import CapturedDatagram
 from harness.field.replay._agent_record import Record, RecordEntry
 from ucp.messages import MalformedDatagramError, Message, decode
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
@@ -41,7 +41,7 @@ def ignored_messages(record: Record, play_to: Callable[[int], PlayedAgent]) -> t
 
     `play_to` plays the entries up to a position.
     """
-    places: list[tuple[int, Sighting, Message]] = []
+    places: list[tuple[int, CapturedDatagram, Message]] = []
     last = -1
     for position, sighting in _without_line(record):
         message = decode(sighting.datagram).message
@@ -64,7 +64,7 @@ def ignored_messages(record: Record, play_to: Callable[[int], PlayedAgent]) -> t
     return position, Deviation(record.agent_id, entry.line, sighting.at_s, handler, what)
 
 
-def _without_line(record: Record) -> Iterator[tuple[int, Sighting]]:
+def _without_line(record: Record) -> Iterator[tuple[int, CapturedDatagram]]:
     """Yield the messages that arrived between two lines of an incarnation and have no line, with the next position."""
     known = {(run.sender, run.sequence) for entry in record.entries if (run := _received(entry)) is not None}
     times = [entry.content.t for entry in record.entries]

@@ -11,7 +11,7 @@ from ucp.trigger import MessageTrigger
 
 
 @dataclass(frozen=True, slots=True)
-class Delivery:
+class DeliveredMessage:
     """A message with the times at which it was sent and received, each on the clock of the agent there."""
 
     sender: int
@@ -24,7 +24,7 @@ class PeerMessage(NamedTuple):
     """A message, and the position of the trace entry that sent or received it."""
 
     position: int
-    delivery: Delivery
+    delivery: DeliveredMessage
 
 
 class PeerMessages:
@@ -64,8 +64,8 @@ class PeerMessages:
             if isinstance(trigger, MessageTrigger) and trigger.sender == other:
                 sent = self.runs_that_sent(trigger.message, trigger.sequence)
                 if len(sent) == 1:
-                    yield PeerMessage(position, Delivery(other, own, self.runs[sent[0]][1].t, run.t))
+                    yield PeerMessage(position, DeliveredMessage(other, own, self.runs[sent[0]][1].t, run.t))
             for message in run.sent:
                 received = self.runs_that_received(message.message, message.seq)
                 if len(received) == 1:
-                    yield PeerMessage(position, Delivery(own, other, run.t, self.runs[received[0]][1].t))
+                    yield PeerMessage(position, DeliveredMessage(own, other, run.t, self.runs[received[0]][1].t))

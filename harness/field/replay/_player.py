@@ -15,7 +15,7 @@ from harness.checker.reference.algorithms import ON_TIMER
 from harness.checker.reference.state import State
 from harness.checker.steps import end_of_record, wrongly_dropped
 from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.follower import Follower, OptionalTraceFields
+from harness.checker.steps.follower import OptionalTraceFields, StepComparer
 from harness.checker.steps.implementation import REFERENCE, Implementation
 from harness.checker.steps.single_line import LINES_AFTER, damage_that_explains
 from harness.field.replay._agent_record import Record, RecordEntry
@@ -74,7 +74,7 @@ class ReplayResult:
 
 @dataclass(frozen=True)
 class _Checkpoint:
-    follower: Follower
+    follower: StepComparer
     incarnation: int
     result: ReplayResult
 
@@ -282,8 +282,8 @@ class RecordPlayer:
             self.record.doubts = found if len(found) <= MAX_DOUBTS else {}
         return self.record.doubts.get(self.position)
 
-    def _new_follower(self) -> Follower:
-        return Follower(self.record.header, self._parts, self._blocks, self.record.was_paused, self._implementation)
+    def _new_follower(self) -> StepComparer:
+        return StepComparer(self.record.header, self._parts, self._blocks, self.record.was_paused, self._implementation)
 
 
 class _DoubtingPlayer(RecordPlayer):

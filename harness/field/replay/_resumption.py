@@ -15,7 +15,7 @@ from statistics import median
 
 from harness.archive.traces import Trace
 from harness.checker.recorded_inputs import NotOnRecordError, event_of
-from harness.checker.steps.follower import Follower
+from harness.checker.steps.follower import StepComparer
 from harness.field.replay._agent_record import Record, RecordEntry
 from harness.field.replay._peer_messages import PeerMessages
 from harness.field.replay.replay_names import RecordedBlocks
@@ -36,7 +36,7 @@ class ResumptionSearch:
         self._blocks = blocks
         self._inception = InceptionBlock(record.header.initial_data).chain_hash
 
-    def resume(self, follower: Follower, position: int) -> bool:
+    def resume(self, follower: StepComparer, position: int) -> bool:
         """Set a new follower to the agent's state after the entry at `position`. Return true if that state is known."""
         entry = self._record.entries[position]
         run = entry.content

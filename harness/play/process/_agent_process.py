@@ -36,7 +36,7 @@ from harness.play.agent_control import (
     resolve_command,
 )
 from harness.play.child_processes import ChildProcesses
-from harness.play.process._run_lab import MissionLab, Program
+from harness.play.process._run_lab import LabProgram, MissionLab
 from harness.play.process.agent_mission import mission_file
 from harness.play.trace_space import trace_quota
 from harness.play.variant import variant_in_use
@@ -115,7 +115,7 @@ class AgentProcess:
         self.detail: str | None = None
         self._rundir = rundir
         self._incarnations: list[_Incarnation] = []
-        self._process: Program | None = None
+        self._process: LabProgram | None = None
         self._control_lock = asyncio.Lock()
         """Held while the agent answers a status request, so that no fault ends or pauses it meanwhile."""
         self._completed_before: list[str] = []
@@ -200,7 +200,7 @@ class AgentProcess:
         self._incarnations.append(_Incarnation(directory, store, reboot=kept))
         return self._incarnations[-1]
 
-    async def _wait_for_first_status(self, process: Program) -> None:
+    async def _wait_for_first_status(self, process: LabProgram) -> None:
         deadline = asyncio.get_running_loop().time() + START_LIMIT_S
         while True:
             try:
@@ -288,7 +288,7 @@ class AgentProcess:
                 raise self._end_error(self._process) from None
             raise self._failure("hung", f"stopped answering: {error}") from None
 
-    async def _has_ended(self, process: Program) -> bool:
+    async def _has_ended(self, process: LabProgram) -> bool:
         """Return true if the process has ended. It waits a moment, because the connection can end before the process
         does.
         """
@@ -427,7 +427,7 @@ class AgentProcess:
     def _log(self) -> Path:
         return self._incarnations[-1].directory / f"{self.agent_id}.log"
 
-    def _end_error(self, process: Program) -> HarnessError:
+    def _end_error(self, process: LabProgram) -> HarnessError:
         """Return the error for an agent whose process ended by itself.
 
         Exit status 127 before the start of the mission means that the agent lacks a feature of the mission. A shell

@@ -14,7 +14,7 @@ from harness.play.process._watchers import MissionTasks
 from harness.scenario import Scenario
 from netem.radio import Place
 from sitl.address import Address
-from sitl.circumstances import Circumstance
+from sitl.circumstances import SimulatedFailure
 from sitl.ground_station import GroundStation
 from sitl.system_ids import system_ids
 from sitl.vehicle import Home, VehicleError, VehicleKind
@@ -137,7 +137,7 @@ class Fleet:
     def fall(self, vehicle_id: int) -> None:
         self._watchers.start(self._vehicles[vehicle_id].fall(), of=f"flight {vehicle_id}")
 
-    async def simulate(self, vehicle_id: int, what: str, circumstance: Circumstance, at_s: float) -> str | None:
+    async def simulate(self, vehicle_id: int, what: str, circumstance: SimulatedFailure, at_s: float) -> str | None:
         """Make a vehicle simulate an event such as a GPS failure. See `VehicleProcess.simulate`."""
         if self._station is not None and circumstance.station_is_heard is not None:
             self._station.reach(self._sysids[vehicle_id], reachable=circumstance.station_is_heard)

@@ -37,7 +37,7 @@ from netem.conditions import NetworkConditions
 from netem.engine import AppliedConditions
 from netem.errors import LabUnavailable, LiveCaptureError, NetemError
 from netem.lab import UdpCounters
-from sitl.circumstances import Circumstance
+from sitl.circumstances import SimulatedFailure
 from sitl.vehicle import VehicleKind
 from ucp.clock import MICROSECONDS, MissionClock
 
@@ -295,7 +295,9 @@ class ProgramRun:
         hearers = [agent for agent in self.agents if agent.agent_id in heard_by and agent.awake]
         await asyncio.gather(*(agent.ask("revoke", revocation=revocation) for agent in hearers))
 
-    async def set_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
+    async def set_circumstance(
+        self, agent_id: int, what: str, circumstance: SimulatedFailure, *, by_hand: bool
+    ) -> None:
         if not self._fleet:
             raise ScenarioError(f"`{what}` needs vehicles, but this run has none")
         at_s = round(self.clock.now(), 3)
@@ -304,7 +306,9 @@ class ProgramRun:
         elif problem := await self._fleet.simulate(agent_id, what, circumstance, at_s):
             raise ScenarioError(problem)  # the user waits for the result of an intervention
 
-    async def _simulate_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, at_s: float) -> None:
+    async def _simulate_circumstance(
+        self, agent_id: int, what: str, circumstance: SimulatedFailure, at_s: float
+    ) -> None:
         if problem := await self._fleet.simulate(agent_id, what, circumstance, at_s):
             self.played.unmatched_fates.append(problem)
 

@@ -18,7 +18,7 @@ from netem.lab import Lab as NetworkLab
 Role = Literal["agent", "vehicle"]
 
 
-class Program(Protocol):
+class LabProgram(Protocol):
     """A program that runs in the virtual network. Its methods raise NetemError if the network fails."""
 
     @property
@@ -76,7 +76,7 @@ class MissionLab(Protocol):
         stderr: Path,
         role: Role,
         max_file_bytes: int | None = None,
-    ) -> Program: ...
+    ) -> LabProgram: ...
 
     async def connect(self, vehicle: int, port: int, *, timeout_s: float) -> socket: ...
 

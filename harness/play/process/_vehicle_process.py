@@ -14,7 +14,7 @@ from harness.play.child_processes import passed_on
 from harness.play.process._run_lab import MissionLab, Program
 from harness.scenario.vehicles import Flight
 from netem.radio import Place
-from sitl.circumstances import Circumstance
+from sitl.circumstances import SimulatedFailure
 from sitl.ground_station import GroundStation
 from sitl.modes import mav_type
 from sitl.parameters import in_lines
@@ -195,7 +195,7 @@ class VehicleProcess:
             return None
         return self.pilot.shortfall(self._flight)
 
-    async def simulate(self, what: str, circumstance: Circumstance, at_s: float) -> str | None:
+    async def simulate(self, what: str, circumstance: SimulatedFailure, at_s: float) -> str | None:
         """Make the vehicle simulate an event such as a GPS failure. If it cannot, return the reason as a sentence."""
         assert self.pilot is not None
         entry: dict[str, Any] = {"at_s": at_s, "what": what, "parameters": {}}

@@ -30,7 +30,7 @@ from harness.scenario.changes import Change, NetworkChange, TimedInjection, disc
 from harness.scenario.fates import Fate
 from harness.scenario.faults import VehicleFault
 from netem.radio import Place
-from sitl.circumstances import Circumstance
+from sitl.circumstances import SimulatedFailure
 from sitl.track import Track
 from ucp.trace import HandlerRun
 
@@ -491,7 +491,9 @@ class Simulation(EventLoop):
                 incarnation.secured.revoke(revocation, incarnation.local_s(self._now))
                 self._finish_input(number, incarnation)
 
-    async def set_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
+    async def set_circumstance(
+        self, agent_id: int, what: str, circumstance: SimulatedFailure, *, by_hand: bool
+    ) -> None:
         raise AssertionError("faults of vehicles are refused")
 
     async def pause(self, agent_id: int) -> None:

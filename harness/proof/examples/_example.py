@@ -22,7 +22,7 @@ Document = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Example:
+class ViolationExample:
     """A path to a violation as a scenario file. `judged` contains the bad verdicts on its simulated run."""
 
     path: Path
@@ -71,7 +71,9 @@ def _bad(result: Result) -> dict[str, Judgement]:
     return {key: result.judgements[key] for key in result.bad}
 
 
-def keep(played: PlayedExample, path: Path, bounds: Bounds, instants: int, sentences: Sequence[str]) -> Example:
+def keep(
+    played: PlayedExample, path: Path, bounds: Bounds, instants: int, sentences: Sequence[str]
+) -> ViolationExample:
     """Write a played scenario to `path`, with `sentences` as its comment, and return it as an example."""
     comment = [
         *sentences,
@@ -79,4 +81,6 @@ def keep(played: PlayedExample, path: Path, bounds: Bounds, instants: int, sente
         *evidence_lines(played.judged),
         f"  ucp-harness run {path} --backend sim --seed {SEED}",
     ]
-    return Example(write_new_file(path, to_yaml(played.document, comment)), instants, played.judged, played.chains)
+    return ViolationExample(
+        write_new_file(path, to_yaml(played.document, comment)), instants, played.judged, played.chains
+    )

@@ -12,7 +12,7 @@ from functools import partial
 from harness.proof._progress_bar import LOOK_EVERY, Ended, ExplorationBudget, LimitReachedError, Progress
 from harness.proof.graph._expansion import StateExpansion, StateStore, SuccessorStore, cycles_left_alone, expanded
 from harness.proof.graph._workers import Workers
-from harness.proof.model._flaws import Flaw
+from harness.proof.model._flaws import PropertyViolation
 from harness.proof.model._global_states import ModelSwarm, State
 
 NO_PARENT = -1
@@ -48,7 +48,7 @@ class StateGraph:
         self.states = StateStore(self.swarm.bounds.agents)
 
     @property
-    def flaw(self) -> Flaw | None:
+    def flaw(self) -> PropertyViolation | None:
         return None if self.flawed is None else self.swarm.flaw(self.states[self.flawed])
 
     def reach(self, state: State, parent: int) -> int:

@@ -24,7 +24,7 @@ from harness.proof.model._global_states import AGENTS, ZONE, ModelSwarm, State
 from harness.proof.model._known_states import DEAD
 from harness.proof.questions._attractor import Check
 from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
-from harness.run.parallel import FailedTask, Worker, signals_blocked
+from harness.run.parallel import FailedTask, WorkerProcess, signals_blocked
 
 WAIT_S = 0.5
 """Maximum time in seconds to wait for an answer before memory and time are checked again."""
@@ -206,7 +206,7 @@ class _WorkerHandle:
         self.steps = 0
         self._steps_at_fork = swarm.local.steps
         self._translator = _StateTranslator(swarm)
-        self._worker: Worker[StateBatch | ForkedStates, WorkerAnswer] = Worker(_WorkerFunction(swarm))
+        self._worker: WorkerProcess[StateBatch | ForkedStates, WorkerAnswer] = WorkerProcess(_WorkerFunction(swarm))
         self._numbers: list[int] = []
         """The main process's numbers of the states that the worker reported, in order of the reports."""
 

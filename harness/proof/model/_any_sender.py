@@ -17,11 +17,11 @@ from harness.proof._progress_bar import Ended, Progress, memory_bytes
 from harness.proof.attacker._attacker import AttackerKnowledge
 from harness.proof.attacker._forgeries import ForgeryMaterial
 from harness.proof.bounds import Bounds
-from harness.proof.model._flaws import Flaw
+from harness.proof.model._flaws import PropertyViolation
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
 from harness.proof.model._snapshot import AgentStep
-from harness.proof.model._zones import NOTHING_RUNS, Zones
+from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 
 LOOK_EVERY = 500
 
@@ -46,7 +46,7 @@ class CollectedFigures:
     divisions: int = 0
     seconds: float = 0.0
     ended: Ended = "complete"
-    flaw: Flaw | None = None
+    flaw: PropertyViolation | None = None
     way: list[str] = field(default_factory=list)
     """The earlier actions and received messages of the agent with the flaw."""
     shown: set[str] = field(default_factory=set)
@@ -119,7 +119,7 @@ class _BlockDistribution:
             for agent_id in range(1, bounds.agents + 1)
         }
         self.local = LocalStates(bounds)
-        self._zones = Zones()
+        self._zones = ZoneTable()
         self._came_from: dict[Alone, tuple[Alone, str] | None] = {}
         self._said: dict[Said, None] = {}
         self._names: dict[int, frozenset[int]] = {}

@@ -14,7 +14,7 @@ from harness.proof.model._block_renaming import Ordinals
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
 from harness.proof.model._snapshot import NAMES_OF_OTHERS
-from harness.proof.model._zones import Zones
+from harness.proof.model._zones import ZoneTable
 
 Places = tuple[int, ...]
 """The previous place of the agent at each place of a state."""
@@ -46,7 +46,7 @@ class CanonicalOrder:
     agent.
     """
 
-    def __init__(self, local: LocalStates, zones: Zones, name_of: Callable[[int, int], int]) -> None:
+    def __init__(self, local: LocalStates, zones: ZoneTable, name_of: Callable[[int, int], int]) -> None:
         self._as_they_are = tuple(range(local.bounds.agents))
         self._local = local
         self._zones = zones

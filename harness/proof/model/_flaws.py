@@ -9,7 +9,7 @@ from ucp.state import AgentState
 
 
 @dataclass(frozen=True, slots=True)
-class Flaw:
+class PropertyViolation:
     """A violation: its kind, and a sentence that describes it.
 
     The kind is a characteristic ("2", "3", "4"), "hang", "crash" or "steps". With an attacker it can also be "name" (an
@@ -26,7 +26,7 @@ FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
 """Kinds of flaws that the state after a step does not show."""
 
 
-def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> Flaw | None:
+def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> PropertyViolation | None:
     """Return the violation in an agent's state, or None.
 
     `completed` maps each completed block hash to the agent that completed the block. Blocks in the name of the
@@ -35,19 +35,19 @@ def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | N
     aside = [block.block_hash for block in (*state.blocks_to_be_committed, *state.reconcile_stack)]
     chain = [block.block_hash for block in state.chain]
     if state.idle and (aside or not {*state.completed} <= {*chain}):
-        return Flaw("2", "an idle agent holds a completed block that is not in its chain")
+        return PropertyViolation("2", "an idle agent holds a completed block that is not in its chain")
     if any(count > 1 for count in Counter([*chain, *aside]).values()):
-        return Flaw("3", "an agent holds a block twice")
+        return PropertyViolation("3", "an agent holds a block twice")
     if any(completed.get(made) != maker != captured for made, maker in _makers(state).items()):
         kind = "4" if captured is None else "honest"
-        return Flaw(kind, "an agent holds a block that its named maker never completed")
+        return PropertyViolation(kind, "an agent holds a block that its named maker never completed")
     chain_hash = state.chain.inception.chain_hash
     for block, said in state.chain.with_chain_hashes():
         chain_hash = next_chain_hash(chain_hash, block.block_hash)
         if said != chain_hash:
-            return Flaw("4", "a chain hash does not match the blocks up to it")
+            return PropertyViolation("4", "a chain hash does not match the blocks up to it")
     if state.reconcile_in_progress and all(timer.deadline is None for timer in state.reconcile_timers):
-        return Flaw(
+        return PropertyViolation(
             "hang", "an agent reconciles, but no timer of the reconcile runs: it never answers another agent again"
         )
     return None

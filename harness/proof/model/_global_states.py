@@ -14,12 +14,12 @@ from harness.proof.attacker._attacker import Attacker
 from harness.proof.bounds import FAULTS, MAX_COINCIDENCES, MAX_LIES, Bounds
 from harness.proof.model._block_renaming import Ordinals
 from harness.proof.model._canonical_order import CanonicalOrder, OrderedAgents, Places
-from harness.proof.model._flaws import Flaw
+from harness.proof.model._flaws import PropertyViolation
 from harness.proof.model._instant import Actions, AgentAction, AgentStates, FinalRound, InstantOutcomes, MessageRound
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
 from harness.proof.model._snapshot import Started
-from harness.proof.model._zones import NOTHING_RUNS, Zones
+from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 
 State = tuple[int, ...]
 """A global state: the number of completed blocks, the remaining faults, the zone, and the local states.
@@ -95,7 +95,7 @@ class ModelSwarm:
     def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
         self.bounds = bounds
         self.local = LocalStates(bounds, every_count=every_count)
-        self.zones = Zones()
+        self.zones = ZoneTable()
         self._instants = InstantOutcomes(self.local, bounds, every_order=every_count)
         self._order = (
             CanonicalOrder(self.local, self.zones, self.name_of) if bounds.alike or bounds.blocks_alike else None
@@ -357,7 +357,7 @@ class ModelSwarm:
 
     # Properties of a state
 
-    def flaw(self, state: State) -> Flaw | None:
+    def flaw(self, state: State) -> PropertyViolation | None:
         """Return the violation in the state of one of the agents, or None."""
         known = self.local.known
         return next((flaw for local in state[AGENTS:] if local != DEAD and (flaw := known[local].flaw)), None)

@@ -9,7 +9,7 @@ from typing import Any
 
 from harness.proof.bounds import Bounds
 from harness.proof.model._block_renaming import Blocks
-from harness.proof.model._flaws import Flaw, flaw_of, is_deceived
+from harness.proof.model._flaws import PropertyViolation, flaw_of, is_deceived
 from harness.proof.model._snapshot import NAMES_OF_OTHERS, Snapshot, SnapshotParts, dead
 from ucp.state import AgentState
 
@@ -40,7 +40,7 @@ class KnownLocalState:
     idle: bool
     waits: bool
     chain: tuple[int, ...]
-    flaw: Flaw | None
+    flaw: PropertyViolation | None
     anonymous: int
     """A number that is equal for states that differ only in the identity of voters and responders.
 
@@ -69,7 +69,7 @@ class KnownStates:
         self._numbers: dict[tuple[Any, ...], int] = {}
         self._renamed: dict[tuple[int, Names], int] = {}
 
-    def number(self, agent_id: int, state: AgentState, taken: Snapshot, flaw: Flaw | None) -> int:
+    def number(self, agent_id: int, state: AgentState, taken: Snapshot, flaw: PropertyViolation | None) -> int:
         """Return the number of an agent's state. `taken` is its snapshot, in which equal parts are shared."""
         snapshot = taken
         if self.bounds.reduced:

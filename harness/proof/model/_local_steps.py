@@ -10,7 +10,7 @@ from functools import partial
 
 from harness.proof.bounds import Bounds
 from harness.proof.model._block_renaming import Blocks, Ordinals
-from harness.proof.model._flaws import FLAWS_OF_STEPS, Flaw
+from harness.proof.model._flaws import FLAWS_OF_STEPS, PropertyViolation
 from harness.proof.model._known_states import DEAD, FIRST, FIRST_OTHER, KnownStates
 from harness.proof.model._real_agents import RealAgents, end_at_once, end_timer, is_heard, log
 from harness.proof.model._reference_step import Give, ReferenceComparison
@@ -29,14 +29,14 @@ from harness.proof.model._snapshot import (
     set_counts,
     take,
 )
-from harness.proof.model._tallies import TALLIES, Tallies
+from harness.proof.model._tallies import TALLIES, VoteCounts
 from ucp.agent import Agent
 from ucp.clock import MICROSECONDS
 from ucp.messages import CARRY_A_BLOCK, Message
 from ucp.state import AgentState
 from ucp.store import StoredState
 
-Content = tuple[int, Snapshot, "Flaw | None", Ordinals]
+Content = tuple[int, Snapshot, "PropertyViolation | None", Ordinals]
 """The definition of a local state, as another process needs it."""
 
 
@@ -69,7 +69,7 @@ class LocalStates(KnownStates):
         )
         self.durations_us = [round(duration * MICROSECONDS) for duration in durations]
         """The duration of each timer in microseconds."""
-        self._tallies = Tallies(self, self.timers, self.ends, every_count=every_count)
+        self._tallies = VoteCounts(self, self.timers, self.ends, every_count=every_count)
         self._about: dict[int, Ordinals] = {}
         self._patterns: dict[int, int] = {}
         self._of_pattern: dict[tuple[int, Ordinals], int] = {}
@@ -201,7 +201,7 @@ class LocalStates(KnownStates):
             )
         return step
 
-    def _got_in(self, local: int, message: int) -> Flaw | None:
+    def _got_in(self, local: int, message: int) -> PropertyViolation | None:
         """Return a violation if the agent accepts a forged message: of an excluded vehicle, in another vehicle's name,
         or with another vehicle's block.
         """
@@ -209,11 +209,11 @@ class LocalStates(KnownStates):
         revoked = self.agents.revoked[known.agent_id]
         put_back(revoked, known.snapshot)
         if is_heard(revoked, self._sealed(message), known.snapshot):
-            return Flaw("revoked", f"a {said.NAME} of a vehicle whose revocation is known is accepted")
+            return PropertyViolation("revoked", f"a {said.NAME} of a vehicle whose revocation is known is accepted")
         for datagram in self.agents.gate.forged(said, known.agent_id, NOW_S):
             agent = self._restored(local)
             if is_heard(agent, datagram, known.snapshot):
-                return Flaw("name", f"a {said.NAME} is accepted that only another vehicle could sign")
+                return PropertyViolation("name", f"a {said.NAME} is accepted that only another vehicle could sign")
             self.agents.leave_in(known.agent_id, known.snapshot)
         return None
 
@@ -250,7 +250,7 @@ class LocalStates(KnownStates):
         hears: bool = False,
         boots: bool = False,
         completes: int | None = None,
-        flaw: Flaw | None = None,
+        flaw: PropertyViolation | None = None,
         to_reference: Give | None = None,
     ) -> AgentStep:
         """Compute a step of the agent. `to_reference` gives the same input to the reference, in decrypted form."""
@@ -274,10 +274,10 @@ class LocalStates(KnownStates):
         if crashed is None:
             crashed = end_at_once(agent)
         if crashed is not None:
-            flaw = Flaw("crash", f"a handler ended by {crashed}")
+            flaw = PropertyViolation("crash", f"a handler ended by {crashed}")
         if wrong is not None:
             handler, sentence = wrong
-            flaw = Flaw("steps", sentence, handler)
+            flaw = PropertyViolation("steps", sentence, handler)
         sent, started = self._results(agent)
         after = take(agent, {} if boots else before.snapshot)
         if not (self.bounds.reduced or boots or self.bounds.captured):
@@ -383,7 +383,7 @@ class LocalStates(KnownStates):
         agent: Agent,
         taken: Snapshot,
         before: Snapshot | None = None,
-        flaw: Flaw | None = None,
+        flaw: PropertyViolation | None = None,
         *,
         keep: bool = True,
     ) -> int:

@@ -12,7 +12,7 @@ from copy import copy
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
-from harness.proof.model._flaws import Flaw
+from harness.proof.model._flaws import PropertyViolation
 from ucp.agent import ON_MESSAGE, Agent
 from ucp.block import Block
 from ucp.chain import Chain
@@ -293,12 +293,12 @@ class SnapshotParts:
             name: value if like.get(name, self) is value else self.part(name, value) for name, value in snapshot.items()
         }
 
-    def key(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> tuple[Any, ...]:
+    def key(self, agent_id: int, flaw: PropertyViolation | None, snapshot: Snapshot) -> tuple[Any, ...]:
         """Return a key of a state that consists of stored parts. Equal states have equal keys."""
         numbers = self._numbers
         return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
 
-    def anonymous(self, agent_id: int, flaw: Flaw | None, snapshot: Snapshot) -> int:
+    def anonymous(self, agent_id: int, flaw: PropertyViolation | None, snapshot: Snapshot) -> int:
         """Return a number for a state that does not depend on the identity of voters and responders. It is the same on
         all machines.
         """

@@ -14,7 +14,7 @@ TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "re
 """Parts of the state that count answers, and are otherwise read only when a timer expires."""
 
 
-class Tallies:
+class VoteCounts:
     """The simplified vote counts of each agent state after all messages of a moment.
 
     `ends` returns the possible results of a timer's expiry for a state's number and the timer's index in `timers`. The

@@ -15,7 +15,7 @@ EVER_US = 10**15
 """A duration that is longer than any timer, in microseconds."""
 
 
-class Zones:
+class ZoneTable:
     """All zones by number, with cached results of their operations. A zone is a set of possible remaining timer
     values.
     """

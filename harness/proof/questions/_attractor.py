@@ -11,7 +11,7 @@ Check = Callable[[], object]
 """A function that is called repeatedly, and raises GivenUpError when the limit of memory or time is reached."""
 
 
-class Attractor:
+class BackwardReachableStates:
     """A growing set of states: the goals, and all states from which a path leads to them.
 
     The durations of timers determine the next timer, but a zone may leave several timers open. All of these must

@@ -10,7 +10,7 @@ from functools import partial
 from harness.proof.graph._expansion import cycles_left_alone
 from harness.proof.graph._exploration import StateGraph
 from harness.proof.graph._workers import Workers
-from harness.proof.questions._attractor import Attractor, Check
+from harness.proof.questions._attractor import BackwardReachableStates, Check
 from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
 from harness.proof.questions._graph_cycles import cycles
 
@@ -49,7 +49,7 @@ def look(graph: StateGraph, watch: Watch = lambda asked: None, workers: Workers 
     idle_states = dict(_idle_states(graph, partial(watch, "idle states")))
     forks = [number for number, chains in idle_states.items() if chains > 1]
     result = ConvergenceResult(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "cycles")))
-    safe = Attractor(graph.quiet, graph.swarm.bounds.timers_any, partial(watch, "paths to one chain"))
+    safe = BackwardReachableStates(graph.quiet, graph.swarm.bounds.timers_any, partial(watch, "paths to one chain"))
     safe.add(number for number, chains in idle_states.items() if chains <= 1)
     result.astray.append(safe.left)
     if not safe.left:

@@ -11,7 +11,7 @@ from harness.proof.graph._expansion import quiet
 from harness.proof.model._global_states import AGENTS, BLOCKS, ModelSwarm, State
 from harness.proof.model._instant import AgentAction
 from harness.proof.model._known_states import DEAD
-from harness.proof.questions._attractor import Attractor, ByTimer, Check
+from harness.proof.questions._attractor import BackwardReachableStates, ByTimer, Check
 
 MAX_EXPLORED = 50_000
 """Maximum number of states that are explored after the votes of one state.
@@ -140,7 +140,7 @@ class ExtraVotes:
         for at in states:
             self._count_explored()
             by_timer.append(quiet(self._swarm, at, number_of).by_timer)
-        attractor = Attractor(by_timer, self._swarm.bounds.timers_any, self._check)
+        attractor = BackwardReachableStates(by_timer, self._swarm.bounds.timers_any, self._check)
         attractor.add(
             number
             for number, at in enumerate(states)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from harness.archive.run_record import Cycle
-from harness.proof.examples._example import Example, PlayedExample, keep, play
+from harness.proof.examples._example import PlayedExample, ViolationExample, keep, play
 from harness.proof.examples._path_script import NO_CLOCKS, CompletionInterval, Document, PathScript
 from harness.proof.graph._exploration import StateGraph
 from harness.proof.model._global_states import AGENTS
@@ -42,7 +42,7 @@ class Livelock:
     ways: int
     coincidences: int | None
     completions: tuple[CompletionInterval, ...]
-    example: Example
+    example: ViolationExample
     losses: int
     cycle: Cycle | None
     contradictory: bool = False

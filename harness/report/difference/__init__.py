@@ -15,9 +15,9 @@ from harness.report.difference._run_difference import (
     AgentDifference,
     ChainDifference,
     ComparedStep,
-    Difference,
     FirstDifference,
     KeyDifference,
+    RunDifference,
     compare,
 )
 
@@ -25,8 +25,8 @@ __all__ = [
     "AgentDifference",
     "ChainDifference",
     "ComparedStep",
-    "Difference",
     "FirstDifference",
     "KeyDifference",
+    "RunDifference",
     "compare",
 ]

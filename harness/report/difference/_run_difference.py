@@ -10,7 +10,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.exports import RUN_FILE
 from harness.archive.traces import HandlerRunLine
 from harness.errors import RunDirectoryError
-from harness.report.agent_programs import Program, programs
+from harness.report.agent_programs import AgentProgram, programs
 from harness.report.chain_tree import ranges
 from ucp.trigger import Trigger
 
@@ -127,7 +127,7 @@ class AgentDifference:
 
 
 @dataclass(frozen=True)
-class Difference:
+class RunDifference:
     """All differences between two runs.
 
     keys: differing keys of the scenario, and `seed`. agents: every agent of the roster. Both fields are None for an
@@ -137,7 +137,7 @@ class Difference:
     """
 
     keys: list[KeyDifference]
-    programs: dict[Literal["a", "b"], list[Program]]
+    programs: dict[Literal["a", "b"], list[AgentProgram]]
     agents: dict[int, AgentDifference]
     handler_runs: int
     exact: bool
@@ -172,7 +172,7 @@ class Difference:
         }
 
 
-def compare(a: Path, b: Path) -> Difference:
+def compare(a: Path, b: Path) -> RunDifference:
     """Return the differences between two run directories.
 
     Raises RunDirectoryError if a directory is no run, or if the rosters or backends differ.
@@ -187,8 +187,8 @@ def compare(a: Path, b: Path) -> Difference:
         chains = _compare_chains(run_a.chain(agent_id), run_b.chain(agent_id))
         agents[agent_id] = AgentDifference(first_difference, chains)
     keys = [*differing_keys(run_a.requested(), run_b.requested())]
-    ran: dict[Literal["a", "b"], list[Program]] = {"a": programs(run_a.record), "b": programs(run_b.record)}
-    return Difference(keys, ran, agents, handler_runs, exact, [*run_a.problems(), *run_b.problems()])
+    ran: dict[Literal["a", "b"], list[AgentProgram]] = {"a": programs(run_a.record), "b": programs(run_b.record)}
+    return RunDifference(keys, ran, agents, handler_runs, exact, [*run_a.problems(), *run_b.problems()])
 
 
 class _Run:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.archive.archive import RunArchive
-from harness.archive.connectivity import Components, Connectivity, Losses, Topology
+from harness.archive.connectivity import Components, Connectivity, LossRates, Topology
 from harness.archive.exports import name_blocks
 from harness.archive.history import LATEST_S, History, end_of_traces, has_possible_time, history_of, possible_faults
 from harness.archive.replication import replication_of
@@ -24,6 +24,8 @@ from harness.report import logbook
 from harness.report.export._logs import log_files, read_log
 from harness.report.export._samples import (
     DropSample,
+    EarthPosition,
+    FieldPosition,
     HandlerRunSample,
     Level,
     LogLine,
@@ -31,8 +33,6 @@ from harness.report.export._samples import (
     MessageSample,
     MissionTime,
     NetworkSample,
-    Place,
-    Position,
     ReconcileSample,
     ReplicationSample,
     Sample,
@@ -157,14 +157,14 @@ class ExportedRun:
         ]
         return merge(*streams, key=attrgetter("at_ns"))
 
-    def positions(self) -> Iterator[Position]:
+    def positions(self) -> Iterator[FieldPosition]:
         """Yield the recorded positions of the vehicles. If there are none, yield the positions that agents logged as
         events.
         """
         positions = self._by_tracks() if self.tracks.by_vehicle else self._by_events()
         return iter(sorted(positions, key=attrgetter("at_ns")))
 
-    def _by_tracks(self) -> Iterator[Position]:
+    def _by_tracks(self) -> Iterator[FieldPosition]:
         scenario = self.archive.record.scenario
         if scenario is None:
             self._problems.append("the location of the field is unknown: positions are in metres, without a map")
@@ -173,10 +173,10 @@ class ExportedRun:
             for fix in fixes:
                 metres = fix.east_m, fix.north_m, fix.up_m
                 there = home.offset(fix.north_m, fix.east_m) if home else None
-                place = Place(there.lat_deg, there.lon_deg, there.alt_m + fix.up_m) if there else None
-                yield Position(self.time.at(fix.at_s), vehicle, metres, place)
+                place = EarthPosition(there.lat_deg, there.lon_deg, there.alt_m + fix.up_m) if there else None
+                yield FieldPosition(self.time.at(fix.at_s), vehicle, metres, place)
 
-    def _by_events(self) -> Iterator[Position]:
+    def _by_events(self) -> Iterator[FieldPosition]:
         """Yield the positions in logged events. The first one becomes the centre of the field."""
         if not self.archive.exports.by_agent:
             return
@@ -186,14 +186,14 @@ class ExportedRun:
             self._problems.append("event data is sealed to the depot: positions need --depot-key")
         for track in tracks(read):
             for timestamp_us, logged in track.fixes:
-                place = Place(*(logged.lat_e7 / 1e7, logged.lon_e7 / 1e7, logged.alt_mm / 1e3))
+                place = EarthPosition(*(logged.lat_e7 / 1e7, logged.lon_e7 / 1e7, logged.alt_mm / 1e3))
                 field = field or Home(*place)
                 at_ns = self.time.of_timestamp(timestamp_us)
                 if at_ns is None:
                     untimed += 1
                 else:
                     north_m, east_m, up_m = field.metres_to(*place)
-                    yield Position(at_ns, track.agent_id, (east_m, north_m, up_m), place)
+                    yield FieldPosition(at_ns, track.agent_id, (east_m, north_m, up_m), place)
         if untimed:
             self._problems.append(f"{untimed} logged positions with an impossible time are left out")
 
@@ -208,15 +208,15 @@ class ExportedRun:
                 yield LossSample(self.time.at(at_s), losses)
 
     def _network(self) -> Iterator[NetworkSample]:
-        def at(change: Topology | Losses) -> float:
+        def at(change: Topology | LossRates) -> float:
             return change.at_s
 
         groups: Components = ()
-        losses = Losses(0.0, 0.0, 0.0)
-        changes: list[Topology | Losses] = [*self.network.states, *self.network.losses]
+        losses = LossRates(0.0, 0.0, 0.0)
+        changes: list[Topology | LossRates] = [*self.network.states, *self.network.losses]
         for at_s, simultaneous in groupby(sorted(changes, key=at), at):
             for change in simultaneous:
-                if isinstance(change, Losses):
+                if isinstance(change, LossRates):
                     losses = change
                 else:
                     groups = change.components

@@ -8,7 +8,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 from harness.archive.connectivity import Link
-from harness.report.export._samples import Metres, Position
+from harness.report.export._samples import FieldPosition, Metres
 
 FIELD = "field"
 """The frame of the field: x is east, y north and z up, in metres from its centre."""
@@ -42,7 +42,7 @@ class Links:
         self._drawn_ns: int | None = None
         self._moved_ns = -1
 
-    def move(self, position: Position) -> list[LinkLine] | None:
+    def move(self, position: FieldPosition) -> list[LinkLine] | None:
         """Store a new position. If a picture of the previous positions is due, return its lines, otherwise None.
 
         All movements of one instant belong together, so the lines are complete when the first later movement arrives.

@@ -24,7 +24,7 @@ Metres = tuple[float, float, float]
 """East, north and up."""
 
 
-class Place(NamedTuple):
+class EarthPosition(NamedTuple):
     """A position on Earth: latitude and longitude in degrees, and altitude in metres above mean sea level."""
 
     lat_deg: float
@@ -33,7 +33,7 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Position:
+class FieldPosition:
     """The position of a vehicle at one time, relative to the centre of the field.
 
     `place` is None if the field's location is unknown.
@@ -42,7 +42,7 @@ class Position:
     at_ns: int
     vehicle: int
     metres: Metres
-    place: Place | None
+    place: EarthPosition | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ class LogLine:
 
 
 Sample = (
-    Position
+    FieldPosition
     | LossSample
     | NetworkSample
     | HandlerRunSample

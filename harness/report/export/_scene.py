@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from harness.archive.run_record import RunRecord
 from harness.present.colours import inks
 from harness.report.export._links import FIELD, LinkLine, Links, vehicle_frame
-from harness.report.export._samples import Position
+from harness.report.export._samples import FieldPosition
 
 _SIZE_M = 2.0
 _TEXT_PX = 14.0
@@ -31,7 +31,7 @@ def _colour(fill: str) -> Any:
     return Color(r=red, g=green, b=blue, a=1.0)
 
 
-class Scene:
+class FieldScene:
     """The 3D view over time. `links` contains the current loss rates."""
 
     def __init__(self, record: RunRecord, colours: Mapping[int, Any]) -> None:
@@ -39,7 +39,7 @@ class Scene:
         self._record, self._colours = record, colours
         self._drawn: set[int] = set()
 
-    def move(self, position: Position) -> Iterator[Any]:
+    def move(self, position: FieldPosition) -> Iterator[Any]:
         """Yield the updates of the view (SceneUpdate messages) that are due after a movement."""
         if (lines := self.links.move(position)) is not None:
             yield _drawn_links(position.at_ns, lines)
@@ -47,7 +47,7 @@ class Scene:
             self._drawn.add(position.vehicle)
             yield self._vehicle(position)
 
-    def _vehicle(self, position: Position) -> Any:
+    def _vehicle(self, position: FieldPosition) -> Any:
         vehicle_record = self._record.vehicles.get(str(position.vehicle), {})
         update = SceneUpdate()
         entity = update.entities.add(id=vehicle_frame(position.vehicle), frame_locked=True)

@@ -71,7 +71,7 @@ SCHEMAS: dict[str, Schema] = {
 }
 
 
-class Topics:
+class TopicConverter:
     """Converts recorded values to JSON objects. `schemas` contains the JSON schemas of all used topics by name."""
 
     def __init__(self, recording: ExportedRun) -> None:

@@ -15,8 +15,8 @@ from harness.archive.exports import MAX_EXPORT_BYTES, RUN_FILE, export_paths
 from harness.errors import extra
 from harness.report.export._exported_run import ExportedRun
 from harness.report.export._links import FIELD, vehicle_frame
-from harness.report.export._samples import LogLine, LossSample, Position, Telemetry
-from harness.report.export._topics import Topics
+from harness.report.export._samples import FieldPosition, LogLine, LossSample, Telemetry
+from harness.report.export._topics import TopicConverter
 from ucp.plain_file import read_plain_file
 
 with extra("export", "writing MCAP"):
@@ -27,7 +27,7 @@ with extra("export", "writing MCAP"):
     from mcap.writer import Writer
     from mcap_protobuf.schema import register_schema
 
-    from harness.report.export._scene import Scene, colours_of
+    from harness.report.export._scene import FieldScene, colours_of
 
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO, Log.INFO, Log.DEBUG)
@@ -46,11 +46,11 @@ def write_mcap(recording: ExportedRun, path: Path, progress: Callable[[float], N
 
 def _write(recording: ExportedRun, writer: "_Writer", progress: Callable[[float], None]) -> int:
     colours = colours_of(recording.agents)
-    topics, scene = Topics(recording), Scene(recording.archive.record, colours)
+    topics, scene = TopicConverter(recording), FieldScene(recording.archive.record, colours)
     for sample in recording.samples():
         at_ns = sample.at_ns
         match sample:
-            case Position():
+            case FieldPosition():
                 writer.position(sample, colours[sample.vehicle])
                 for update in scene.move(sample):
                     writer.message("/scene", at_ns, update)
@@ -83,7 +83,7 @@ class _Writer:
         self._channels: dict[str, int] = {}
         self.messages = 0
 
-    def position(self, position: Position, colour: Any) -> None:
+    def position(self, position: FieldPosition, colour: Any) -> None:
         """Write a position, both for the map and for the 3D view."""
         frame = vehicle_frame(position.vehicle)
         transform = FrameTransform(parent_frame_id=FIELD, child_frame_id=frame)

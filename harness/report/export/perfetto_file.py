@@ -18,7 +18,14 @@ from typing import IO, Any
 from harness.archive.history import Message
 from harness.errors import extra
 from harness.report.export._exported_run import ExportedRun
-from harness.report.export._samples import HandlerRunSample, LogLine, NetworkSample, Position, ReplicationSample, Sample
+from harness.report.export._samples import (
+    FieldPosition,
+    HandlerRunSample,
+    LogLine,
+    NetworkSample,
+    ReplicationSample,
+    Sample,
+)
 from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
@@ -141,7 +148,7 @@ class _Trace:
                 held = {"chain": run.state.chain, "deque": run.state.deque, "stack": run.state.stack}
                 for name, blocks in held.items():
                     yield from self._count(at_ns, _agent(agent), f"{name} (blocks)", blocks)
-            case Position(vehicle=vehicle, metres=metres):
+            case FieldPosition(vehicle=vehicle, metres=metres):
                 yield from self._count(at_ns, _agent(vehicle), "altitude (m)", metres[2])
             case NetworkSample():
                 yield from self._count(at_ns, SWARM, "mean loss (%)", 100 * sample.mean_loss)

@@ -18,12 +18,12 @@ from harness.errors import MachineError, extra
 from harness.report.export._exported_run import ExportedRun
 from harness.report.export._links import FIELD, LinkLine, Links, vehicle_frame
 from harness.report.export._samples import (
+    FieldPosition,
     HandlerRunSample,
     LogLine,
     LossSample,
     Metres,
     NetworkSample,
-    Position,
     Sample,
     Telemetry,
 )
@@ -113,7 +113,7 @@ class _Messages:
     def _of(self, sample: Sample) -> Iterator[tuple[str, Any]]:
         at_ns = sample.at_ns
         match sample:
-            case Position(vehicle=vehicle):
+            case FieldPosition(vehicle=vehicle):
                 if (lines := self._links.move(sample)) is not None:
                     yield "/links", _markers(at_ns, lines)
                 yield "/tf", _transform(sample)
@@ -171,7 +171,7 @@ def _bytes(data: bytes) -> Any:
     return _message("std_msgs/msg/UInt8MultiArray", layout=layout, data=numpy.frombuffer(data, numpy.uint8))
 
 
-def _fix(position: Position) -> Any:
+def _fix(position: FieldPosition) -> Any:
     assert position.place is not None
     lat_deg, lon_deg, alt_m = position.place
     return _message(
@@ -194,7 +194,7 @@ def _quaternion() -> Any:
     return _message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
 
 
-def _transform(position: Position) -> Any:
+def _transform(position: FieldPosition) -> Any:
     transform = _message(
         "geometry_msgs/msg/TransformStamped",
         header=_header(position.at_ns, FIELD),

@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from harness.archive.history import COMMITTED_BY, LATEST_S, ActivityStart, HistoryReader, Reconcile, Tie, Vote
+from harness.archive.history import COMMITTED_BY, LATEST_S, ActivityStart, HistoryReader, Phase2Tie, Reconcile, Vote
 from harness.archive.traces import Header, HeldBlocks, parse_line
 from harness.report.live._live_trace import AgentTrace
 from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
@@ -171,7 +171,7 @@ class AgentCourse:
                     self._add_activity(run.t, "voted", step.outcome[:80])
                 case Reconcile():
                     self._add_activity(run.t, "reconciled", "")
-                case Tie():
+                case Phase2Tie():
                     self._add_activity(run.t, "tie", step.branch[:80])
 
     def _add_activity(self, t: float, activity: str, detail: str) -> None:

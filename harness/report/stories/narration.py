@@ -76,7 +76,7 @@ class AgentReaction:
         return asked_by is not None and asked_by != self.agent_id and not self.has_effect
 
 
-class Narrator:
+class StoryWriter:
     """Writes a story from the traces of all agents."""
 
     def __init__(self, traces: Mapping[int, Trace], roster: Sequence[int]) -> None:

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from harness.scenario.strict_model import VehicleId
 from harness.scenario.vehicles import Vehicles
-from sitl.circumstances import Circumstance
+from sitl.circumstances import SimulatedFailure
 
 AgentIds = Annotated[list[VehicleId], Field(min_length=1)]
 DiskState = Literal["kept", "lost"]
@@ -61,7 +61,9 @@ class AgentOperations(Protocol):
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:
         """Send a message from the ground that excludes the agent. The vehicles in `heard_by` receive it."""
 
-    async def set_circumstance(self, agent_id: int, what: str, circumstance: Circumstance, *, by_hand: bool) -> None:
+    async def set_circumstance(
+        self, agent_id: int, what: str, circumstance: SimulatedFailure, *, by_hand: bool
+    ) -> None:
         """Let the vehicle of the agent simulate an event such as a GPS failure. The run record states whether it
         could.
         """

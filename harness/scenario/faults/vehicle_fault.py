@@ -21,7 +21,7 @@ from sitl.circumstances import (
     RC_REGAINED,
     STATION_LOST,
     STATION_REGAINED,
-    Circumstance,
+    SimulatedFailure,
     battery,
 )
 from sitl.circumstances import wind as wind_circumstance
@@ -41,7 +41,7 @@ class VehicleFault(Fault):
     """Types of vehicles that can have this fault."""
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         """The event, such as a GPS failure, that the vehicles simulate."""
         raise NotImplementedError
 
@@ -80,7 +80,7 @@ class Battery(VehicleFault):
     meaning = HAS_FAULT
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return battery(self.volts)
 
     @property
@@ -96,7 +96,7 @@ class BreachFence(VehicleFault):
     meaning = HAS_FAULT
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return FENCE_BREACHED
 
 
@@ -108,7 +108,7 @@ class LiftFence(VehicleFault):
     meaning = RECOVERED
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return FENCE_LIFTED
 
 
@@ -120,7 +120,7 @@ class LoseCompass(VehicleFault):
     meaning = HAS_FAULT
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return COMPASS_LOST
 
 
@@ -132,7 +132,7 @@ class RegainCompass(VehicleFault):
     meaning = RECOVERED
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return COMPASS_REGAINED
 
 
@@ -144,7 +144,7 @@ class LoseGcs(VehicleFault):
     meaning = HAS_FAULT
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return STATION_LOST
 
 
@@ -156,7 +156,7 @@ class RegainGcs(VehicleFault):
     meaning = RECOVERED
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return STATION_REGAINED
 
 
@@ -168,7 +168,7 @@ class LoseGps(VehicleFault):
     meaning = HAS_FAULT
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return GPS_LOST
 
 
@@ -180,7 +180,7 @@ class RegainGps(VehicleFault):
     meaning = RECOVERED
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return GPS_REGAINED
 
 
@@ -192,7 +192,7 @@ class LoseRc(VehicleFault):
     meaning = HAS_FAULT
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return RC_LOST
 
 
@@ -204,7 +204,7 @@ class RegainRc(VehicleFault):
     meaning = RECOVERED
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return RC_REGAINED
 
 
@@ -217,7 +217,7 @@ class StopMotor(VehicleFault):
     meaning = HAS_FAULT
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return MOTOR_STOPPED
 
 
@@ -240,7 +240,7 @@ class Wind(VehicleFault):
     meaning = HAS_FAULT
 
     @property
-    def circumstance(self) -> Circumstance:
+    def circumstance(self) -> SimulatedFailure:
         return wind_circumstance(self.wind_ms, self.from_deg)
 
     @property

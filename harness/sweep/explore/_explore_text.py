@@ -8,7 +8,7 @@ from rich.console import Console
 
 from harness.run.simulate import ENDED, evidence_lines
 from harness.scenario.verdict_names import BAD_IN_WORDS
-from harness.sweep.explore._exploring import Explored, Violation, Watcher
+from harness.sweep.explore._exploring import Explored, SearchProgress, Violation
 
 _WORDS = {**BAD_IN_WORDS, ENDED: "an agent crashed or hung"}
 
@@ -20,7 +20,7 @@ CLEAR_LINE = "\r\x1b[2K"
 
 
 @contextlib.contextmanager
-def watching(console: Console) -> Iterator[Watcher]:
+def watching(console: Console) -> Iterator[SearchProgress]:
     """Yield functions that print violations and the progress of the reduction.
 
     On a terminal, the progress is one line that is redrawn. Elsewhere it is a line every ten seconds.
@@ -44,7 +44,7 @@ def watching(console: Console) -> Iterator[Watcher]:
                 console.print(so_far, highlight=False, soft_wrap=True)
 
     try:
-        yield Watcher(on_violation, on_step, shown=True)
+        yield SearchProgress(on_violation, on_step, shown=True)
     finally:
         if console.is_terminal:
             console.file.write(CLEAR_LINE)

@@ -24,7 +24,7 @@ class Violation:
 
 
 @dataclass
-class Searched:
+class SearchResult:
     """The result of a search for a violation.
 
     `failed` maps a seed to the reason why its run has no verdict. `unfinished` has the seeds of the runs that only
@@ -38,13 +38,13 @@ class Searched:
     interrupted: bool = False
 
 
-def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> Searched:
+def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> SearchResult:
     """Play the seeds in order until a run violates a check. A swarm that only needs more time does not count.
 
     The result is the first such seed, for any number of `jobs`. Ctrl-C ends the search early. Raises HarnessError if
     the scenario cannot be played.
     """
-    searched = Searched()
+    searched = SearchResult()
 
     def verdict(seed: int) -> tuple[tuple[str, ...], bool]:
         result = judge(scenario, seed)
@@ -74,7 +74,7 @@ SEEDS = 1000
 
 
 @dataclass(frozen=True)
-class Shrunk:
+class ShrunkScenario:
     """The smallest scenario that still violates: its file, and the number of steps that led to it."""
 
     path: Path
@@ -92,8 +92,8 @@ class Explored:
     ended the search or the shrinking.
     """
 
-    searched: Searched
-    shrunk: Shrunk | None = None
+    searched: SearchResult
+    shrunk: ShrunkScenario | None = None
     interrupted: bool = False
 
     @property
@@ -106,7 +106,7 @@ class Explored:
 
 
 @dataclass(frozen=True)
-class Watcher:
+class SearchProgress:
     """Functions that report progress. `on_step` is called with the number of runs so far, and the size of the scenario
     as text.
     """
@@ -125,7 +125,7 @@ def explore(
     jobs: int | None = None,
     judge: Judge = simulated,
     max_runs: int = MAX_RUNS,
-    watcher: Watcher | None = None,
+    watcher: SearchProgress | None = None,
 ) -> Explored:
     """Play a scenario in virtual time with one seed after another, and reduce the first run that violates a check.
 
@@ -139,7 +139,7 @@ def explore(
     Raises HarnessError if the scenario cannot be played, the file cannot be written, or an agent behaves differently in
     two runs of the same seed.
     """
-    watcher, jobs, source = watcher or Watcher(), jobs or cores(), source or scenario.name
+    watcher, jobs, source = watcher or SearchProgress(), jobs or cores(), source or scenario.name
     path = choose_path(out, scenario.name)
     if scenario.foreign:
         check_determinism(scenario, seeds[0])
@@ -205,7 +205,7 @@ def _written(
     words: str,
     judge: Judge,
     recorded: Callable[[Document], Recording],
-) -> Shrunk:
+) -> ShrunkScenario:
     result = judge(scenario_of(document), seed)
     judgements = {key: result.judgements[key] for key in result.wrong}
     replay = f"ucp-harness run {path} --backend sim --seed {seed}"
@@ -215,4 +215,4 @@ def _written(
         f"  {replay}",
     ]
     written = write_new_file(path, file_of(document, header, recorded(document)))
-    return Shrunk(written, seed, judgements, words, replay.replace(str(path), str(written)))
+    return ShrunkScenario(written, seed, judgements, words, replay.replace(str(path), str(written)))

@@ -25,7 +25,7 @@ from ucp.trigger import MessageTrigger
 
 
 @dataclass(frozen=True, slots=True)
-class Logged:
+class RecordedEvent:
     """A logged event of an agent. `completes` is true if it completed a block."""
 
     at_s: float
@@ -35,7 +35,7 @@ class Logged:
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
+class LostMessage:
     """A message that `receiver` did not receive. It was number `count` of its type from `sender`, sent at `at_s`.
 
     `by_quirk` is true if the message arrived and the receiver ignored it.
@@ -55,8 +55,8 @@ class Recording:
     """A recorded run with its verdict. Events and lost messages are in order of time."""
 
     result: Result
-    logged: list[Logged]
-    lost: list[Lost]
+    logged: list[RecordedEvent]
+    lost: list[LostMessage]
 
 
 def record(scenario: Scenario, seed: int) -> Recording:
@@ -72,16 +72,16 @@ def record(scenario: Scenario, seed: int) -> Recording:
 class _Recorder(MemoryRecorder):
     def __init__(self) -> None:
         super().__init__(tracing=True)
-        self.events: list[Logged] = []
-        self.lost: list[Lost] = []
-        self.sent: dict[tuple[int, int], Lost] = {}
+        self.events: list[RecordedEvent] = []
+        self.lost: list[LostMessage] = []
+        self.sent: dict[tuple[int, int], LostMessage] = {}
         """(sender, sequence) of each Commit Block -> its entry in `lost`, should a receiver ignore it."""
         self._last_of: dict[int, int] = {}
         self._counts: Counter[int] = Counter()
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
         self._last_of[agent_id] = len(self.events)
-        self.events.append(Logged(at_s, agent_id, data_bytes, completes=False))
+        self.events.append(RecordedEvent(at_s, agent_id, data_bytes, completes=False))
 
     def write(self, agent_id: int, entries: list[Entry]) -> None:
         super().write(agent_id, entries)
@@ -90,17 +90,17 @@ class _Recorder(MemoryRecorder):
                 continue
             if run.handler == "build_data_block" and run.branch == "full" and agent_id in self._last_of:
                 last = self.events[self._last_of[agent_id]]
-                self.events[self._last_of[agent_id]] = Logged(last.at_s, last.agent, last.bytes, completes=True)
+                self.events[self._last_of[agent_id]] = RecordedEvent(last.at_s, last.agent, last.bytes, completes=True)
             for sent in run.sent:
                 if sent.message == CommitBlock.NAME:
                     self._counts[agent_id] += 1
                     count = self._counts[agent_id]
-                    self.sent[agent_id, sent.seq] = Lost(run.t, sent.message, agent_id, 0, count, None)
+                    self.sent[agent_id, sent.seq] = LostMessage(run.t, sent.message, agent_id, 0, count, None)
             if run.branch == "ignored by quirk" and isinstance(run.trigger, MessageTrigger):
                 lost = self.sent.get((run.trigger.sender, run.trigger.sequence))
                 if lost is not None:  # a rogue node's is no agent's
                     self.lost.append(
-                        Lost(lost.at_s, lost.message, lost.sender, agent_id, lost.count, None, by_quirk=True)
+                        LostMessage(lost.at_s, lost.message, lost.sender, agent_id, lost.count, None, by_quirk=True)
                     )
 
 
@@ -127,5 +127,5 @@ class _RecordingScript(FateScript):
             if receiver != sender and number not in reached and hears(number):
                 count = self._sent[message.NAME, sender]
                 name = self._name(block_hash) if block_hash else None
-                self._tape.lost.append(Lost(now, message.NAME, sender, receiver, count, name))
+                self._tape.lost.append(LostMessage(now, message.NAME, sender, receiver, count, name))
         return decided

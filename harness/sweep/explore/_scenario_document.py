@@ -11,7 +11,7 @@ from harness.scenario import Scenario
 from harness.scenario.faults import TIMELINE_FAULTS
 from harness.scenario.injection import INJECTIONS
 from harness.scenario.strict_model import format_pairs, parse_pairs
-from harness.sweep.explore._recording import Logged, Lost
+from harness.sweep.explore._recording import LostMessage, RecordedEvent
 
 Document = dict[str, Any]
 
@@ -48,7 +48,7 @@ def at(document: Document, key: str) -> Any:
     return value
 
 
-def with_script(document: Document, logged: list[Logged], drops: list[Document]) -> Document:
+def with_script(document: Document, logged: list[RecordedEvent], drops: list[Document]) -> Document:
     """Replace all random parts of the document: exactly these events are logged, and exactly these messages are
     lost.
     """
@@ -70,12 +70,12 @@ def with_drops(document: Document, drops: list[Document]) -> Document:
     return with_key(document, "fates", [*drops, *others])
 
 
-def event_of(event: Logged) -> Document:
+def event_of(event: RecordedEvent) -> Document:
     size = {} if event.bytes == 256 else {"bytes": event.bytes}
     return {"at_s": event.at_s, "agent": event.agent, **size}
 
 
-def fate_by_count(lost: Lost) -> Document:
+def fate_by_count(lost: LostMessage) -> Document:
     return {
         "message": lost.message,
         "sender": lost.sender,
@@ -85,7 +85,7 @@ def fate_by_count(lost: Lost) -> Document:
     }
 
 
-def fate_by_time(lost: Lost, slack_s: float) -> Document:
+def fate_by_time(lost: LostMessage, slack_s: float) -> Document:
     """Return a rule that loses all messages of this type from this sender at about this time.
 
     It stays valid when other messages disappear from the run.

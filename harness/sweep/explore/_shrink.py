@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from harness.run.parallel import sweep
 from harness.scenario import Scenario
 from harness.scenario.scenario_file import to_yaml
-from harness.sweep.explore._recording import Lost, Recording
+from harness.sweep.explore._recording import LostMessage, Recording
 from harness.sweep.explore._scenario_document import Document, at
 
 T = TypeVar("T")
@@ -123,7 +123,9 @@ def file_of(document: Document, header: list[str], recording: Recording) -> str:
 
     `recording` belongs to this document, and supplies sending times for comments.
     """
-    sent: dict[Any, Lost] = {(lost.message, lost.sender, lost.receiver, lost.count): lost for lost in recording.lost}
+    sent: dict[Any, LostMessage] = {
+        (lost.message, lost.sender, lost.receiver, lost.count): lost for lost in recording.lost
+    }
 
     def remark(entry: Document) -> str | None:
         key = entry.get("message"), entry.get("sender"), entry.get("receiver"), _hashable(entry.get("count"))

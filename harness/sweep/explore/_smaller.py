@@ -11,7 +11,7 @@ from itertools import combinations
 from typing import Any
 
 from harness.scenario import Scenario
-from harness.sweep.explore._recording import Logged, Recording
+from harness.sweep.explore._recording import RecordedEvent, Recording
 from harness.sweep.explore._scenario_document import (
     Document,
     at,
@@ -167,7 +167,9 @@ def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
     if at(document, "settings.max_block_bytes") == largest or not script(document):
         return
     size = min(256, largest - EVENT_HEADER_BYTES)
-    events = [Logged(event.at_s, event.agent, size, True) for event in record(document).logged if event.completes]
+    events = [
+        RecordedEvent(event.at_s, event.agent, size, True) for event in record(document).logged if event.completes
+    ]
     smaller = with_key(document, "events.script", [event_of(event) for event in events])
     shrinker.first([with_key(smaller, "settings.max_block_bytes", largest)])
 

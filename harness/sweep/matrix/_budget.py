@@ -1,6 +1,6 @@
 """Choose the order of runs when the time does not suffice for all of them: the most informative cell first.
 
-A further run tells most about the cell whose figures are least certain. Every cell therefore begins with two runs. From
+A further run helps most in the cell whose figures are least certain. Every cell therefore begins with two runs. From
 then on, the next run belongs to the cell with the widest interval: that of the share of runs with one chain, or that of
 the messages per block relative to their mean. Cells whose runs agree stay at a few runs, and the time goes to the cells
 whose runs differ.

@@ -13,7 +13,7 @@ from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Esti
 from harness.sweep.matrix._matrix_file import Point, Task
 
 
-class AtPoint(BaseModel):
+class CellRecord(BaseModel):
     """The base class of all records that belong to one combination of values in the matrix."""
 
     model_config = ConfigDict(frozen=True)
@@ -28,7 +28,7 @@ class AtPoint(BaseModel):
         return Point(self.loss, self.agents, self.backend, self.duration_s)
 
 
-class Run(AtPoint):
+class Run(CellRecord):
     """The result of one run: its figures, and its verdicts by number or key.
 
     A run without a verdict has a reason: in `failed` for an error, or in `unsupported` if an agent lacks a feature.
@@ -53,7 +53,7 @@ class Run(AtPoint):
         return Task(self.point, self.seed)
 
 
-class Cell(AtPoint):
+class Cell(CellRecord):
     """The summary of the runs with one combination of values. `failed` and `unsupported` count runs without figures.
 
     `estimates` has an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` has the seeds

@@ -23,7 +23,7 @@ from harness.sweep.matrix._matrix_file import Matrix, Point, Task
 from harness.sweep.matrix._run_steps import fingerprint
 
 
-class Judged(NamedTuple):
+class JudgedRun(NamedTuple):
     """A judged run. `steps` is its fingerprint, empty without traces."""
 
     played: RunOutcome
@@ -31,7 +31,7 @@ class Judged(NamedTuple):
     steps: str = ""
 
 
-Judge = Callable[[Scenario, int], Judged]
+Judge = Callable[[Scenario, int], JudgedRun]
 """Plays a scenario with a seed and judges the run."""
 
 
@@ -42,21 +42,21 @@ class RunFailedError(HarnessError):
 
 
 @gc_paused()
-def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> Judged:
+def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> JudgedRun:
     """Simulate a run in virtual time, and judge it. Every step is judged if `tracing` is true."""
     from harness.run.simulate import simulate
 
     run = simulate(scenario, seed, tracing=tracing)
-    return Judged(run.played, run.result, fingerprint(run.evidence.traces))
+    return JudgedRun(run.played, run.result, fingerprint(run.evidence.traces))
 
 
 @gc_paused()
-def play_with_coverage(scenario: Scenario, seed: int, reached: ReachedStates) -> Judged:
+def play_with_coverage(scenario: Scenario, seed: int, reached: ReachedStates) -> JudgedRun:
     """Simulate a run with traces, and add its coverage to `reached`."""
     watcher = CoverageWatcher()
     run = simulate_watched(scenario, seed, watcher.step)
     reached.add(watcher.reached)
-    return Judged(run.played, run.result, fingerprint(run.evidence.traces))
+    return JudgedRun(run.played, run.result, fingerprint(run.evidence.traces))
 
 
 def _same_twice(scenario: Scenario, seed: int) -> None:
@@ -66,7 +66,7 @@ def _same_twice(scenario: Scenario, seed: int) -> None:
 
 
 @dataclass(frozen=True)
-class Player:
+class RunPlayer:
     """Plays any run of `matrix`. Runs with real programs leave directories in `directory`. `judge` plays simulated
     runs.
     """
@@ -113,7 +113,7 @@ class Player:
         for point in points:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
-    def _play_with_processes(self, scenario: Scenario, task: Task, reached: ReachedStates | None) -> Judged:
+    def _play_with_processes(self, scenario: Scenario, task: Task, reached: ReachedStates | None) -> JudgedRun:
         """Play a run with real programs. Raises UnsupportedError, or RunFailedError that names the run directory."""
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # remains of an interrupted run
@@ -131,7 +131,7 @@ class Player:
             reached.add(reached_in(gather(RunArchive(directory))))
         if not finished.result.bad and self.matrix.keep == "violated":
             shutil.rmtree(directory)
-        return Judged(finished.played, finished.result)
+        return JudgedRun(finished.played, finished.result)
 
 
 def directory_name(task: Task) -> str:

@@ -16,13 +16,13 @@ from collections.abc import Iterator, Sequence
 from pydantic import BaseModel, Field
 
 from harness.play.backends import BACKENDS
-from harness.sweep.matrix._cell import AtPoint, Cell, Run
+from harness.sweep.matrix._cell import Cell, CellRecord, Run
 from harness.sweep.matrix._estimate import BY_NAME, CONFIDENCE, Estimate, Metric, estimate_mean
 from harness.sweep.matrix._matrix_file import Point
 from harness.sweep.matrix._run_steps import FirstChange
 
 
-class Change(AtPoint):
+class Change(CellRecord):
     """A changed figure. `metric` was `before` and is `now`.
 
     `difference` is the mean difference of the runs with the same seed, with its corrected interval. It is null if the
@@ -36,7 +36,7 @@ class Change(AtPoint):
     difference: Estimate | None = None
 
 
-class ChangedRuns(AtPoint):
+class ChangedRuns(CellRecord):
     """The seeds of the simulated runs that differ from the earlier night, among `pairs` compared runs.
 
     `first` has the first changed handler run of the first `MAX_NAMED` of them.
@@ -58,7 +58,7 @@ class CulpritCommit(BaseModel):
     after: float | None
 
 
-class Culprit(AtPoint):
+class Culprit(CellRecord):
     """The commits that changed a worse figure of the run with this seed, oldest first.
 
     `problem` is the reason why the search did not find all of them, or null.

@@ -8,14 +8,14 @@ from pydantic import BaseModel
 from harness.proof import Bounds
 from harness.proof.coverage import ReachedStates, existing, to_json
 from harness.proof.coverage.reached import BRANCHES
-from harness.sweep.matrix._cell import AtPoint
+from harness.sweep.matrix._cell import CellRecord
 from harness.sweep.matrix._matrix_file import Matrix, Point
 
 MOST_AGENTS, MOST_BLOCKS = 3, 3
 """Bounds of the states that coverage is compared with: numbers of agents and blocks."""
 
 
-class CellCoverage(AtPoint):
+class CellCoverage(CellRecord):
     """The coverage by the runs with one combination of values, as far as this command played them."""
 
     local_states: int

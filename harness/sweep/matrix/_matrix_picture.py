@@ -46,7 +46,7 @@ PANELS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Dot:
+class LinePoint:
     """A point of a line: an estimate with its horizontal position and its tooltip."""
 
     x: float
@@ -166,7 +166,8 @@ def _panel(placed: PlacedPanel, cells: Sequence[Cell]) -> Markup:
 def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axis, up: Axis) -> Markup:
     """Draw a line, and its name beside its middle."""
     known = [
-        Dot(cell.loss, cell.estimates[name], f"{text.percent(cell.loss)} loss: {_say(name, cell)}") for cell in cells
+        LinePoint(cell.loss, cell.estimates[name], f"{text.percent(cell.loss)} loss: {_say(name, cell)}")
+        for cell in cells
     ]
     drawing, points = curve(number, known, across, up)
     if label and points:
@@ -177,7 +178,7 @@ def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axi
     return Markup('<g class="series {}">{}</g>').format(svg.CLASSES[number], drawing)
 
 
-def curve(number: int, dots: Sequence[Dot], across: Axis, up: Axis) -> tuple[Markup, list[tuple[float, float]]]:
+def curve(number: int, dots: Sequence[LinePoint], across: Axis, up: Axis) -> tuple[Markup, list[tuple[float, float]]]:
     """Draw line `number` of a chart with its band of confidence intervals. Return the drawing and the points.
 
     Unknown means are left out.

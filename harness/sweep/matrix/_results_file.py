@@ -24,7 +24,7 @@ FILE = "results.jsonl"
 SCHEMA = "ucp-matrix-results/1"
 
 
-class Results:
+class MatrixResults:
     """The finished runs of a matrix, at most one for each task."""
 
     def __init__(self, directory: Path, started_at: str, runs: dict[Task, Run], file: BinaryIO) -> None:
@@ -46,7 +46,7 @@ class Results:
 
 
 @contextlib.contextmanager
-def opened(directory: Path, matrix: Matrix) -> Iterator[Results]:
+def opened(directory: Path, matrix: Matrix) -> Iterator[MatrixResults]:
     """Open the results of `matrix` in `directory`, which may be new or empty.
 
     Raises RunDirectoryError if the directory holds other files, or if another command uses it.
@@ -71,7 +71,7 @@ def opened(directory: Path, matrix: Matrix) -> Iterator[Results]:
         started_at = _start_time(first, matrix, directory)
         file.truncate(whole)
         file.seek(whole)
-        yield Results(directory, started_at, _read(lines, matrix, path), file)
+        yield MatrixResults(directory, started_at, _read(lines, matrix, path), file)
 
 
 def _header(matrix: Matrix) -> dict[str, Any]:

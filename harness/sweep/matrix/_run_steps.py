@@ -24,7 +24,7 @@ MAX_STEPS = 4000
 _BYTES = 2
 
 
-class Step(NamedTuple):
+class HandlerStep(NamedTuple):
     """A handler run and its agent."""
 
     t: float
@@ -74,13 +74,13 @@ def name_change(scenario: Scenario, seed: int, position: int) -> FirstChange:
     )
 
 
-def _steps(traces: Mapping[int, Trace]) -> list[Step]:
+def _steps(traces: Mapping[int, Trace]) -> list[HandlerStep]:
     """Return the handler runs with an effect of all agents, in the order of mission time."""
-    steps = (Step(run.t, agent_id, run) for agent_id, trace in sorted(traces.items()) for run in trace.runs)
+    steps = (HandlerStep(run.t, agent_id, run) for agent_id, trace in sorted(traces.items()) for run in trace.runs)
     return sorted((step for step in steps if step.run.sent or not only_receives(step.run)), key=lambda step: step.t)
 
 
-def _digest(step: Step) -> int:
+def _digest(step: HandlerStep) -> int:
     run = step.run
     sent = [(message.message, message.seq, message.block) for message in run.sent]
     facts = (round(step.t, 6), step.agent_id, run.handler, run.branch, [*map(tuple, run.changes)], sent)

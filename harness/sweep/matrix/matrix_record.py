@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
 from harness.errors import CANNOT_HERE, INCOMPLETE, INTERRUPTED, VIOLATED
-from harness.sweep.matrix._cell import AtPoint, Cell, Run
+from harness.sweep.matrix._cell import Cell, CellRecord, Run
 from harness.sweep.matrix._comparison import Comparison
 from harness.sweep.matrix._growth import Growth
 from harness.sweep.matrix._matrix_coverage import MatrixCoverage
@@ -18,7 +18,7 @@ from harness.sweep.matrix._matrix_file import Matrix
 SCHEMA = "ucp-matrix/1"
 
 
-class RunWithoutResult(AtPoint):
+class RunWithoutResult(CellRecord):
     """A run without a result, and the reason."""
 
     seed: int

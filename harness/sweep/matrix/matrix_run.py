@@ -15,14 +15,14 @@ from harness.run.provenance import versions
 from harness.scenario import Scenario
 from harness.sweep.matrix._budget import informative
 from harness.sweep.matrix._cell import Run, sum_up
-from harness.sweep.matrix._cell_play import Judge, Player, simulated
+from harness.sweep.matrix._cell_play import Judge, RunPlayer, simulated
 from harness.sweep.matrix._cluster import cluster
 from harness.sweep.matrix._comparison import Comparison, compare, compare_pairs, is_paired
 from harness.sweep.matrix._culprits import find_culprits
 from harness.sweep.matrix._growth import growths
 from harness.sweep.matrix._matrix_coverage import CoverageTally
 from harness.sweep.matrix._matrix_file import Matrix, Point, Task
-from harness.sweep.matrix._results_file import Results, opened
+from harness.sweep.matrix._results_file import MatrixResults, opened
 from harness.sweep.matrix._run_steps import FirstChange, first_changed, name_change
 from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
 from harness.sweep.matrix.nights import Baseline
@@ -90,10 +90,10 @@ def run_matrix(
 
 
 def _run_missing(
-    matrix: Matrix, results: Results, spread: Spread, judge: Judge, covers: bool, budget_s: float | None
+    matrix: Matrix, results: MatrixResults, spread: Spread, judge: Judge, covers: bool, budget_s: float | None
 ) -> Finished:
     started = time.monotonic()
-    play = Player(matrix, results.directory / "runs", judge, covers)
+    play = RunPlayer(matrix, results.directory / "runs", judge, covers)
     tasks = [task for task in matrix.tasks if task not in results.runs]
     if matrix.grows:  # the longest runs first, so that no core waits for a long run at the end
         tasks.sort(key=lambda task: _effort(matrix.scenario_at(task.point)), reverse=True)

@@ -23,7 +23,7 @@ SIGNIFICANT_DIGITS = 4
 
 
 @dataclass(frozen=True)
-class Compared:
+class ComparedValue:
     """A value that is compared for each pair of runs. `of` returns None if a run does not determine it."""
 
     label: str
@@ -54,25 +54,25 @@ def _bad(*keys: str) -> Callable[[Run], float | None]:
 
 
 COMPARED = (
-    Compared("blocks that are not in every chain", _missing_blocks),
-    Compared("messages", _figure("messages")),
-    Compared("messages per block", _figure("messages_per_block")),
-    Compared("reconciles", _figure("reconciles")),
-    Compared("seconds to one chain", _figure("uniform_at_s")),
-    Compared("distinct chains at the end", _figure("distinct_chains")),
-    Compared("runs that end with a fork", _forked, "share"),
-    Compared("runs with a livelock", _verdict("liveness", "never finishes"), "share"),
-    Compared("runs that are not finished", _verdict("liveness", "not finished"), "share"),
-    Compared("runs that violate a characteristic", _bad(*CHARACTERISTICS), "share"),
-    Compared("runs with a step that deviates", _bad("steps"), "share"),
+    ComparedValue("blocks that are not in every chain", _missing_blocks),
+    ComparedValue("messages", _figure("messages")),
+    ComparedValue("messages per block", _figure("messages_per_block")),
+    ComparedValue("reconciles", _figure("reconciles")),
+    ComparedValue("seconds to one chain", _figure("uniform_at_s")),
+    ComparedValue("distinct chains at the end", _figure("distinct_chains")),
+    ComparedValue("runs that end with a fork", _forked, "share"),
+    ComparedValue("runs with a livelock", _verdict("liveness", "never finishes"), "share"),
+    ComparedValue("runs that are not finished", _verdict("liveness", "not finished"), "share"),
+    ComparedValue("runs that violate a characteristic", _bad(*CHARACTERISTICS), "share"),
+    ComparedValue("runs with a step that deviates", _bad("steps"), "share"),
 )
 
 
 @dataclass(frozen=True)
-class Row:
+class ComparisonRow:
     """One line of the page: the means of the original and the variant, and the mean difference of the pairs."""
 
-    compared: Compared
+    compared: ComparedValue
     original: float | None
     variant: float | None
     difference: Estimate
@@ -95,7 +95,7 @@ class VariantComparison:
 
     variant: Variant
     matrix: Matrix
-    rows: dict[Point, list[Row]]
+    rows: dict[Point, list[ComparisonRow]]
 
     def to_json(self) -> dict[str, Any]:
         cells = [{**point._asdict(), "rows": [row.to_json() for row in rows]} for point, rows in self.rows.items()]
@@ -135,15 +135,15 @@ def compare_runs(variant: Variant, matrix: Matrix, original: Finished, changed: 
     return VariantComparison(variant, matrix, rows)
 
 
-def _row(compared: Compared, pairs: Sequence[tuple[Run, Run]]) -> Row:
+def _row(compared: ComparedValue, pairs: Sequence[tuple[Run, Run]]) -> ComparisonRow:
     known = [
         (run.seed, before, after)
         for original, run in pairs
         if (before := compared.of(original)) is not None and (after := compared.of(run)) is not None
     ]
     if not known:
-        return Row(compared, None, None, Estimate(n=0), [])
-    return Row(
+        return ComparisonRow(compared, None, None, Estimate(n=0), [])
+    return ComparisonRow(
         compared,
         sum(before for _, before, _ in known) / len(known),
         sum(after for *_, after in known) / len(known),
@@ -152,7 +152,7 @@ def _row(compared: Compared, pairs: Sequence[tuple[Run, Run]]) -> Row:
     )
 
 
-def _line(row: Row) -> str:
+def _line(row: ComparisonRow) -> str:
     difference = row.difference
 
     def said(value: float | None, *, signed: bool = False) -> str:

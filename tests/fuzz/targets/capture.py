@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from harness.archive.packets import packets_text
 from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import read_captures
-from harness.archive.packets.exchanges import Exchanges, count_losses
+from harness.archive.packets.exchanges import RequestAnswers, count_losses
 from harness.archive.packets.packets_document import document
 from harness.archive.packets.packets_text import TransmissionText
 from harness.archive.packets.pcap import OUTBOUND, CaptureFile, Frame
@@ -55,7 +55,7 @@ def _show(paths: list[Path]) -> None:
     for sentence in (*captures.errors, *captures.problems):
         sound(sentence)
     transmissions = join(captures)
-    exchanges, names = Exchanges(transmissions), BlockNames(transmissions, [])
+    exchanges, names = RequestAnswers(transmissions), BlockNames(transmissions, [])
     list(packets_text.transmission_lines(transmissions, exchanges, TransmissionText(names, str, {}), None))
     packets_text.header(captures)
     list(packets_text.totals(captures, transmissions))

@@ -7,7 +7,7 @@ import pytest
 
 from harness.archive import archive
 from harness.archive.archive import RunArchive
-from harness.archive.history import CUT_SHORT, Message, Phase, Reconcile, Tie, Vote, end_of_traces, history_of
+from harness.archive.history import CUT_SHORT, Message, Phase, Phase2Tie, Reconcile, Vote, end_of_traces, history_of
 from harness.archive.replication import Replication, replication_of
 from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Header, Trace
@@ -72,7 +72,7 @@ def test_tie_has_votes_and_phases_of_both_reconciles() -> None:
     ]
     phases = [Phase("phase 1", 32.0, 37.0, 1), Phase("phase 2", 37.0, 42.0, 1)]
     assert found.reconciles[0] == Reconcile(1, 32.0, 42.0, "vote not approved", phases, done=True)
-    assert found.ties[0] == Tie(1, 42.0, "tie: top of chain")
+    assert found.ties[0] == Phase2Tie(1, 42.0, "tie: top of chain")
     fetched = next(one for one in found.reconciles if one.agent == 2 and one.reason == "chain diverged")
     assert [(phase.name, phase.rounds) for phase in fetched.phases] == [
         ("phase 1", 2),

@@ -9,9 +9,9 @@ import pytest
 from harness.archive.packets.block_names import BlockNames, run_directories
 from harness.archive.packets.capture_files import Captures as Read
 from harness.archive.packets.capture_files import capture_files, read_captures
-from harness.archive.packets.exchanges import Exchanges, LinkLosses, RequestOutcome, count_losses
+from harness.archive.packets.exchanges import LinkLosses, RequestAnswers, RequestOutcome, count_losses
 from harness.archive.packets.packets_text import TransmissionText
-from harness.archive.packets.selection import Selection, block_arrivals, exchanges_about
+from harness.archive.packets.selection import MessageFilter, block_arrivals, exchanges_about
 from harness.archive.packets.transmissions import Transmission, join
 from harness.errors import CaptureError
 from tests.harness.captures import INBOUND, OUTBOUND, Captures, CaptureScript, PcapNg, frame, pcap, wall_ns
@@ -94,7 +94,7 @@ def test_each_response_matches_the_request_in_the_trace(finished_flight: tuple[A
     """Compare with the agents' traces, which name the message that triggered each answer."""
     air, _ = finished_flight
     found = join(read(run_dir))
-    exchanges = Exchanges(found)
+    exchanges = RequestAnswers(found)
     matched = {
         (response.sender, response.sequence): (request.sender, request.sequence)
         for request in found
@@ -118,7 +118,7 @@ def test_request_has_an_outcome_for_each_vehicle(tmp_path: Path) -> None:
     scene.send(10.03, 3, DISAPPROVE, {2: 0.01})
     scene.finish(20)
     request, *responses = transmissions_of(scene, tmp_path)
-    answers = Exchanges([request, *responses]).answers(request)
+    answers = RequestAnswers([request, *responses]).answers(request)
     assert [(answer.by, answer.outcome) for answer in answers] == [
         (2, "answered"),
         (3, "response lost"),
@@ -147,7 +147,7 @@ def test_each_type_of_request_matches_its_response(tmp_path: Path) -> None:
         scene.send(number + 0.02, 2, response)
     scene.finish(10)
     found = transmissions_of(scene, tmp_path)
-    exchanges = Exchanges(found)
+    exchanges = RequestAnswers(found)
     assert [exchanges.responses(one) for one in found[::2]] == [[one] for one in found[1::2]]
 
 
@@ -163,7 +163,7 @@ def test_response_answers_the_last_received_request(tmp_path: Path) -> None:
     scene.send(3.02, 2, ChainContainResponse(CHAIN, True))
     scene.finish(10)
     found = transmissions_of(scene, tmp_path)
-    exchanges = Exchanges(found)
+    exchanges = RequestAnswers(found)
     assert [len(exchanges.responses(one)) for one in found] == [0, 0, 1, 0]
     assert [answer.outcome for answer in exchanges.answers(found[1])] == ["request lost", "no answer"]
 
@@ -176,7 +176,7 @@ def test_simultaneous_requests_are_answered_in_order(tmp_path: Path) -> None:
     scene.send(1.021, 2, ChainContainResponse(CHAIN, True))
     scene.finish(10)
     found = transmissions_of(scene, tmp_path)
-    exchanges = Exchanges(found)
+    exchanges = RequestAnswers(found)
     assert [exchanges.responses(one) for one in found[:2]] == [[found[2]], [found[3]]]
 
 
@@ -192,7 +192,7 @@ def test_duplicated_request_is_answered_twice(tmp_path: Path) -> None:
     found = transmissions_of(scene, tmp_path)
     _, twice, first, again, second, third = found
     assert received(twice) == {2: (1.01, 2)}
-    exchanges = Exchanges(found)
+    exchanges = RequestAnswers(found)
     assert [exchanges.responses(one) for one in (twice, again)] == [[first, third], [second]]
 
 
@@ -203,7 +203,7 @@ def test_uncaptured_agent_answers_the_last_request_of_another(tmp_path: Path) ->
     scene.send(3, 3, ChainContainResponse(CHAIN, True))
     scene.finish(10)
     found = transmissions_of(scene, tmp_path, 3)
-    assert [len(Exchanges(found).responses(one)) for one in found] == [1, 0, 0]
+    assert [len(RequestAnswers(found).responses(one)) for one in found] == [1, 0, 0]
 
 
 def test_answered_request_arrived_although_the_capture_lacks_it(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_answered_request_arrived_although_the_capture_lacks_it(tmp_path: Path) 
     scene.send(2, 2, ChainContainResponse(CHAIN, True))
     scene.finish(10)
     found = transmissions_of(scene, tmp_path)
-    assert [(answer.by, answer.outcome) for answer in Exchanges(found).answers(found[0])] == [(2, "answered")]
+    assert [(answer.by, answer.outcome) for answer in RequestAnswers(found).answers(found[0])] == [(2, "answered")]
 
 
 def test_outcomes_are_listed_from_answers_to_losses() -> None:
@@ -283,7 +283,7 @@ def test_datagram_missing_in_the_capture_of_its_sender_is_forged(tmp_path: Path)
         (77, "forged", None),
         (78, "forged", "rogue"),
     ]
-    assert Exchanges(found).responses(found[0]) == ()
+    assert RequestAnswers(found).responses(found[0]) == ()
     assert not any(pair.sender == 1 and pair.sent > 1 for pair in count_losses(found))
 
 
@@ -311,7 +311,7 @@ def test_field_captures_count_time_from_the_first_packet(tmp_path: Path) -> None
     assert (request.at_s, request.origin, received(request)) == (0.0, "captured", {2: (0.25, 1)})
     assert (response.at_s, received(response)) == (0.25, {1: (0.5, 1), "tower": (0.3, 1)})
     assert request.absent == ("tower",)
-    assert Exchanges([request, response]).responses(request) == [response]
+    assert RequestAnswers([request, response]).responses(request) == [response]
 
 
 def test_capture_of_another_run_is_left_out(tmp_path: Path) -> None:
@@ -331,7 +331,7 @@ def test_exchanges_about_a_block_include_all_its_messages(finished_flight: tuple
     names = BlockNames(found, run_directories([run_dir]))
     block_hash = air.agents[3].state.completed[1]
     assert names.find("3.2") == names.find(block_hash.hex()[:10]) == block_hash
-    exchanges = list(exchanges_about(block_hash, found, Exchanges(found)))
+    exchanges = list(exchanges_about(block_hash, found, RequestAnswers(found)))
     numbers = [one.number for exchange in exchanges for one in (exchange.first, *exchange.answers)]
     assert len(numbers) == len(set(numbers))
     assert set(numbers) >= {one.number for one in found if one.summary.block_hash == block_hash}
@@ -371,7 +371,7 @@ def test_late_capture_gives_no_block_names(tmp_path: Path) -> None:
 def test_selection_filters_by_sender_receiver_message_and_time(run_dir: Path) -> None:
     captures = read(run_dir)
     found = join(captures)
-    selection = Selection(sender=2, receiver=3, message="commit block", between_s=(100, 500))
+    selection = MessageFilter(sender=2, receiver=3, message="commit block", between_s=(100, 500))
     selected = list(selection.filter(found, captures))
     whole = [
         one for one in found if one.sender == 2 and one.summary.message == "Commit Block" and 100 <= one.at_s <= 500
@@ -381,8 +381,8 @@ def test_selection_filters_by_sender_receiver_message_and_time(run_dir: Path) ->
     assert [one.lost_by for one in selected] == [(3,) if 3 in one.lost_by else () for one in whole]
     assert all(one.reached in ([], [3]) for one in selected)
     with pytest.raises(CaptureError, match="no such message; use one of Block Add Request, "):
-        Selection(message="Hello")
+        MessageFilter(message="Hello")
     with pytest.raises(CaptureError, match="the first second is not before the last"):
-        Selection(between_s=(2, 1))
+        MessageFilter(between_s=(2, 1))
     with pytest.raises(CaptureError, match="no capture of that vehicle; captures are of 1, 2, 3, 4, 5"):
-        list(Selection(receiver=9).filter(found, captures))
+        list(MessageFilter(receiver=9).filter(found, captures))

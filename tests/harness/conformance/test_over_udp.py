@@ -9,7 +9,7 @@ import pytest
 
 from docs.generate.wrong_agents import quirky
 from harness.conformance._alphabet import INPUTS, LOG
-from harness.conformance._observation import Observation
+from harness.conformance._observation import TestedStep
 from harness.conformance._state_space import VARIANTS, explore
 from harness.conformance._udp_agent import TIMING_IN_PARALLEL, UdpAgent
 from harness.conformance._udp_lab import UdpLab
@@ -73,7 +73,7 @@ def test_vectors_that_need_a_missing_feature_are_not_applicable(tmp_path: Path, 
     assert results.exit_status == 0 and "an unknown feature" in results.notes[0]
 
 
-async def _late(place: Path) -> tuple[Observation | None, bool, Observation | None]:
+async def _late(place: Path) -> tuple[TestedStep | None, bool, TestedStep | None]:
     """Suspend an agent while its vote ends, and give it two inputs.
 
     Return the first observation, whether the reference follows the agent, and the second observation.

@@ -5,7 +5,7 @@ import time
 
 from harness.conformance._agent_under_test import AgentUnderTest
 from harness.conformance._alphabet import AgentInput
-from harness.conformance._observation import Observation, RecordedDatagram
+from harness.conformance._observation import RecordedDatagram, TestedStep
 from harness.conformance._state_space import VARIANTS, SettingsVariant, advance, explore, key_of, state_of
 from harness.conformance._suite import VectorSuite
 from harness.conformance._tours import VectorMap
@@ -32,14 +32,14 @@ class AgentOnLateMachine(AgentUnderTest):
         self._alone = alone
         self._now = 0.0
 
-    async def _step(self, given: AgentInput) -> Observation | None:
+    async def _step(self, given: AgentInput) -> TestedStep | None:
         before = state_of(self.model)
         advanced = advance(self.model, given, self._now)
         if advanced is None:
             return None
         outcome, self._now = advanced
         wrong = () if self._alone else ("it did not send an expected message",)
-        return Observation(key_of(before, given), outcome, given.name, (), (), wrong, before, late=not self._alone)
+        return TestedStep(key_of(before, given), outcome, given.name, (), (), wrong, before, late=not self._alone)
 
     @property
     def timer_is_near(self) -> bool:

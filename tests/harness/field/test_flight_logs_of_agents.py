@@ -13,7 +13,7 @@ from harness.field.depot.record_outputs import flight_logs, flown_tracks
 from harness.field.flight_logs import read_flight_log
 from harness.field.flight_logs._matching import Fixes, MatchedLog, match_logs
 from harness.field.flight_logs._summary import changes
-from harness.field.reconstruct._clock_offsets import Delivery, estimate
+from harness.field.reconstruct._clock_offsets import DeliveredMessage, estimate
 from harness.report.logbook.positions import RoundedPosition
 from tests.harness.command import harness, sentences
 from tests.harness.field.flight_log_files import (
@@ -172,7 +172,7 @@ def test_import_copies_flight_logs_and_names_the_others(folder: Path, tmp_path: 
 
 
 def test_gps_time_places_clocks_of_agents_without_messages() -> None:
-    deliveries = [Delivery(1, 2, 10.0, 10.1), Delivery(2, 1, 20.0, 20.1)]
+    deliveries = [DeliveredMessage(1, 2, 10.0, 10.1), DeliveredMessage(2, 1, 20.0, 20.1)]
     assert estimate([1, 2, 3], deliveries)[3].offset_s == 0.0
     clocks = estimate([1, 2, 3], deliveries, {2: 0.5, 3: 4.0})
     assert clocks[3].offset_s - clocks[2].offset_s == pytest.approx(3.5)

@@ -7,11 +7,11 @@ import pytest
 from harness.archive.run_record import Cycle
 from harness.proof import Bounds, Progress, in_words, prove
 from harness.proof._progress_bar import ExplorationBudget
-from harness.proof.examples._example import Example
+from harness.proof.examples._example import ViolationExample
 from harness.proof.graph._exploration import explore
 from harness.proof.model._global_states import AGENTS, BLOCKS, ZONE, ModelSwarm
 from harness.proof.model._instant import AgentAction
-from harness.proof.model._zones import NOTHING_RUNS, Zones
+from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 from harness.proof.questions._extra_votes import ExtraVotes
 from harness.proof.questions._graph_cycles import cycles
 from harness.proof.questions._livelock import Livelock, show
@@ -48,7 +48,7 @@ def test_livelock_reports_its_conditions(
     tmp_path: Path, coincidences: int | None, losses: int, goes_round: bool, contradictory: bool, expected: str
 ) -> None:
     cycle = Cycle(since_s=1.0, period_s=15.0, agents=[1]) if goes_round else None
-    example = Example(tmp_path / "x.yaml", 1, {}, 1)
+    example = ViolationExample(tmp_path / "x.yaml", 1, {}, 1)
     assert expected in Livelock(1, coincidences, (), example, losses, cycle, contradictory).in_words()
 
 
@@ -133,7 +133,7 @@ def test_single_path_gives_the_result_of_all_successors(monkeypatch: pytest.Monk
 
 
 def test_coincidence_is_an_open_difference_of_two_times() -> None:
-    zones = Zones()
+    zones = ZoneTable()
     ten_s = -10_000_000 - 1
     first = zones.after(NOTHING_RUNS, (), (ten_s,))
     assert first is not None

@@ -4,7 +4,7 @@ from itertools import product
 from random import Random
 
 from harness.proof.examples._path_times import TimerRun, instants_s
-from harness.proof.model._zones import NOTHING_RUNS, Zones
+from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 
 DURATIONS = (10, 5)
 
@@ -12,7 +12,7 @@ DURATIONS = (10, 5)
 def test_zones_contain_exactly_the_possible_times() -> None:
     """Timers start and expire at random. Whole units are enough, because all bounds are whole numbers."""
     for seed in range(30):
-        lots, zones = Random(seed), Zones()
+        lots, zones = Random(seed), ZoneTable()
         zone, points = NOTHING_RUNS, {()}
         for _ in range(8):
             running = len(next(iter(points)))
@@ -35,7 +35,7 @@ def test_zones_contain_exactly_the_possible_times() -> None:
 
 
 def test_zone_finds_timers_that_expire_at_the_same_moment() -> None:
-    zones = Zones()
+    zones = ZoneTable()
     zone = zones.after(NOTHING_RUNS, (), (-11, -11))
     assert zone is not None
     assert zones.tied(zone) == [(0, 1), (0, 1)]
@@ -44,7 +44,7 @@ def test_zone_finds_timers_that_expire_at_the_same_moment() -> None:
     assert zones.tied(apart) == [(0, 1), (0, 1), (2,)]
 
 
-def inside(zones: Zones, zone: int, timers: int) -> list[tuple[int, ...]]:
+def inside(zones: ZoneTable, zone: int, timers: int) -> list[tuple[int, ...]]:
     """Return the points of a zone with integer coordinates."""
     matrix = zones.matrix(zone)
     found = []

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.archive.exports import name_blocks
-from harness.report._chain_tree_layout import CHARACTER_WIDTH, Layout, PlacedMark, lay_out
+from harness.report._chain_tree_layout import CHARACTER_WIDTH, ChainTreeLayout, PlacedMark, lay_out
 from harness.report.chain_tree import chain_tree, marks
 from tests.harness.report.runs import Chains, exports
 
@@ -18,7 +18,7 @@ BLOCKS = [f"{agent_id}.{ordinal}" for agent_id in (1, 2, 300, 65535) for ordinal
 LINK_TURN = 11
 
 
-def layout(chains: Chains, *, abridged: bool = True) -> Layout:
+def layout(chains: Chains, *, abridged: bool = True) -> ChainTreeLayout:
     read = exports(chains)
     return lay_out(marks(chain_tree(read), name_blocks(read), abridged=abridged))
 
@@ -31,7 +31,7 @@ def overlap(one: Box, other: Box) -> bool:
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
 
 
-def assert_readable(drawn: Layout) -> None:
+def assert_readable(drawn: ChainTreeLayout) -> None:
     placed_marks = list(drawn.root.walk())
     boxes = [box(placed) for placed in placed_marks]
     for one, other in itertools.combinations(boxes, 2):

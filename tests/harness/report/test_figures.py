@@ -7,7 +7,7 @@ import pytest
 
 from harness.archive.archive import RunArchive
 from harness.play.progress import SilentProgress
-from harness.report.stories.narration import Narrator
+from harness.report.stories.narration import StoryWriter
 from harness.report.stories.story_file import Story, read_story
 from harness.run.run import run
 from ucp.agent import HANDLERS
@@ -31,7 +31,7 @@ IN_NO_FIGURE = {
 def told(story: Story, directory: Path, seed: int = 1) -> str:
     """Return the text of the story as it is played in virtual time."""
     run(story.in_virtual_time, seed, directory, SilentProgress(), "sim", delivers_all=True)
-    narrator = Narrator(RunArchive(directory).traces, story.scenario.roster)
+    narrator = StoryWriter(RunArchive(directory).traces, story.scenario.roster)
     return story.with_answers([narrator.answer(section) for section in story.sections])
 
 

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.archive.tracks import PositionFix
-from harness.report.map_parts import INVISIBLE_PX, Extent, Point, Projection, extent, simplify, thin
+from harness.report.map_parts import INVISIBLE_PX, GroundRectangle, MapProjection, Point, extent, simplify, thin
 
-LAND = Extent(south_m=-100, north_m=100, west_m=-200, east_m=200)
-TO_PX = Projection(LAND, 10, 20, 800, 600)
+LAND = GroundRectangle(south_m=-100, north_m=100, west_m=-200, east_m=200)
+TO_PX = MapProjection(LAND, 10, 20, 800, 600)
 
 places = st.lists(st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)), min_size=1, max_size=20)
 lines = st.lists(st.tuples(st.floats(0, 900), st.floats(0, 600)), min_size=2, max_size=60)
@@ -26,8 +26,8 @@ def test_north_is_up_east_is_right_and_metres_have_equal_lengths() -> None:
 
 
 def test_land_of_any_shape_fits_into_its_rectangle() -> None:
-    for land in (LAND, Extent(-500, 500, -10, 10), Extent(0, 30, 0, 30)):
-        to_px = Projection(land, 0, 0, 800, 600)
+    for land in (LAND, GroundRectangle(-500, 500, -10, 10), GroundRectangle(0, 30, 0, 30)):
+        to_px = MapProjection(land, 0, 0, 800, 600)
         assert to_px.width <= 800 + 1e-9
         assert to_px.height <= 600 + 1e-9
         assert max(to_px.width / 800, to_px.height / 600) == pytest.approx(1)
@@ -38,7 +38,7 @@ def test_ticks_and_scale_bar_are_round_metres() -> None:
     assert north == [-100, -50, 0, 50, 100]
     assert east == [-200, -150, -100, -50, 0, 50, 100, 150, 200]
     assert TO_PX.scale_bar_m() == 100
-    assert Projection(Extent(0, 1000, 0, 1100), 0, 0, 800, 600).scale_bar_m() == 250
+    assert MapProjection(GroundRectangle(0, 1000, 0, 1100), 0, 0, 800, 600).scale_bar_m() == 250
 
 
 @given(places)

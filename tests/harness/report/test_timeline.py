@@ -13,7 +13,7 @@ import pytest
 
 from harness.archive import archive
 from harness.archive.archive import RunArchive
-from harness.archive.history import Commit, History, Phase, Reconcile, Tie, Vote
+from harness.archive.history import Commit, History, Phase, Phase2Tie, Reconcile, Vote
 from harness.archive.replication import Replication
 from harness.play.progress import SilentProgress
 from harness.report import _timeline_charts, _timeline_lanes, _timeline_section, write_report
@@ -133,7 +133,7 @@ def test_long_run_with_many_changes_is_thinned_and_reported() -> None:
     votes = [Vote(agent, "aa", at_s, at_s + 1, "approved") for agent, at_s in spans]
     reconciles = [Reconcile(agent, at_s, at_s + 1, "why", phases, done=True) for agent, at_s in spans]
     commits = [Commit(agent, at_s + part / 4, "aa", "heard") for agent, at_s in spans for part in range(4)]
-    ties = [Tie(agent, at_s, "tie: block") for agent, at_s in spans]
+    ties = [Phase2Tie(agent, at_s, "tie: block") for agent, at_s in spans]
     restless = History(votes, reconciles, commits, ties, None)
     picture = _timeline_lanes.draw(restless, [], [], range(1, 51), {}, 200.0, "")
     assert picture.notes == [

@@ -31,7 +31,7 @@ INITIAL_DATA = b"test"
 MICROSECONDS = 1_000_000
 
 
-class Story:
+class RecordedMission:
     """A recorded mission of agent 7. `exchanges` contains each input with its outputs.
 
     Times are mission seconds of the agent, and `now` is the time of the last input. The story plays the other agents.

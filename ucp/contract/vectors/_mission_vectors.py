@@ -6,7 +6,7 @@ Each function plays a mission. Its name is the name of the transcript, and its d
 from collections.abc import Callable
 
 from ucp.block import Block, next_chain_hash
-from ucp.contract.vectors._mission_story import AGENT_ID, Story, chain_of, others_block
+from ucp.contract.vectors._mission_story import AGENT_ID, RecordedMission, chain_of, others_block
 from ucp.contract.vectors.drop_vectors import datagram
 from ucp.messages import (
     BlockAddRequest,
@@ -26,9 +26,9 @@ STRANGE = bytes(range(32))
 """A hash that no block and no chain has."""
 
 
-def alone() -> Story:
+def alone() -> RecordedMission:
     """An agent without neighbours builds two blocks. It proposes and approves one after the other."""
-    story = Story(roster=(AGENT_ID,), epoch_us=1_795_258_278_064_591)
+    story = RecordedMission(roster=(AGENT_ID,), epoch_us=1_795_258_278_064_591)
     story.complete_a_block()
     story.complete_a_block()
     story.log(32)
@@ -41,9 +41,9 @@ def alone() -> Story:
     return story
 
 
-def follow() -> Story:
+def follow() -> RecordedMission:
     """The agent votes on proposals of other agents, follows their commits, and answers their queries."""
-    story = Story()
+    story = RecordedMission()
     first, second, third = others_block(A, 1, at_s=1), others_block(B, 2, at_s=2), others_block(C, 3, at_s=3)
     chain = chain_of()
     inception = chain.top_chain_hash
@@ -76,9 +76,9 @@ def first_again(block: Block) -> Block:
     return Block(block.agent_id, block.timestamp_us + 1, block.event_data)
 
 
-def vote() -> Story:
+def vote() -> RecordedMission:
     """Votes count once, and only for the candidate. A majority commits the block, and late votes do not count."""
-    story = Story()
+    story = RecordedMission()
     story.hear(A, BlockAddResponse(STRANGE, True))
     story.complete_a_block()
     story.vote((A, True), (A, True), (A, False))
@@ -91,9 +91,9 @@ def vote() -> Story:
     return story
 
 
-def tied_vote() -> Story:
+def tied_vote() -> RecordedMission:
     """A tied vote is not approved. The agent reconciles, finds that all agents have its chain, and proposes again."""
-    story = Story()
+    story = RecordedMission()
     story.complete_a_block()
     story.vote((A, False))
     story.wait()
@@ -112,12 +112,12 @@ def tied_vote() -> Story:
     return story
 
 
-def chain_changed() -> Story:
+def chain_changed() -> RecordedMission:
     """A commit changes the chain during a vote.
 
     The agent votes again without a majority, and reconciles without answers.
     """
-    story = Story()
+    story = RecordedMission()
     first, second = others_block(A, 1), others_block(B, 2)
     chain = chain_of(first)
     story.complete_a_block()
@@ -134,12 +134,12 @@ def chain_changed() -> Story:
     return story
 
 
-def held_already() -> Story:
+def held_already() -> RecordedMission:
     """Another agent commits the agent's own block on top of its chain.
 
     No correct agent does this. It is not followed.
     """
-    story = Story()
+    story = RecordedMission()
     story.complete_a_block()
     story.wait()
     own = story.sent[0]
@@ -155,12 +155,12 @@ def chain_hash_on(chain_hash: bytes, block: Block) -> bytes:
     return next_chain_hash(chain_hash, block.block_hash)
 
 
-def diverged() -> Story:
+def diverged() -> RecordedMission:
     """A query during a vote shows that the agent's chain has diverged.
 
     The agent answers no message until it has reconciled.
     """
-    story = Story(vote_timeout_s=10.0, phase1_timeout_s=7.5)
+    story = RecordedMission(vote_timeout_s=10.0, phase1_timeout_s=7.5)
     mine, other = others_block(A, 1), others_block(B, 2)
     story.hear(A, CommitBlock(mine, chain_of(mine).top_chain_hash))
     story.complete_a_block()
@@ -184,12 +184,12 @@ def diverged() -> Story:
     return story
 
 
-def outvoted() -> Story:
+def outvoted() -> RecordedMission:
     """Three blocks are popped.
 
     One block of the majority is requested, one is on the stack, and the rest is committed again.
     """
-    story = Story()
+    story = RecordedMission()
     mutual, theirs, last = others_block(A, 1), others_block(B, 2), others_block(C, 3)
     chain = chain_of(mutual)
     story.hear(A, CommitBlock(mutual, chain.top_chain_hash))
@@ -222,9 +222,9 @@ def outvoted() -> Story:
     return story
 
 
-def no_gap() -> Story:
+def no_gap() -> RecordedMission:
     """Without a finalize gap, the whole stack is committed in one run."""
-    story = Story(finalize_gap_s=0)
+    story = RecordedMission(finalize_gap_s=0)
     for ordinal in range(1, 4):
         blocks = [others_block(A, number) for number in range(1, ordinal + 1)]
         story.hear(A, CommitBlock(blocks[-1], chain_of(*blocks).top_chain_hash))
@@ -237,9 +237,9 @@ def no_gap() -> Story:
     return story
 
 
-def nobody() -> Story:
+def nobody() -> RecordedMission:
     """No agent answers in phase 1, in a later phase 2, and in a later phase 3."""
-    story = Story()
+    story = RecordedMission()
     theirs = others_block(B, 2)
     story.command("reconcile")
     story.wait()
@@ -255,9 +255,9 @@ def nobody() -> Story:
     return story
 
 
-def at_inception() -> Story:
+def at_inception() -> RecordedMission:
     """All agents answer that they do not contain the inception block. It is never popped."""
-    story = Story()
+    story = RecordedMission()
     story.command("reconcile")
     story.contain((A, False), (B, False))
     story.wait()
@@ -265,9 +265,9 @@ def at_inception() -> Story:
     return story
 
 
-def ties() -> Story:
+def ties() -> RecordedMission:
     """A tie in phase 1 continues with phase 2. A tie in phase 2 selects the oldest block, then the lowest hash."""
-    story = Story()
+    story = RecordedMission()
     old, young, top = others_block(B, 1, at_s=10), others_block(C, 2, at_s=20), others_block(A, 3, at_s=15)
     story.hear(A, CommitBlock(top, chain_of(top).top_chain_hash))
     story.command("reconcile")
@@ -292,9 +292,9 @@ def ties() -> Story:
     return story
 
 
-def ties_read_otherwise() -> Story:
+def ties_read_otherwise() -> RecordedMission:
     """The settings are `phase1_tie` pop and `phase2_tie` block."""
-    story = Story(phase1_tie="pop", phase2_tie="block")
+    story = RecordedMission(phase1_tie="pop", phase2_tie="block")
     first, second = others_block(A, 1, at_s=1), others_block(B, 2, at_s=2)
     story.hear(A, CommitBlock(first, chain_of(first).top_chain_hash))
     story.command("reconcile")
@@ -311,9 +311,9 @@ def ties_read_otherwise() -> Story:
     return story
 
 
-def asks_after_commit() -> Story:
+def asks_after_commit() -> RecordedMission:
     """The setting is `asks_after_commit`. After a commit and a gap, the agent sends a query unless it reconciles."""
-    story = Story(asks_after_commit=True)
+    story = RecordedMission(asks_after_commit=True)
     story.complete_a_block()
     story.vote((A, True))
     story.wait()
@@ -326,9 +326,9 @@ def asks_after_commit() -> Story:
     return story
 
 
-def answer_spread() -> Story:
+def answer_spread() -> RecordedMission:
     """The setting is `answer_spread_s`. Each answer is sent after its own wait, and all other messages at once."""
-    story = Story(answer_spread_s=2.0)
+    story = RecordedMission(answer_spread_s=2.0)
     block = others_block(A, 1, at_s=1)
     chain = chain_of(block)
     story.hear(A, BlockAddRequest(block.block_hash, chain_of().top_chain_hash))
@@ -346,9 +346,9 @@ def answer_spread() -> Story:
     return story
 
 
-def top_needs_majority() -> Story:
+def top_needs_majority() -> RecordedMission:
     """The setting is `top_needs_majority`. "Is Top Of Chain" ends the search only if a vote would be approved."""
-    story = Story(top_needs_majority=True)
+    story = RecordedMission(top_needs_majority=True)
     old, young = others_block(B, 1, at_s=10), others_block(C, 2, at_s=20)
     story.command("reconcile")
     story.contain((A, True))
@@ -362,9 +362,9 @@ def top_needs_majority() -> Story:
     return story
 
 
-def votes_name_chains() -> Story:
+def votes_name_chains() -> RecordedMission:
     """The settings are `vote_names_chain` and `changed_before_tally`."""
-    story = Story(vote_names_chain=True, changed_before_tally=True)
+    story = RecordedMission(vote_names_chain=True, changed_before_tally=True)
     first = others_block(A, 1)
     inception = chain_of().top_chain_hash
     story.hear(A, BlockAddRequest(first.block_hash, inception))
@@ -383,9 +383,9 @@ def votes_name_chains() -> Story:
     return story
 
 
-def offered_what_it_holds() -> Story:
+def offered_what_it_holds() -> RecordedMission:
     """The majority names a block that is in the agent's deque, and later a block that is in its chain."""
-    story = Story()
+    story = RecordedMission()
     first = others_block(A, 1)
     story.hear(A, CommitBlock(first, chain_of(first).top_chain_hash))
     story.complete_a_block()
@@ -405,12 +405,12 @@ def offered_what_it_holds() -> Story:
     return story
 
 
-def reboot() -> Story:
+def reboot() -> RecordedMission:
     """A brown-out interrupts a reconcile.
 
     The stack is committed again, and the front of the deque is proposed again.
     """
-    story = Story()
+    story = RecordedMission()
     blocks = [others_block(A, ordinal) for ordinal in range(1, 4)]
     for ordinal in range(1, 4):
         story.hear(A, CommitBlock(blocks[ordinal - 1], chain_of(*blocks[:ordinal]).top_chain_hash))
@@ -436,9 +436,9 @@ def reboot() -> Story:
     return story
 
 
-def late_timers() -> Story:
+def late_timers() -> RecordedMission:
     """The clock begins below 0, two timers have expired when the agent runs, and datagrams are dropped in between."""
-    story = Story(at_s=-3.5)
+    story = RecordedMission(at_s=-3.5)
     story.hear_datagram(b"", after_s=0.0)
     story.log(256, after_s=4.0)
     story.log()
@@ -456,7 +456,7 @@ def late_timers() -> Story:
     return story
 
 
-def secured() -> Story:
+def secured() -> RecordedMission:
     """The mission has keys and seals events. Replayed datagrams and a revoked sender are dropped. The agent reboots.
 
     After the reboot, the agent accepts no datagrams of other agents until they answer its challenge.
@@ -492,7 +492,7 @@ def secured() -> Story:
     return story
 
 
-MISSIONS: dict[str, Callable[[], Story]] = {
+MISSIONS: dict[str, Callable[[], RecordedMission]] = {
     mission.__name__: mission
     for mission in (
         alone,

@@ -7,7 +7,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from ucp.block import Block, InceptionBlock
 from ucp.chain import Chain
-from ucp.contract.vectors._mission_story import AGENT_ID, INITIAL_DATA, ROSTER, Story
+from ucp.contract.vectors._mission_story import AGENT_ID, INITIAL_DATA, ROSTER, RecordedMission
 from ucp.messages import CARRY_A_BLOCK, TYPE_CODES, Message
 from ucp.sealed import seal_to
 from ucp.secure.block_signature import sign_block
@@ -24,7 +24,7 @@ KEYS = KeySet.derived(bytes(range(32, 64)), ROSTER, seals=True)
 MAX_BLOCK_BYTES = 976
 
 
-class SecuredStory(Story):
+class SecuredStory(RecordedMission):
     """A recorded secured mission with encrypted event data."""
 
     def __init__(self) -> None:

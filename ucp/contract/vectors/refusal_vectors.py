@@ -7,7 +7,7 @@ it lacks a feature that the mission needs, the error is `unsupported`, and the e
 import json
 from typing import Any
 
-from ucp.contract.vectors._mission_story import Story
+from ucp.contract.vectors._mission_story import RecordedMission
 from ucp.sealed import seal_to
 from ucp.trace import in_base64
 
@@ -17,7 +17,7 @@ UNKNOWN = "a feature of a later version"
 
 def vectors() -> dict[str, Any]:
     """Return the test vectors. `plays` is true if an agent with the features `needs` must play the mission."""
-    ordinary = Story().exchanges[0]["input"]["mission"]
+    ordinary = RecordedMission().exchanges[0]["input"]["mission"]
     return {
         "about": "Missions and requests in doubt; see CONTRACT.md",
         "missions": [

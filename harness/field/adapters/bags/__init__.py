@@ -17,9 +17,9 @@ from harness.field.adapters.bags import _mcap_bag, _sqlite, _version_1
 from harness.field.adapters.bags._decompression import (
     MAX_FILE_BYTES,
     ZSTD_MAGIC,
-    Damage,
     Item,
     RawMessage,
+    UnreadablePart,
     decompress_file,
 )
 from ucp.plain_file import open_plain_file
@@ -41,7 +41,7 @@ class BagMessage(NamedTuple):
     data: bytes
 
 
-def messages(path: Path) -> Iterator[BagMessage | Damage]:
+def messages(path: Path) -> Iterator[BagMessage | UnreadablePart]:
     """Yield all messages in a ROS bag, and a Damage for each unreadable place between them. Raises OSError."""
     number = 0
     with TemporaryDirectory(prefix="ucp-bag-") as directory:
@@ -71,9 +71,9 @@ def _items(path: Path, scratch: Path) -> Iterator[Item]:
         with open_plain_file(path) as bag, mmap.mmap(bag.fileno(), 0, access=mmap.ACCESS_READ) as content:
             yield from (_version_1 if magic == _version_1.MAGIC else _mcap_bag).items(content)
     else:
-        yield Damage("it is no ROS bag")
+        yield UnreadablePart("it is no ROS bag")
     if problem:
-        yield Damage(problem)
+        yield UnreadablePart(problem)
 
 
 def _magic(path: Path) -> bytes | None:

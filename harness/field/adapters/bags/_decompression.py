@@ -30,16 +30,16 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class Damage(NamedTuple):
+class UnreadablePart(NamedTuple):
     """A place in a file that cannot be read. `why` completes a sentence."""
 
     why: str
 
 
-Item = RawMessage | Damage
+Item = RawMessage | UnreadablePart
 
 
-class Topics:
+class BagTopics:
     """The topics of the channels in a ROS bag.
 
     A message on a channel without a known topic is kept until the end, because an index at the end of the file may
@@ -70,7 +70,7 @@ class Topics:
             else:
                 unknown += 1
         if unknown:
-            yield Damage(f"{unknown} messages are left out because their topic is not declared")
+            yield UnreadablePart(f"{unknown} messages are left out because their topic is not declared")
 
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"

@@ -8,10 +8,10 @@ from harness.field.adapters.bags._decompression import (
     MAX_CHUNK_BYTES,
     MAX_RECORDS,
     MAX_TRIES,
+    BagTopics,
     Buffer,
-    Damage,
     Item,
-    Topics,
+    UnreadablePart,
     decompress,
 )
 
@@ -27,18 +27,18 @@ MAX_DEPTH = 2
 
 
 def items(bag: Buffer) -> Iterator[Item]:
-    topics = Topics()
+    topics = BagTopics()
     reader = _Reader(topics)
     yield from reader.items(bag, len(MAGIC), 0)
     if next(reader.records, None) is None:
-        yield Damage(f"only the first {MAX_RECORDS} records are read")
+        yield UnreadablePart(f"only the first {MAX_RECORDS} records are read")
     elif not reader.closed:
-        yield Damage("it was not closed, and ends early")
+        yield UnreadablePart("it was not closed, and ends early")
     yield from topics.pending()
 
 
 class _Reader:
-    def __init__(self, topics: Topics) -> None:
+    def __init__(self, topics: BagTopics) -> None:
         self._topics = topics
         self._tries = iter(range(MAX_TRIES))
         self.records = iter(range(MAX_RECORDS))
@@ -60,9 +60,9 @@ class _Reader:
                 next_position = self._next(buffer, position + 1)
                 if next_position is None:
                     if whole and depth:
-                        yield Damage("it ends early, or is damaged")
+                        yield UnreadablePart("it ends early, or is damaged")
                     return
-                yield Damage("it is damaged in the middle; the data after the damage is read")
+                yield UnreadablePart("it is damaged in the middle; the data after the damage is read")
                 position = next_position
                 continue
             record = buffer[start : min(end, start + MAX_CHUNK_BYTES)]
@@ -79,7 +79,7 @@ class _Reader:
         content, problem = decompress(compression, record[position_after + 8 :])
         yield from self.items(content, 0, depth + 1, not problem and not cut_off)
         if problem:
-            yield Damage(problem)
+            yield UnreadablePart(problem)
 
     def _record(self, operation: int, record: bytes) -> Iterator[Item]:
         if operation == _SCHEMA and len(record) >= _U16.size:

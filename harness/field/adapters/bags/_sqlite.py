@@ -11,9 +11,9 @@ from harness.field.adapters.bags._decompression import (
     MAX_CHUNK_BYTES,
     MAX_FILE_BYTES,
     MAX_MESSAGE_BYTES,
-    Damage,
     Item,
     RawMessage,
+    UnreadablePart,
 )
 from harness.field.adapters.bags._sqlite_pages import FILE_HEADER_BYTES, SqlitePages
 from ucp.plain_file import open_plain_file
@@ -48,7 +48,7 @@ def items(path: Path, scratch: Path) -> Iterator[Item]:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)) as database:
             yield from _rows(database)
     except sqlite3.Error as error:
-        yield Damage(f"its database cannot be read: {error}")
+        yield UnreadablePart(f"its database cannot be read: {error}")
 
 
 def _pages_of_truncated(path: Path) -> SqlitePages | None:
@@ -74,11 +74,11 @@ def _rows_in_pages(pages: SqlitePages) -> Iterator[Item]:
             case [None, int(), int(), bytes()]:
                 messages.setdefault(number, values)
     if not topics:
-        yield Damage("its database is truncated, and the list of topics is lost")
+        yield UnreadablePart("its database is truncated, and the list of topics is lost")
         return
     for _, (_, topic, time_ns, data) in sorted(messages.items()):
         yield _item(topics, topic, time_ns, data)
-    yield Damage("its database is truncated: later messages cannot be read")
+    yield UnreadablePart("its database is truncated: later messages cannot be read")
 
 
 def _rows(database: sqlite3.Connection) -> Iterator[Item]:
@@ -89,7 +89,7 @@ def _rows(database: sqlite3.Connection) -> Iterator[Item]:
     database.text_factory = lambda text: text.decode("utf-8", "replace")
     tables = database.execute("SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN (?, ?)", _TABLES)
     if tables.fetchone() != (len(_TABLES),):
-        yield Damage("it is not a ROS bag: the database has no tables messages and topics")
+        yield UnreadablePart("it is not a ROS bag: the database has no tables messages and topics")
         return
     topics = {number: (str(name), str(kind)) for number, name, kind in database.execute(_TOPICS)}
     last = _FIRST
@@ -111,12 +111,12 @@ def _rows(database: sqlite3.Connection) -> Iterator[Item]:
                 break
     except sqlite3.DatabaseError as error:
         problem = str(error)
-    yield Damage(f"messages cannot be read here ({problem})")
+    yield UnreadablePart(f"messages cannot be read here ({problem})")
     yield from reversed(messages_behind)
 
 
 def _item(topics: dict[Any, tuple[str, str]], topic: Any, time_ns: Any, data: Any) -> Item:
     """Return the message in a database row. In a damaged file, values may have any type."""
     if topic not in topics or not isinstance(time_ns, int) or not isinstance(data, bytes):
-        return Damage("a message is damaged")
+        return UnreadablePart("a message is damaged")
     return RawMessage(*topics[topic], time_ns, data)

@@ -8,10 +8,10 @@ from harness.field.adapters.bags._decompression import (
     MAX_CHUNK_BYTES,
     MAX_RECORDS,
     MAX_TRIES,
+    BagTopics,
     Buffer,
-    Damage,
     Item,
-    Topics,
+    UnreadablePart,
     decompress,
 )
 
@@ -30,16 +30,16 @@ _Record = tuple[dict[str, bytes], bytes, int]
 
 
 def items(bag: Buffer) -> Iterator[Item]:
-    topics = Topics()
+    topics = BagTopics()
     reader = _Reader(topics)
     yield from reader.items(bag, len(MAGIC), 0)
     if next(reader.records, None) is None:
-        yield Damage(f"only the first {MAX_RECORDS} records are read")
+        yield UnreadablePart(f"only the first {MAX_RECORDS} records are read")
     yield from topics.pending()
 
 
 class _Reader:
-    def __init__(self, topics: Topics) -> None:
+    def __init__(self, topics: BagTopics) -> None:
         self._topics = topics
         self._tries = iter(range(MAX_TRIES))
         self.records = iter(range(MAX_RECORDS))
@@ -55,9 +55,9 @@ class _Reader:
                 next_position = self._next(buffer, position + 1)
                 if next_position is None:
                     if whole:
-                        yield Damage("it ends early, or is damaged")
+                        yield UnreadablePart("it ends early, or is damaged")
                     return
-                yield Damage("it is damaged in the middle; the data after the damage is read")
+                yield UnreadablePart("it is damaged in the middle; the data after the damage is read")
                 position = next_position
                 continue
             fields, data, position = record
@@ -67,7 +67,7 @@ class _Reader:
                 intact = not problem and len(data) == _declared_length(buffer, position, data)
                 yield from self.items(content, 0, depth + 1, intact)
                 if problem or not intact:
-                    yield Damage(problem or "it ends early")
+                    yield UnreadablePart(problem or "it ends early")
             elif operation == _CONNECTION:
                 self._connection(fields, data)
             elif operation == _MESSAGE and len(fields.get("time", b"")) == _TIME.size:

@@ -16,7 +16,7 @@ from harness.present import text
 from harness.present.colours import AgentColours
 from harness.present.svg import FONT, n
 from harness.report.logbook.positions import GlobalPosition, LogEntry, Track
-from harness.report.map_parts import Point, Projection, extent, thin
+from harness.report.map_parts import MapProjection, Point, extent, thin
 from harness.report.map_svg import end_mark, frame, start_mark, tags
 from ucp.telemetry import describe
 
@@ -55,7 +55,7 @@ def draw(
     flown_paths = [[field.fix(at_us, position) for at_us, position in track.fixes] for track in flown]
     far_positions = field.far_positions
     extent_of_map = extent([fix for path in (*paths.values(), *flown_paths) for fix in path])
-    projection = Projection(extent_of_map, _LEFT, _TOP, _WIDTH, _HEIGHT)
+    projection = MapProjection(extent_of_map, _LEFT, _TOP, _WIDTH, _HEIGHT)
     single_copies = set(rare)
     vehicles = {track.agent_id for track in (*tracks, *flown)}
     logged = [event for track in tracks for event in _logged(track, single_copies)]
@@ -109,7 +109,7 @@ class _Field:
 def _flown(
     tracks: Sequence[Track],
     paths: Sequence[Sequence[PositionFix]],
-    projection: Projection,
+    projection: MapProjection,
     ink: Mapping[int, AgentColours],
 ) -> Markup:
     stride = sum(map(len, paths)) // MAX_FIXES + 1
@@ -126,7 +126,7 @@ def _paths(
     tracks: Sequence[Track],
     paths: Mapping[int, Sequence[PositionFix]],
     lost: Mapping[int, Sequence[int]],
-    projection: Projection,
+    projection: MapProjection,
     ink: Mapping[int, AgentColours],
 ) -> Markup:
     pieces = [(track, gap, piece) for track in tracks for gap, piece in _pieces(track, paths[track.agent_id], lost)]
@@ -188,7 +188,7 @@ def _mark(place: Point, entry: LogEntry, rare: bool, ink: AgentColours) -> Marku
 
 
 def _ends(
-    paths: Mapping[int, Sequence[PositionFix]], projection: Projection, ink: Mapping[int, AgentColours]
+    paths: Mapping[int, Sequence[PositionFix]], projection: MapProjection, ink: Mapping[int, AgentColours]
 ) -> Markup:
     parts = []
     for agent_id, path in paths.items():

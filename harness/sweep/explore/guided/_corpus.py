@@ -26,10 +26,10 @@ from harness.errors import MachineError, RunDirectoryError, ScenarioError
 from harness.scenario import Scenario
 from harness.scenario.load import parse, read_yaml
 from harness.sweep.explore._scenario_document import Document, document_of
-from harness.sweep.explore.guided._finding_identity import Identity
-from harness.sweep.explore.guided._hunt import MOST_KEPT, Candidate
+from harness.sweep.explore.guided._finding_identity import FindingIdentity
+from harness.sweep.explore.guided._hunt import MOST_KEPT, CandidateRun
 from harness.sweep.explore.guided._hunt_trial import with_liveness_phase, without_liveness_phase
-from harness.sweep.explore.guided._mutation import Limits
+from harness.sweep.explore.guided._mutation import MutationLimits
 from ucp.agent_files import write_atomically, write_json_atomically
 from ucp.plain_file import open_plain_file, parse_json, read_plain_file
 
@@ -83,8 +83,8 @@ class Finding(BaseModel):
     """Evidence lines."""
 
     @property
-    def identity(self) -> Identity:
-        return Identity(self.key, self.verdict, self.handler, self.shape)
+    def identity(self) -> FindingIdentity:
+        return FindingIdentity(self.key, self.verdict, self.handler, self.shape)
 
     @property
     def file(self) -> str:
@@ -109,7 +109,7 @@ class Corpus:
 
     directory: Path
     base: Document
-    limits: Limits
+    limits: MutationLimits
     left_out: list[str] = field(default_factory=list)
     _lock: BinaryIO | None = None
 
@@ -117,12 +117,12 @@ class Corpus:
         if self._lock is not None:
             self._lock.close()
 
-    def runs(self) -> list[Candidate]:
+    def runs(self) -> list[CandidateRun]:
         """Return the stored runs without duplicates, in the order of their names."""
         paths = sorted((self.directory / "runs").iterdir())
         if len(paths) > 2 * MOST_KEPT:
             self.left_out.append(f"{len(paths) - 2 * MOST_KEPT} of {len(paths)} files in {self.directory / 'runs'}")
-        by_name: dict[str, Candidate] = {}
+        by_name: dict[str, CandidateRun] = {}
         for path in paths[: 2 * MOST_KEPT]:
             if (candidate := self._run(path)) is not None:
                 name = _name_of(candidate)
@@ -131,21 +131,21 @@ class Corpus:
                     self._rename(path, name)
         return list(by_name.values())
 
-    def _run(self, path: Path) -> Candidate | None:
+    def _run(self, path: Path) -> CandidateRun | None:
         name = _NAME.fullmatch(path.name)
         document = None if name is None else self._document(path)
         if name is None or document is None:
             if name is None:
                 self.left_out.append(f"{path} is no run that was kept here")
             return None
-        return Candidate(without_liveness_phase(document), int(name[1]))
+        return CandidateRun(without_liveness_phase(document), int(name[1]))
 
-    def keep(self, candidate: Candidate) -> None:
+    def keep(self, candidate: CandidateRun) -> None:
         """Store a run. Raises MachineError if the file cannot be written."""
         text = json.dumps(with_liveness_phase(candidate.document), sort_keys=True)
         self._write(self.directory / "runs" / _name_of(candidate), text + "\n")
 
-    def drop(self, candidate: Candidate) -> None:
+    def drop(self, candidate: CandidateRun) -> None:
         """Delete a run whose states and inputs are all reached by other runs."""
         (self.directory / "runs" / _name_of(candidate)).unlink(missing_ok=True)
 
@@ -222,7 +222,7 @@ class Corpus:
             raise MachineError(f"{path} cannot be written: {error.strerror}") from None
 
 
-def opened(directory: Path, scenario: Scenario, limits: Limits) -> Corpus:
+def opened(directory: Path, scenario: Scenario, limits: MutationLimits) -> Corpus:
     """Open a corpus directory, and create it if it does not exist.
 
     Raises RunDirectoryError if it is no corpus, is the corpus of another scenario, or is used by another command.
@@ -252,7 +252,7 @@ def opened(directory: Path, scenario: Scenario, limits: Limits) -> Corpus:
     return Corpus(directory, base, limits, _lock=lock)
 
 
-def check_fits(document: Any, base: Document, limits: Limits) -> Document:
+def check_fits(document: Any, base: Document, limits: MutationLimits) -> Document:
     """Return the document if it can result from changes of the base scenario. Raises ScenarioError otherwise."""
     if not isinstance(document, dict):
         raise ScenarioError("it is no scenario")
@@ -278,6 +278,6 @@ def _is_part(value: Any, whole: Any) -> bool:
     return bool(value == whole)
 
 
-def _name_of(candidate: Candidate) -> str:
+def _name_of(candidate: CandidateRun) -> str:
     text = json.dumps(with_liveness_phase(candidate.document), sort_keys=True)  # as it is after reading
     return f"{sha256(text.encode()).hexdigest()[:12]}-seed-{candidate.seed}.yaml"

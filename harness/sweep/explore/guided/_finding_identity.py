@@ -25,7 +25,7 @@ SIZE_SETTINGS = frozenset(("max_block_bytes", "max_event_bytes"))
 
 
 @dataclass(frozen=True, order=True)
-class Identity:
+class FindingIdentity:
     """The identity of a finding. `key` is the key of a check. `handler` is empty if the evidence names no handler."""
 
     key: str
@@ -38,14 +38,14 @@ class Identity:
         return ", ".join(part for part in (f"{name} {self.verdict}", self.handler, self.shape) if part)
 
 
-def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple[Identity, ...]:
+def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple[FindingIdentity, ...]:
     """Return the identity of the finding behind each bad verdict.
 
     Settings that differ from the thesis are part of the shape.
     """
     settings = _changed_settings(scenario.settings)
     return tuple(
-        Identity(
+        FindingIdentity(
             key,
             judgement.verdict,
             next((finding.handler for finding in judgement.evidence if finding.handler), ""),

@@ -19,9 +19,15 @@ from harness.proof.coverage.reached import MOST
 from harness.run.parallel import FailedTask, sweep
 from harness.scenario import Scenario
 from harness.sweep.explore._scenario_document import Document, with_key
-from harness.sweep.explore.guided._finding_identity import Identity
-from harness.sweep.explore.guided._hunt_trial import Divergence, TimerPatterns, Trial, play_trial, with_liveness_phase
-from harness.sweep.explore.guided._mutation import Limits, mutate
+from harness.sweep.explore.guided._finding_identity import FindingIdentity
+from harness.sweep.explore.guided._hunt_trial import (
+    Divergence,
+    PlayedRun,
+    TimerPatterns,
+    play_trial,
+    with_liveness_phase,
+)
+from harness.sweep.explore.guided._mutation import MutationLimits, mutate
 
 BITS = 1 << 28
 """Size of the bit field (32 MiB). With ten million numbers, one new number in about 30 counts as known."""
@@ -59,7 +65,7 @@ NEAR_LIVELOCK = 0.6
 SEEDS = 1 << 16
 
 
-class Candidate(NamedTuple):
+class CandidateRun(NamedTuple):
     """A scenario document to play with a seed. It lacks the phase at the end that every run gets to become idle."""
 
     document: Document
@@ -71,12 +77,12 @@ class Candidate(NamedTuple):
 
 
 @dataclass
-class Kept:
+class KeptRun:
     """A stored document. It reached `new_states` new agent states, or something of similar value, in `steps` handler
     runs.
     """
 
-    candidate: Candidate
+    candidate: CandidateRun
     new_states: int
     steps: int
     failed: int
@@ -102,13 +108,13 @@ class NewCoverage:
     """The parts of a run's coverage that are new, and the findings of the run."""
 
     reached: ReachedStates
-    found: tuple[Identity, ...]
+    found: tuple[FindingIdentity, ...]
     divergence: Divergence | None
     timers_ended_s: tuple[float, ...]
     failed_votes: TimerPatterns
 
     @classmethod
-    def of(cls, run: Trial, known: ReachedStates) -> "NewCoverage":
+    def of(cls, run: PlayedRun, known: ReachedStates) -> "NewCoverage":
         new = ReachedStates(
             run.reached.states - known.states,
             run.reached.pairs - known.pairs,
@@ -123,47 +129,47 @@ class NewCoverage:
 class Hunt:
     """The state of a search: its coverage, its findings and its stored documents."""
 
-    limits: Limits
+    limits: MutationLimits
     rng: Random
     reached: ReachedStates = field(default_factory=ReachedStates)
     states_overflow: DigestSet = field(default_factory=DigestSet)
     pairs_overflow: DigestSet = field(default_factory=DigestSet)
     """Digests of further coverage after `reached` is full."""
-    kept: list[Kept] = field(default_factory=list)
+    kept: list[KeptRun] = field(default_factory=list)
     runs: int = 0
-    found: dict[Identity, Candidate] = field(default_factory=dict)
+    found: dict[FindingIdentity, CandidateRun] = field(default_factory=dict)
     """Findings, with the first run that showed each."""
-    shown: Counter[Identity] = field(default_factory=Counter)
+    shown: Counter[FindingIdentity] = field(default_factory=Counter)
     """Number of runs that showed each finding."""
     failures: int = 0
-    failed: list[tuple[Candidate, str]] = field(default_factory=list)
+    failed: list[tuple[CandidateRun, str]] = field(default_factory=list)
     """The first runs without a verdict, with the reason. `failures` counts all of them."""
-    _dropped: list[Candidate] = field(default_factory=list)
+    _dropped: list[CandidateRun] = field(default_factory=list)
     _known_divergences: set[Divergence] = field(default_factory=set)
     """Known differences of chains at rest. The first run of each is played again with a final reconcile."""
     _known_patterns: set[TimerPatterns] = field(default_factory=set)
     """Known patterns of failed votes. The first run of each is kept."""
-    _to_reconcile: list[Candidate] = field(default_factory=list)
+    _to_reconcile: list[CandidateRun] = field(default_factory=list)
 
-    def begin(self, candidates: Iterable[Candidate], jobs: int) -> Iterator[tuple[Candidate, bool]]:
+    def begin(self, candidates: Iterable[CandidateRun], jobs: int) -> Iterator[tuple[CandidateRun, bool]]:
         """Play these candidates unchanged. Yield each played run, and true if it is stored."""
         yield from self._play(list(candidates), jobs)
 
-    def round(self, jobs: int) -> Iterator[tuple[Candidate, bool]]:
+    def round(self, jobs: int) -> Iterator[tuple[CandidateRun, bool]]:
         """Change stored documents and play them. Yield each played run, and true if it is stored."""
         to_reconcile, self._to_reconcile = self._to_reconcile, []
         worth = list(accumulate(kept.worth for kept in self.kept))
         yield from self._play([*to_reconcile, *(self._next(worth) for _ in range(ROUND))], jobs)
 
-    def dropped(self) -> list[Candidate]:
+    def dropped(self) -> list[CandidateRun]:
         """Return the documents that were removed since the last call."""
         dropped, self._dropped = self._dropped, []
         return dropped
 
-    def _play(self, candidates: Sequence[Candidate], jobs: int) -> Iterator[tuple[Candidate, bool]]:
+    def _play(self, candidates: Sequence[CandidateRun], jobs: int) -> Iterator[tuple[CandidateRun, bool]]:
         known = self.reached
 
-        def play(candidate: Candidate) -> NewCoverage | None:
+        def play(candidate: CandidateRun) -> NewCoverage | None:
             try:
                 return NewCoverage.of(play_trial(candidate.scenario(), candidate.seed), known)
             except (ValidationError, ScenarioError, UnsupportedError):  # the changed scenario cannot be played
@@ -182,7 +188,7 @@ class Hunt:
                 else:
                     yield candidate, self._learn(candidate, outcome)
 
-    def _learn(self, candidate: Candidate, news: NewCoverage) -> bool:
+    def _learn(self, candidate: CandidateRun, news: NewCoverage) -> bool:
         """Add the results of a run. Return true if it reached something new."""
         for identity in news.found:
             self.shown[identity] += 1
@@ -206,7 +212,7 @@ class Hunt:
             new_states += WORTH_OF_PATTERN
         if not (new_states or branches or pairs):
             return False
-        self.kept.append(Kept(candidate, new_states, news.reached.steps, failed, news.timers_ended_s))
+        self.kept.append(KeptRun(candidate, new_states, news.reached.steps, failed, news.timers_ended_s))
         if len(self.kept) > MOST_KEPT:
             least = min(self.kept[:-NEWEST], key=lambda kept: kept.worth)
             self.kept.remove(least)
@@ -223,15 +229,15 @@ class Hunt:
         """The number of different pairs of agent state and input that runs have reached."""
         return len(self.reached.pairs) + self.pairs_overflow.count
 
-    def _next(self, worth: Sequence[float]) -> Candidate:
+    def _next(self, worth: Sequence[float]) -> CandidateRun:
         rng, kept = self.rng, self._pick(worth)
         kept.picked += 1
         other = rng.choice(self.kept).candidate.document
         document = mutate(kept.candidate.document, other, self.limits, rng, kept.timers_ended_s)
         document = with_key(document, "final_reconcile", None)
-        return Candidate(document, kept.candidate.seed if rng.random() < 0.8 else rng.randrange(SEEDS))
+        return CandidateRun(document, kept.candidate.seed if rng.random() < 0.8 else rng.randrange(SEEDS))
 
-    def _pick(self, worth: Sequence[float]) -> Kept:
+    def _pick(self, worth: Sequence[float]) -> KeptRun:
         """Choose a stored document: in half of all cases a new one, otherwise one of high expected benefit.
 
         `worth` holds cumulative sums.

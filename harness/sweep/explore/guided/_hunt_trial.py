@@ -24,10 +24,10 @@ from harness.proof.coverage import CoverageWatcher, ReachedStates
 from harness.proof.coverage.reached import simulate_watched
 from harness.run.simulate import result_of_failure
 from harness.scenario import Scenario
-from harness.sweep.explore._recording import Logged, record
+from harness.sweep.explore._recording import RecordedEvent, record
 from harness.sweep.explore._scenario_document import Document, at, cut_after, document_of, timeline, with_key
-from harness.sweep.explore.guided._finding_identity import Identity, identities
-from harness.sweep.explore.guided._mutation import AFTER_LAST_S, FEW_BLOCKS, Limits, with_events
+from harness.sweep.explore.guided._finding_identity import FindingIdentity, identities
+from harness.sweep.explore.guided._mutation import AFTER_LAST_S, FEW_BLOCKS, MutationLimits, with_events
 from ucp.agent import ON_TIMER
 from ucp.events import EVENT_HEADER_BYTES
 from ucp.settings import Settings
@@ -90,11 +90,11 @@ Divergence = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
-class Trial:
+class PlayedRun:
     """The coverage of a run, and the findings that it shows."""
 
     reached: ReachedStates
-    found: tuple[Identity, ...]
+    found: tuple[FindingIdentity, ...]
     divergence: Divergence | None = None
     """The difference of the chains at rest, in a run without a final reconcile."""
     timers_ended_s: tuple[float, ...] = ()
@@ -104,18 +104,18 @@ class Trial:
 
 
 @gc_paused()
-def play_trial(scenario: Scenario, seed: int) -> Trial:
+def play_trial(scenario: Scenario, seed: int) -> PlayedRun:
     """Play a scenario, and return the result. Raises HarnessError if it cannot be played."""
     watcher = CoverageWatcher()
     result, evidence = _played(scenario, seed, watcher.step)
     divergence = None if scenario.final_reconcile or result.bad else _known_divergences(result)
     found = identities(result, evidence.cached(cycle_of) if evidence else None, scenario)
     if evidence is None:
-        return Trial(watcher.reached, found)
+        return PlayedRun(watcher.reached, found)
     timer_ends = timers_ended(evidence)
     moments = tuple(sorted({round(each.at_s, 3) for each in timer_ends if each.at_s <= scenario.duration_s}))
     patterns = failed_votes([each for each in timer_ends if each.at_s > scenario.duration_s])
-    return Trial(watcher.reached, found, divergence, moments, patterns)
+    return PlayedRun(watcher.reached, found, divergence, moments, patterns)
 
 
 def _known_divergences(result: Result) -> Divergence | None:
@@ -126,7 +126,7 @@ def _known_divergences(result: Result) -> Divergence | None:
     return tuple(sorted((agents, len(chain) - mutual) for chain, agents in holders.items()))
 
 
-def findings_of(scenario: Scenario, seed: int) -> tuple[Identity, ...]:
+def findings_of(scenario: Scenario, seed: int) -> tuple[FindingIdentity, ...]:
     """Return the findings of a run. Raises HarnessError if the scenario cannot be played."""
     result, evidence = _played(scenario, seed, lambda state, run: None)
     return identities(result, evidence.cached(cycle_of) if evidence else None, scenario)
@@ -180,7 +180,7 @@ def _until(fate: Document, ends_s: float) -> Document:
     return {**fate, "until_s": min(ends_s, fate.get("until_s", ends_s))}
 
 
-def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[Limits, list[tuple[Document, int]]]:
+def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[MutationLimits, list[tuple[Document, int]]]:
     """Return the limits for changes, and short documents with which the search can begin."""
     initial, last_s = [], LAST_S
     for seed in seeds:
@@ -188,7 +188,7 @@ def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[Limits,
         documents = [_as_json(_initial_document(scenario, completing[:blocks])) for blocks in (FEW_BLOCKS, MOST_BLOCKS)]
         initial += [(document, seed) for document in documents]
         last_s = max(last_s, documents[-1]["duration_s"])
-    return Limits(scenario.roster, MOST_BLOCKS, last_s), initial
+    return MutationLimits(scenario.roster, MOST_BLOCKS, last_s), initial
 
 
 def _as_json(document: Document) -> Document:
@@ -197,7 +197,7 @@ def _as_json(document: Document) -> Document:
     return copy
 
 
-def _initial_document(scenario: Scenario, completing: Sequence[Logged]) -> Document:
+def _initial_document(scenario: Scenario, completing: Sequence[RecordedEvent]) -> Document:
     """Return a document in which one event completes each of these blocks.
 
     Everything else is as in the scenario up to then. Losses and latencies are still random.

@@ -36,7 +36,7 @@ LATE_S = (0.001, 0.01, 0.03, 0.06, 0.2, 0.5)
 Change = Callable[[Document, Random], Document]
 
 
-class Limits(NamedTuple):
+class MutationLimits(NamedTuple):
     """The agents that may take part, the maximum number of blocks, and the latest time of a block."""
 
     roster: Sequence[int]
@@ -45,7 +45,7 @@ class Limits(NamedTuple):
 
 
 def mutate(
-    document: Document, other: Document, limits: Limits, rng: Random, timers_ended_s: Sequence[float] = ()
+    document: Document, other: Document, limits: MutationLimits, rng: Random, timers_ended_s: Sequence[float] = ()
 ) -> Document:
     """Return a document with one to eight random changes, sometimes combined with parts of `other`.
 
@@ -63,7 +63,7 @@ def mutate(
     return _limited(document, limits._replace(blocks=min(FEW_BLOCKS, limits.blocks)) if few else limits)
 
 
-def _limited(document: Document, limits: Limits) -> Document:
+def _limited(document: Document, limits: MutationLimits) -> Document:
     """Return the document within the limits, with a mission that ends soon after the last event."""
     events = [event for event in script(document) if event["at_s"] <= limits.last_s][: limits.blocks]
     last_s = max((event["at_s"] for event in events), default=0.0)

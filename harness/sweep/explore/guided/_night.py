@@ -26,10 +26,10 @@ from harness.sweep.explore._scenario_document import Document
 from harness.sweep.explore._shrink import file_of
 from harness.sweep.explore._smaller import scenario_of
 from harness.sweep.explore.guided._corpus import Corpus, Finding, opened
-from harness.sweep.explore.guided._finding_identity import Identity
-from harness.sweep.explore.guided._hunt import Candidate, Hunt
+from harness.sweep.explore.guided._finding_identity import FindingIdentity
+from harness.sweep.explore.guided._hunt import CandidateRun, Hunt
 from harness.sweep.explore.guided._hunt_trial import findings_of, initial_documents, with_liveness_phase
-from harness.sweep.explore.guided._mutation import Limits
+from harness.sweep.explore.guided._mutation import MutationLimits
 from harness.sweep.explore.guided._night_page import to_html
 
 Status = Literal["new", "resolved", "rare", "ongoing"]
@@ -48,7 +48,7 @@ SAMPLES = 200
 
 
 @dataclass(frozen=True)
-class Watcher:
+class NightProgress:
     """Functions that report progress. `on_progress` gets the numbers of runs, agent states and findings, and `on_event`
     a text.
     """
@@ -146,7 +146,7 @@ def spend(
     for_s: float = float("inf"),
     most_runs: float = float("inf"),
     jobs: int = 1,
-    watcher: Watcher = Watcher(),
+    watcher: NightProgress = NightProgress(),
 ) -> Night:
     """Search for `for_s` seconds or `most_runs` runs, and store the results in `directory`. Ctrl-C ends the night
     early.
@@ -159,7 +159,7 @@ def spend(
     corpus = opened(directory, scenario, limits)
     try:
         return _NightRun(scenario, corpus, limits, first_seed, for_s, most_runs, jobs, watcher).spend(
-            [Candidate(*each) for each in initial]
+            [CandidateRun(*each) for each in initial]
         )
     finally:
         corpus.close()
@@ -172,12 +172,12 @@ class _NightRun:
         self,
         scenario: Scenario,
         corpus: Corpus,
-        limits: Limits,
+        limits: MutationLimits,
         first_seed: int,
         for_s: float,
         most_runs: float,
         jobs: int,
-        watcher: Watcher,
+        watcher: NightProgress,
     ) -> None:
         self._corpus, self._jobs, self._watcher = corpus, jobs, watcher
         self._most_runs = most_runs
@@ -186,10 +186,10 @@ class _NightRun:
         started_at = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
         self._night = Night(scenario, corpus.directory, Hunt(limits, Random(f"{first_seed}")), started_at)
         self._known = {finding.identity: finding for finding in corpus.findings()}
-        self._new: dict[Identity, Finding] = {}
-        self._shown: dict[Identity, tuple[int, int]] = {}
+        self._new: dict[FindingIdentity, Finding] = {}
+        self._shown: dict[FindingIdentity, tuple[int, int]] = {}
 
-    def spend(self, initial: list[Candidate]) -> Night:
+    def spend(self, initial: list[CandidateRun]) -> Night:
         night = self._night
         try:
             self._replay()
@@ -212,7 +212,7 @@ class _NightRun:
                 self._watcher.on_event(f"playing a known finding again: {identity}")
                 self._shown[identity] = self._count_seeds(identity, document, finding.seed)
 
-    def _count_seeds(self, identity: Identity, document: Document, seed: int) -> tuple[int, int]:
+    def _count_seeds(self, identity: FindingIdentity, document: Document, seed: int) -> tuple[int, int]:
         seeds = [seed, *(other for other in range(1, SEEDS + 1) if other != seed)][:SEEDS]
 
         def shows(with_seed: int) -> bool:
@@ -221,7 +221,7 @@ class _NightRun:
         with sweep(seeds, shows, self._jobs) as outcomes:
             return sum(outcome is True for _, outcome in outcomes), len(seeds)
 
-    def _hunt(self, initial: list[Candidate]) -> None:
+    def _hunt(self, initial: list[CandidateRun]) -> None:
         """Continue the search from the stored runs.
 
         Runs that reach nothing new any more are dropped, if there was time to play all of them.
@@ -244,7 +244,7 @@ class _NightRun:
     def _over(self) -> bool:
         return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
 
-    def _kept_runs(self, runs: Iterator[tuple[Candidate, bool]]) -> Iterator[Candidate]:
+    def _kept_runs(self, runs: Iterator[tuple[CandidateRun, bool]]) -> Iterator[CandidateRun]:
         """Yield the runs to store. They and new findings are written at once."""
         night, hunt = self._night, self._night.hunt
         for candidate, is_kept in runs:
@@ -258,7 +258,7 @@ class _NightRun:
             if self._over:
                 return
 
-    def _add_finding(self, identity: Identity, candidate: Candidate) -> None:
+    def _add_finding(self, identity: FindingIdentity, candidate: CandidateRun) -> None:
         finding = Finding(
             **vars(identity),
             seed=candidate.seed,
@@ -286,7 +286,7 @@ class _NightRun:
             document = with_liveness_phase(self._night.hunt.found[identity].document)
             self._watcher.on_event(f"shrinking: {identity}")
 
-            def still(scenario: Scenario, identity: Identity = identity, seed: int = finding.seed) -> bool:
+            def still(scenario: Scenario, identity: FindingIdentity = identity, seed: int = finding.seed) -> bool:
                 return identity in findings_of(scenario, seed)
 
             smallest, words, interrupted = smallest_of(

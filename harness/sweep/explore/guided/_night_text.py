@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from rich.console import Console
 
 from harness.proof.coverage import in_words as coverage_in_words
-from harness.sweep.explore.guided._night import Night, Watcher
+from harness.sweep.explore.guided._night import Night, NightProgress
 
 REDRAW_EVERY_S = 0.1
 FIRST_LINE_S, LINES_GROW, LONGEST_S = 10.0, 1.5, 600.0
@@ -16,7 +16,7 @@ CLEAR_LINE = "\r\x1b[2K"
 
 
 @contextlib.contextmanager
-def watching(console: Console) -> Iterator[Watcher]:
+def watching(console: Console) -> Iterator[NightProgress]:
     """Yield functions that print the progress.
 
     On a terminal, the progress is one line that is redrawn. Elsewhere it is a line at growing intervals.
@@ -43,7 +43,7 @@ def watching(console: Console) -> Iterator[Watcher]:
         console.print(words, highlight=False, soft_wrap=True, markup=False)
 
     try:
-        yield Watcher(on_progress, on_event)
+        yield NightProgress(on_progress, on_event)
     finally:
         if console.is_terminal:
             console.file.write(CLEAR_LINE)

@@ -89,7 +89,7 @@ class TileMark:
 
 
 @dataclass(frozen=True, slots=True)
-class Tile:
+class HeatmapTile:
     """A tile of the heatmap. `shade` is None for an unknown figure, and `href` is None without runs."""
 
     shade: int | None
@@ -108,7 +108,7 @@ class Grid:
 
     name: str
     losses: list[str]
-    rows: list[tuple[str, list[Tile]]]
+    rows: list[tuple[str, list[HeatmapTile]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,13 +154,15 @@ def _scale(figure: Figure, record: MatrixRecord) -> tuple[float, float]:
     return min(means, default=0.0), max(means, default=0.0)
 
 
-def _tile(record: MatrixRecord, figure: Figure, point: Point, cell: Cell | None, scale: tuple[float, float]) -> Tile:
+def _tile(
+    record: MatrixRecord, figure: Figure, point: Point, cell: Cell | None, scale: tuple[float, float]
+) -> HeatmapTile:
     name = name_of(record.matrix, point)
     if cell is None:
-        return Tile(None, "\u2013", "", [], f"{name}: no run has ended", None)
+        return HeatmapTile(None, "\u2013", "", [], f"{name}: no run has ended", None)
     estimate, marks = figure.of(cell), _marks(record, figure, cell)
     text = ", ".join([say(figure.metric, estimate), *(mark.text for mark in marks)])
-    return Tile(
+    return HeatmapTile(
         None if estimate.mean is None else _shade(estimate.mean, *scale),
         say_mean(figure.metric, estimate),
         say_interval(figure.metric, estimate),

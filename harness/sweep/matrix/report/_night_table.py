@@ -19,7 +19,7 @@ class NightColumn:
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class NightCell:
     """The state of a cell in a night: a short sign, all facts in words, and a CSS class."""
 
     sign: str
@@ -34,17 +34,17 @@ def columns(nights: Sequence[MatrixRecord]) -> list[NightColumn]:
     ]
 
 
-def rows(nights: Sequence[MatrixRecord], tonight: MatrixRecord) -> list[tuple[str, list[Field]]]:
+def rows(nights: Sequence[MatrixRecord], tonight: MatrixRecord) -> list[tuple[str, list[NightCell]]]:
     """Return the name of each cell of tonight's matrix, with a field for each night."""
     return [
         (name_of(tonight.matrix, point), [_field(night, point) for night in nights]) for point in tonight.matrix.points
     ]
 
 
-def _field(night: MatrixRecord, point: Point) -> Field:
+def _field(night: MatrixRecord, point: Point) -> NightCell:
     cell = next((cell for cell in night.cells if cell.point == point), None)
     if cell is None:
-        return Field("", "no runs", "unknown")
+        return NightCell("", "no runs", "unknown")
     bad = violated(cell) + cell.failed
     against = night.against
     worse = sum(change.point == point for change in against.regressions) if against else 0
@@ -56,6 +56,6 @@ def _field(night: MatrixRecord, point: Point) -> Field:
     ]
     found = [(f"{sign}{count}", meaning, kind) for count, sign, meaning, kind in facts if count]
     if not found:
-        return Field("✓", f"{cell.runs} runs, no violation", "holds")
+        return NightCell("✓", f"{cell.runs} runs, no violation", "holds")
     signs, meanings = (" ".join(sign for sign, _, _ in found), ", ".join(meaning for _, meaning, _ in found))
-    return Field(signs, f"{cell.runs} runs: {meanings}", found[0][2])
+    return NightCell(signs, f"{cell.runs} runs: {meanings}", found[0][2])

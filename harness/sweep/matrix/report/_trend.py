@@ -13,7 +13,7 @@ from harness.present import svg, text
 from harness.present.svg import Axis, ChartArea, n
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import Estimate
-from harness.sweep.matrix._matrix_picture import Dot, curve
+from harness.sweep.matrix._matrix_picture import LinePoint, curve
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import say, series, series_name
 from harness.sweep.matrix.report._heatmap import Figure
@@ -43,7 +43,7 @@ def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: Figure)
         for cell, area in zip(cells, areas, strict=True):
             known = [(at, by_point[cell.point]) for at, by_point in enumerate(of_night) if cell.point in by_point]
             dots = [
-                Dot(at, estimate, f"{begun[at]}, {commits[at]}: {say(figure.metric, estimate)}")
+                LinePoint(at, estimate, f"{begun[at]}, {commits[at]}: {say(figure.metric, estimate)}")
                 for at, estimate in known
                 if _is_sane(estimate)
             ]
@@ -61,7 +61,7 @@ def _drawing(height: float, label: str, panels: Sequence[Markup]) -> Markup:
     ).format(w=svg.WIDTH, h=n(height), label=label, panels=Markup("").join(panels))
 
 
-def _panel(figure: Figure, cell: Cell, dots: Sequence[Dot], dates: Sequence[str], area: ChartArea) -> Markup:
+def _panel(figure: Figure, cell: Cell, dots: Sequence[LinePoint], dates: Sequence[str], area: ChartArea) -> Markup:
     last = len(dates) - 1
     across = Axis(0, last, *area.across, sorted({0, last // 2, last} if last > 3 else {0, last}))
     up = _value_axis(figure, [dot.estimate for dot in dots], area)

@@ -13,7 +13,7 @@ import yaml
 from harness.errors import HarnessError
 from harness.play.simulation.foreign._virtual_program import ProgramPool
 from harness.run.simulate import simulate
-from harness.sweep.matrix._cell_play import Player
+from harness.sweep.matrix._cell_play import RunPlayer
 from harness.sweep.matrix._matrix_file import Matrix
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.play.foreign.agents import EXPORT, living, played_by, small
@@ -64,7 +64,7 @@ def test_matrix_checks_the_first_seed_of_each_cell(tmp_path: Path) -> None:
     command = small(tmp_path, EXPORT + "import time\nsaid['now'] = time.time_ns()")
     document = {"name": "m", "loss": [0.0, 0.1], "seeds": 2, "scenario": {**BUSY, "agent_command": command}}
     matrix = Matrix.model_validate({**document, "backend": ["sim"]})
-    player = Player(matrix, tmp_path)
+    player = RunPlayer(matrix, tmp_path)
     first, *_ = matrix.tasks
     with pytest.raises(HarnessError, match="is not deterministic"):
         player(first)

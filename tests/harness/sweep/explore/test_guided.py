@@ -26,9 +26,9 @@ from harness.sweep.explore._scenario_document import document_of, script
 from harness.sweep.explore.guided import Night, spend
 from harness.sweep.explore.guided._corpus import MOST_BYTES, opened
 from harness.sweep.explore.guided._finding_identity import identities
-from harness.sweep.explore.guided._hunt import Candidate, Hunt, Kept
+from harness.sweep.explore.guided._hunt import CandidateRun, Hunt, KeptRun
 from harness.sweep.explore.guided._hunt_trial import (
-    Trial,
+    PlayedRun,
     findings_of,
     initial_documents,
     play_trial,
@@ -73,7 +73,7 @@ def test_equal_draws_make_equal_changes_and_most_are_playable() -> None:
     for each in many(1):
         assert len(each["events"].get("script", [])) <= limits.blocks
         try:
-            playable += bool(Candidate(each, 1).scenario())
+            playable += bool(CandidateRun(each, 1).scenario())
         except ValidationError:
             continue
     assert playable > 100
@@ -107,18 +107,18 @@ def test_run_with_a_new_pattern_of_failed_votes_is_kept(monkeypatch: pytest.Monk
     patterns = iter((("voting", "phase one", "voting"),) * 2 + (("voting", "voting"),))
     monkeypatch.setattr(
         "harness.sweep.explore.guided._hunt.play_trial",
-        lambda scenario, seed: Trial(ReachedStates(), (), failed_votes=(next(patterns),)),
+        lambda scenario, seed: PlayedRun(ReachedStates(), (), failed_votes=(next(patterns),)),
     )
     hunt = Hunt(limits, Random(1))
-    assert [kept for _, kept in hunt.begin([Candidate(document, seed)] * 3, 1)] == [True, False, True]
+    assert [kept for _, kept in hunt.begin([CandidateRun(document, seed)] * 3, 1)] == [True, False, True]
 
 
 def test_documents_near_a_livelock_are_changed_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
     limits, ((document, seed), *_) = initial_documents(ordinary(), range(1))
     monkeypatch.setattr(
-        "harness.sweep.explore.guided._hunt.play_trial", lambda scenario, seed: Trial(ReachedStates(), ())
+        "harness.sweep.explore.guided._hunt.play_trial", lambda scenario, seed: PlayedRun(ReachedStates(), ())
     )
-    near = Kept(Candidate(document, seed), new_states=1, steps=100, failed=3, timers_ended_s=())
+    near = KeptRun(CandidateRun(document, seed), new_states=1, steps=100, failed=3, timers_ended_s=())
     others = [dataclasses.replace(near, failed=0) for _ in range(100)]
     hunt = Hunt(limits, Random(1), kept=[near, *others])
     for _ in hunt.round(1):
@@ -176,7 +176,7 @@ def test_hunt_does_not_depend_on_the_number_of_processes() -> None:
     def hunted(jobs: int) -> Hunt:
         limits, initial = initial_documents(ordinary(), range(2))
         hunt = Hunt(limits, Random(1))
-        for _ in (*hunt.begin([Candidate(*each) for each in initial], jobs), *hunt.round(jobs)):
+        for _ in (*hunt.begin([CandidateRun(*each) for each in initial], jobs), *hunt.round(jobs)):
             pass
         return hunt
 
@@ -189,7 +189,7 @@ def test_hunt_finds_new_states_after_its_sets_are_full(monkeypatch: pytest.Monke
     def hunted() -> Hunt:
         limits, initial = initial_documents(ordinary(), range(2))
         hunt = Hunt(limits, Random(1))
-        for _ in (*hunt.begin([Candidate(*each) for each in initial], 1), *hunt.round(1)):
+        for _ in (*hunt.begin([CandidateRun(*each) for each in initial], 1), *hunt.round(1)):
             pass
         return hunt
 

@@ -10,7 +10,7 @@ from harness.checker.judgement import Judgement, Verdict
 from harness.play.mission import RunOutcome
 from harness.scenario import Scenario
 from harness.sweep.matrix import Finished, Matrix, run_matrix
-from harness.sweep.matrix._cell_play import Judged
+from harness.sweep.matrix._cell_play import JudgedRun
 from harness.sweep.matrix.matrix_run import on_cores
 
 Judge = Callable[[Scenario, int], Result]
@@ -30,8 +30,8 @@ def matrix(
 def played(asked: Matrix, jobs: int, judge: Judge, directory: Path | None = None) -> Finished:
     """Play the matrix into `directory`, or into a temporary one."""
 
-    def plays(scenario: Scenario, seed: int) -> Judged:
-        return Judged(RunOutcome(mission_s=scenario.duration_s + 100, settled=True), judge(scenario, seed))
+    def plays(scenario: Scenario, seed: int) -> JudgedRun:
+        return JudgedRun(RunOutcome(mission_s=scenario.duration_s + 100, settled=True), judge(scenario, seed))
 
     with tempfile.TemporaryDirectory() as folder:
         return run_matrix(asked, directory or Path(folder), on_cores(asked, jobs), plays)

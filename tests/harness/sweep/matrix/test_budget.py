@@ -1,4 +1,4 @@
-"""`--budget`: uncertain cells come first, no run begins late, and the night says what it left out."""
+"""`--budget`: uncertain cells come first, no run begins late, and the output lists the omitted runs."""
 
 from collections import Counter
 from collections.abc import Callable

@@ -30,7 +30,7 @@ def breaks(scenario: Scenario, seed: int) -> Result:
     return judge(scenario, seed)
 
 
-def tiles(finished: Finished, name: str) -> dict[str, _heatmap.Tile]:
+def tiles(finished: Finished, name: str) -> dict[str, _heatmap.HeatmapTile]:
     """Return the tiles of one figure by the page section to which they link."""
     (figure,) = [one for one in known_figures(finished.record.cells) if one.metric.name == name]
     grids = _heatmap.heatmap(finished.record, figure).grids
