@@ -10,8 +10,8 @@ import pytest
 from harness.backend_names import BACKEND_NAMES, BackendName
 from harness.errors import ScenarioError
 from harness.play.progress import SilentProgress
-from harness.pytest_plugin._judged_run import Trial, discard, new_directory, one_sentence
-from harness.pytest_plugin._options import Options
+from harness.pytest_plugin._judged_run import PluginRun, discard, new_directory, one_sentence
+from harness.pytest_plugin._options import SessionOptions
 from harness.pytest_plugin._stash import TRIAL
 from harness.pytest_plugin.findings import Findings
 from harness.pytest_plugin.swarm_in_test import Swarm
@@ -27,7 +27,7 @@ def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
     """Yield the swarm of a test. If the test is aborted, the run ends here."""
     with ExitStack() as stack:
         with one_sentence():
-            options = Options.of(node.config)
+            options = SessionOptions.of(node.config)
             keys = {**DEFAULTS, "name": node.name[:200], "vehicles": {"kind": "none"}}
             for marker in reversed(list(node.iter_markers("swarm"))):  # the nearest marker overrides the others
                 keys |= marker.kwargs
@@ -38,7 +38,7 @@ def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
             stack.enter_context(in_force(variant))
             directory = new_directory(node, options)
             swarm = Swarm(scenario, seed, backend, directory)
-        trial = node.stash[TRIAL] = Trial(scenario, swarm.finish, variant)
+        trial = node.stash[TRIAL] = PluginRun(scenario, swarm.finish, variant)
         stack.callback(swarm.close)
         yield swarm
     if trial.passed:
@@ -48,7 +48,7 @@ def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
 def scenario_for(node: pytest.Item) -> Iterator[Findings]:
     """Play the scenario that the marker names, and yield its verdicts and figures."""
     with one_sentence():
-        options = Options.of(node.config)
+        options = SessionOptions.of(node.config)
         path, keys = _marked(node)
         backend, seed = _backend_and_seed(keys["backend"], keys["seed"], options)
         variant = _variant(keys["variant"], node, options)
@@ -56,7 +56,7 @@ def scenario_for(node: pytest.Item) -> Iterator[Findings]:
         scenario = options.applied_to(load_scenario(path))
         directory = new_directory(node, options)
         finished = play(scenario, seed, backend, directory, variant)
-    trial = node.stash[TRIAL] = Trial(scenario, lambda _: finished, variant)
+    trial = node.stash[TRIAL] = PluginRun(scenario, lambda _: finished, variant)
     yield Findings(directory, finished.result)
     if trial.passed:
         discard(directory, options)
@@ -91,14 +91,14 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
     return path if path.exists() or not included.is_absolute() else included, {**DEFAULTS, **marker.kwargs}
 
 
-def _variant(marked: Any, node: pytest.Item, options: Options) -> Path | None:
+def _variant(marked: Any, node: pytest.Item, options: SessionOptions) -> Path | None:
     """Return the file of the variant from the command line, or else from the marker. Raises ScenarioError."""
     if marked is not None and not isinstance(marked, str | Path):
         raise ScenarioError(f"`variant` is {marked!r}: use the path of a Python file")
     return options.variant or (node.path.parent / marked if marked is not None else None)
 
 
-def _backend_and_seed(backend: Any, seed: Any, options: Options) -> tuple[BackendName, int]:
+def _backend_and_seed(backend: Any, seed: Any, options: SessionOptions) -> tuple[BackendName, int]:
     """Return the backend and seed from the command line, or else from the marker. Raises ScenarioError."""
     if backend not in BACKEND_NAMES:
         *names, last = map(repr, BACKEND_NAMES)

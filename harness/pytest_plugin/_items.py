@@ -14,10 +14,10 @@ from harness.backend_names import BackendName
 from harness.errors import HarnessError, ScenarioError
 from harness.play.backends import in_virtual_time
 from harness.pytest_plugin._fixtures import play
-from harness.pytest_plugin._judged_run import Trial, discard, new_directory, one_sentence
-from harness.pytest_plugin._options import Options
+from harness.pytest_plugin._judged_run import PluginRun, discard, new_directory, one_sentence
+from harness.pytest_plugin._options import SessionOptions
 from harness.pytest_plugin._stash import TRIAL
-from harness.report.stories.narration import Narrator
+from harness.report.stories.narration import StoryWriter
 from harness.report.stories.story_file import Story, read_story
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.expect import Expect
@@ -26,7 +26,7 @@ from harness.scenario.expect import Expect
 class ScenarioFile(pytest.File):
     def collect(self) -> Iterator[pytest.Item]:
         try:
-            options = Options.of(self.config)
+            options = SessionOptions.of(self.config)
             scenario = options.applied_to(load_scenario(self.path))
         except HarnessError as error:
             raise self.CollectError(str(error)) from None
@@ -50,15 +50,15 @@ class ScenarioItem(pytest.Item):
 
     def runtest(self) -> None:
         with one_sentence():
-            options = Options.of(self.config)
+            options = SessionOptions.of(self.config)
             options.refuse(self._backend)
             self._directory = new_directory(self, options)
             finished = play(self._scenario, self._seed, self._backend, self._directory, options.variant)
-        self.stash[TRIAL] = Trial(self._scenario, lambda _: finished, options.variant)
+        self.stash[TRIAL] = PluginRun(self._scenario, lambda _: finished, options.variant)
 
     def teardown(self) -> None:
         if self._directory is not None and TRIAL in self.stash and self.stash[TRIAL].passed:
-            discard(self._directory, Options.of(self.config))
+            discard(self._directory, SessionOptions.of(self.config))
 
     def reportinfo(self) -> tuple[Path, None, str]:
         return self.path, None, f"{self.path.name}::{self.name}"
@@ -70,7 +70,7 @@ CONTEXT_LINES = 3
 class StoryFile(pytest.File):
     def collect(self) -> Iterator[pytest.Item]:
         try:
-            options = Options.of(self.config)
+            options = SessionOptions.of(self.config)
             play = read_story(self.path)
         except HarnessError as error:
             raise self.CollectError(str(error)) from None
@@ -89,7 +89,7 @@ class StoryItem(pytest.Item):
         self._directory: Path | None = None
 
     def runtest(self) -> None:
-        options = Options.of(self.config)
+        options = SessionOptions.of(self.config)
         with one_sentence():
             options.refuse(self._backend)
             virtual = in_virtual_time(self._backend)
@@ -99,7 +99,7 @@ class StoryItem(pytest.Item):
             self._directory = new_directory(self, options)
             seed = 1 if options.seed is None else options.seed
             finished = play(scenario, seed, self._backend, self._directory, options.variant, delivers_all=True)
-        self.stash[TRIAL] = Trial(scenario, lambda _: finished, options.variant)
+        self.stash[TRIAL] = PluginRun(scenario, lambda _: finished, options.variant)
         if finished.played.outcome != "completed":
             return  # the judgement of the run reports the reason
         archive = RunArchive(finished.directory)
@@ -130,7 +130,7 @@ class StoryItem(pytest.Item):
 
     def _played_text(self, archive: RunArchive) -> str:
         """Return the text of the story with the reactions of agents in this run."""
-        narrator = Narrator(archive.traces, self._story.scenario.roster)
+        narrator = StoryWriter(archive.traces, self._story.scenario.roster)
         answers = [narrator.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
         return self._story.with_answers(answers)
 
@@ -154,7 +154,7 @@ class StoryItem(pytest.Item):
 
     def teardown(self) -> None:
         if self._directory is not None and TRIAL in self.stash and self.stash[TRIAL].passed:
-            discard(self._directory, Options.of(self.config))
+            discard(self._directory, SessionOptions.of(self.config))
 
     def reportinfo(self) -> tuple[Path, None, str]:
         return self.path, None, f"{self.path.name}::{self.name}"

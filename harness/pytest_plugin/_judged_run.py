@@ -13,7 +13,7 @@ import pytest
 
 from harness.archive.archive import RunArchive
 from harness.errors import HarnessError, MachineError, RunDirectoryError
-from harness.pytest_plugin._options import Options
+from harness.pytest_plugin._options import SessionOptions
 from harness.pytest_plugin.findings import JudgementInTest
 from harness.report.agent_programs import in_sentence, programs
 from harness.run.run import Run
@@ -22,7 +22,7 @@ from harness.scenario.agent_options import quirks_in_words
 from harness.scenario.expect import Expect
 
 
-class Trial:
+class PluginRun:
     """The run of a test. `finish` ends and judges it. If its argument is true, it waits until the agents are idle.
 
     `variant` is the file of the protocol variant of the run, or None.
@@ -106,7 +106,7 @@ def one_sentence() -> Iterator[None]:
 MAX_NAME = 100
 
 
-def new_directory(node: pytest.Item, options: Options) -> Path:
+def new_directory(node: pytest.Item, options: SessionOptions) -> Path:
     """Create an empty directory for the run of this test. Raises RunDirectoryError."""
     name = re.sub(r"\W+", "-", node.nodeid).strip("-")[-MAX_NAME:]
     if options.keep is None:
@@ -124,7 +124,7 @@ def new_directory(node: pytest.Item, options: Options) -> Path:
     raise AssertionError("numbers do not end")
 
 
-def discard(directory: Path, options: Options) -> None:
+def discard(directory: Path, options: SessionOptions) -> None:
     """Remove the directory of a run without unexpected findings, unless the option `--ucp-keep` is set."""
     if options.keep is None:
         shutil.rmtree(directory, ignore_errors=True)
