@@ -11,7 +11,7 @@ from typing import Any
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
 from harness.play.child_processes import passed_on
-from harness.play.process._run_lab import MissionLab, Program
+from harness.play.process._run_lab import LabProgram, MissionLab
 from harness.scenario.vehicles import Flight
 from netem.radio import Place
 from sitl.circumstances import SimulatedFailure
@@ -19,7 +19,7 @@ from sitl.ground_station import GroundStation
 from sitl.modes import mav_type
 from sitl.parameters import in_lines
 from sitl.pilot import Pilot
-from sitl.procedure import Procedure
+from sitl.procedure import PilotProcedure
 from sitl.vehicle import STATION_PORT, Home, Launch, VehicleError, VehicleKind
 
 LISTEN_LIMIT_S = 20.0
@@ -47,8 +47,8 @@ class VehicleProcess:
         self._abandoned = self._introduced = False
         self.pilot: Pilot | None = None
         self._directory = rundir.vehicle(vehicle_id, incarnation)
-        self._process: Program | None = None
-        self._flight: Procedure | None = None
+        self._process: LabProgram | None = None
+        self._flight: PilotProcedure | None = None
         self._circumstances: list[dict[str, Any]] = []
         self._station_port = STATION_PORT
 
@@ -252,7 +252,7 @@ class VehicleProcess:
             given["parameters_given"] = dict(self.kind.parameters)
         return {key: value for key, value in given.items() if value is not None}
 
-    def _end_error(self, process: Program) -> VehicleFailedError:
+    def _end_error(self, process: LabProgram) -> VehicleFailedError:
         return VehicleFailedError(
             f"vehicle {self.vehicle_id} ({self.kind.name}) ended by itself with {process.end}{self._last_output()}"
         )
