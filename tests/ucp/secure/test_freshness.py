@@ -9,7 +9,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from tests.ucp.secure.swarm import KEYS, ROSTER
 from ucp.messages import RequestForBlock
 from ucp.secure._challenges import CHALLENGE_INTERVAL_S, ECHO_INTERVAL_S, TRUST_DELAY_S
-from ucp.secure._epochs import MAX_EPOCHS_AHEAD
+from ucp.secure._epochs import MAX_EPOCHS_AHEAD, MAX_EPOCHS_FOLLOWED
 from ucp.secure.bundle import Bundle
 from ucp.secure.envelope import CHALLENGE, ECHO
 from ucp.secure.revocation import Revocation
@@ -184,6 +184,15 @@ def test_far_epoch_of_a_captured_vehicle_cuts_off_no_vehicle() -> None:
         assert hears(one, query(two), clocks[one])
         assert hears(two, query(one), clocks[two])
     assert [agent.session.epochs.bundle.epoch for agent in (one, two)] == [0, 3]
+
+
+def test_vehicle_follows_a_far_epoch_so_far_that_slow_clocks_can_open_it() -> None:
+    one, two, captured = born(1), born(2), born(3)
+    captured.session.epochs._followed = two.session.epochs.bundle.epoch + MAX_EPOCHS_AHEAD + 5
+    two.session.set_clock(5 * EPOCH_S)
+    assert hears(two, query(captured), 5 * EPOCH_S)
+    assert two.session.epochs.current == 5 + MAX_EPOCHS_FOLLOWED
+    assert hears(one, query(two), 0.0)
 
 
 def test_vehicle_without_store_learns_revocations_before_it_trusts() -> None:
