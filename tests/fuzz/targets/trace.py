@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.archive.traces import Header, parse_line, read_trace, why_not_a_trace
+from harness.archive.traces import Header, Trace, parse_line, read_trace, why_not_a_trace
 from tests.fuzz.finding import require, sound
 from tests.fuzz.targets.home import came_home, in_its_run
 from ucp.trace import Entry
@@ -26,9 +26,14 @@ def run(data: bytes) -> None:
             for entry in (*trace.runs, *(aside for _, aside in trace.asides)):
                 _same_again(entry)
             skimmed = read_trace(path, skim=True)
-            require(skimmed is not None and skimmed.skimmed().runs == trace.skimmed().runs, "skimmed, it is another")
+            require(skimmed is not None and _lines(skimmed) == _lines(trace), "skimmed, it is another")
     came_home(NAME, data)
     in_its_run(f"agents/{NAME}", data)
+
+
+def _lines(trace: Trace) -> list[str]:
+    """Return the skimmed trace as lines, because a time that is no number equals nothing."""
+    return [run.to_line() for run in trace.skimmed().runs]
 
 
 def _same_again(entry: Entry) -> None:
