@@ -294,7 +294,8 @@ def read_exports(paths: Iterable[Path]) -> Exports:
 
 def export_paths(directory: Path) -> list[Path]:
     """Return the exports in a run directory, or in a directory of exports, in order of agent IDs."""
-    return sorted(agents_directory(directory).glob(f"*{SUFFIX}"), key=lambda path: (len(path.name), path.name))
+    paths = (path for path in agents_directory(directory).glob(f"*{SUFFIX}") if path.exists())
+    return sorted(paths, key=lambda path: (len(path.name), path.name))
 
 
 def agents_directory(directory: Path) -> Path:

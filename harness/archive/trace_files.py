@@ -28,7 +28,7 @@ _CHUNK_BYTES = 1024 * 1024
 
 def trace_files(agents: Path) -> list[Path]:
     """Return the traces in a directory, in the order of the agent IDs in their names."""
-    plain = {path.name: path for path in agents.glob(f"*{SUFFIX}")}
+    plain = {path.name: path for path in agents.glob(f"*{SUFFIX}") if path.exists()}
     packed = {path.name.removesuffix(".gz"): path for path in agents.glob(f"*{PACKED_SUFFIX}")}
     return [path for _, path in sorted((packed | plain).items(), key=lambda item: (len(item[0]), item[0]))]
 

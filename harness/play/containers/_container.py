@@ -184,21 +184,20 @@ def recipe(
     api: docker.APIClient,
     image: ContainerImage,
     argv: Sequence[str],
-    kept: Sequence[Path],
+    kept: Sequence[Mount],
     network_mode: str,
     limits: DockerOptions,
     max_file_bytes: int | None = None,
 ) -> dict[str, Any]:
     """Return the keyword arguments with which the Docker SDK creates the container.
 
-    The container has no capabilities. It can write only into /tmp and the directories in `kept`: the run directory, and
-    the vehicle's key directory if it has one.
+    The container has no capabilities. It can write only into /tmp and the directories in `kept`.
     """
     command = image.command(argv)
     shared = [Mount(str(path), str(path), type="bind", read_only=True) for path in image.shared(argv)]
     host_config = api.create_host_config(
         network_mode=network_mode,
-        mounts=[*shared, *(Mount(str(path), str(path), type="bind") for path in kept)],
+        mounts=[*shared, *kept],
         tmpfs={"/tmp": ""},  # noqa: S108  (inside the container)
         read_only=True,
         init=True,

@@ -20,11 +20,13 @@ from types import TracebackType
 from typing import Any, Self
 
 import docker.errors
+from docker.types import Mount
 
 from harness.archive.directory import RunDirectory
 from harness.play.containers import _images, ownership
 from harness.play.containers._container import Container, ContainerOutput, recipe
 from harness.play.containers._images import ContainerImage
+from harness.play.containers._own_folders import OwnFolders
 from harness.play.containers.docker_engine import CLEAN, DockerEngine, DockerError, DockerEvents
 from harness.play.containers.ownership import remove
 from harness.play.process._run_lab import Role
@@ -62,6 +64,7 @@ class ContainerLab:
         self.network: Lab
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._closed = False
+        self._own_folders = OwnFolders(rundir.agents)
 
     @classmethod
     async def open(cls, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "ContainerLab":
@@ -247,7 +250,7 @@ class ContainerLab:
         self._incarnations[vehicle, role] += 1
         life = self._incarnations[vehicle, role]
         name = f"{self._name}-{role}-{vehicle}" + (f"-{life}" if life > 1 else "")
-        kept = [self._rundir.path, *([self._rundir.keys[vehicle]] if vehicle in self._rundir.keys else [])]
+        kept = await asyncio.to_thread(self._kept, vehicle, role, settings.get("working_dir"))
         options = recipe(self._engine.api, image, argv, kept, network, limits, max_file_bytes)
         labels = ownership.labels(self._name, vehicle, role)
         try:
@@ -262,6 +265,16 @@ class ContainerLab:
                 ) from None
             raise SpawnError(f"the container {name} cannot be created: {error.explanation}") from None
         return name, created["Id"]
+
+    def _kept(self, vehicle: int, role: str, directory: str | None) -> list[Mount]:
+        """Return the mounts of the directories into which the container may write: its own, and that of its keys."""
+        if directory is None:
+            return []
+        if role == "agent":
+            keys = [self._rundir.keys[vehicle]] if vehicle in self._rundir.keys else []
+            own = self._own_folders.mounts(vehicle, Path(directory))
+            return [*own, *(Mount(str(path), str(path), type="bind") for path in keys)]
+        return [Mount(directory, directory, type="bind")]
 
     async def _start(self, name: str, identity: str) -> None:
         try:
@@ -328,4 +341,5 @@ class ContainerLab:
             self._events.close()
         for container in self._containers.values():
             container.close()
+        self._own_folders.merge()
         self._engine.close()

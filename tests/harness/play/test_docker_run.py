@@ -54,6 +54,26 @@ def test_scenarios_hold_in_containers(name: str, tmp_path: Path) -> None:
     assert containers(out) == []
 
 
+def test_agent_neither_reads_nor_changes_files_of_other_agents(tmp_path: Path) -> None:
+    attack = "ls -R .. > 3.seen; echo x >> 1.trace.jsonl; cat 1.mission.json > 3.read; exec $0 -m ucp.node 3.*.json"
+    timeline = [{"at_s": 60, "reboot": [1], "down_s": 10, "disk": "kept"}, {"at_s": 80, "kill": [2]}]
+    command = {"3": ["sh", "-c", attack, sys.executable]}
+    done = on_docker(tmp_path, agent_command=command, timeline=timeline, speedup=40, **NO_VEHICLES)
+    assert done.returncode == 0, done.stdout + done.stderr
+    agents = tmp_path / "run" / "agents"
+    assert (agents / "3.seen").read_text().split() == [
+        "..:",
+        "agents",
+        "../agents:",
+        "3.log",
+        "3.mission.json",
+        "3.seen",
+    ]
+    assert (agents / "3.read").read_text() == ""
+    assert [path.name for path in agents.iterdir() if path.is_symlink()] == []
+    assert {path.name for path in agents.iterdir() if path.is_dir()} == {"1-2", "3-1"}
+
+
 def test_faults_of_agents_and_vehicles(tmp_path: Path) -> None:
     timeline = [
         {"at_s": 40, "pause": [1]},
