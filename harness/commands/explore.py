@@ -68,7 +68,7 @@ def explore_command(
     resolved compared with the previous hunt in the same --corpus.
 
     Exit status 0: no run is bad. 1: a run is bad or failed; of a hunt: a run failed, or a finding is not resolved.
-    4: without a hunt, the only bad verdict of a run is `not finished`.
+    4: without a hunt, the only bad verdict of a run is `not finished`. A hunt counts such runs, and ends with 0.
     """
     if for_time is not None or runs is not None:
         if seeds is not None or out is not None:

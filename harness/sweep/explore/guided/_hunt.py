@@ -112,6 +112,7 @@ class NewCoverage:
     divergence: Divergence | None
     timers_ended_s: tuple[float, ...]
     failed_votes: TimerPatterns
+    unfinished: bool
 
     @classmethod
     def of(cls, run: PlayedRun, known: ReachedStates) -> "NewCoverage":
@@ -122,7 +123,7 @@ class NewCoverage:
             run.reached.steps,
             run.reached.untold,
         )
-        return cls(new, run.found, run.divergence, run.timers_ended_s, run.failed_votes)
+        return cls(new, run.found, run.divergence, run.timers_ended_s, run.failed_votes, run.unfinished)
 
 
 @dataclass
@@ -141,6 +142,8 @@ class Hunt:
     """Findings, with the first run that showed each."""
     shown: Counter[FindingIdentity] = field(default_factory=Counter)
     """Number of runs that showed each finding."""
+    unfinished: int = 0
+    """Number of runs in which nothing is wrong, and the swarm only needed more time."""
     failures: int = 0
     failed: list[tuple[CandidateRun, str]] = field(default_factory=list)
     """The first runs without a verdict, with the reason. `failures` counts all of them."""
@@ -190,6 +193,7 @@ class Hunt:
 
     def _learn(self, candidate: CandidateRun, news: NewCoverage) -> bool:
         """Add the results of a run. Return true if it reached something new."""
+        self.unfinished += news.unfinished
         for identity in news.found:
             self.shown[identity] += 1
             self.found.setdefault(identity, candidate)

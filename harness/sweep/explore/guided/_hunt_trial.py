@@ -18,7 +18,7 @@ from harness.checker import Evidence, Result
 from harness.checker.evidence import Watch
 from harness.checker.recurring_cycles import cycle_of
 from harness.checker.uniform_chain import common_prefix
-from harness.errors import AgentFailedError
+from harness.errors import INCOMPLETE, AgentFailedError
 from harness.gc_pause import gc_paused
 from harness.proof.coverage import CoverageWatcher, ReachedStates
 from harness.proof.coverage.reached import simulate_watched
@@ -101,6 +101,8 @@ class PlayedRun:
     """Times at which timers ended before the liveness phase, in order."""
     failed_votes: TimerPatterns = ()
     """The longest pattern of failed votes in the liveness phase."""
+    unfinished: bool = False
+    """True if nothing is wrong in the run, and the swarm only needed more time."""
 
 
 @gc_paused()
@@ -115,7 +117,8 @@ def play_trial(scenario: Scenario, seed: int) -> PlayedRun:
     timer_ends = timers_ended(evidence)
     moments = tuple(sorted({round(each.at_s, 3) for each in timer_ends if each.at_s <= scenario.duration_s}))
     patterns = failed_votes([each for each in timer_ends if each.at_s > scenario.duration_s])
-    return PlayedRun(watcher.reached, found, divergence, moments, patterns)
+    unfinished = result.exit_status == INCOMPLETE
+    return PlayedRun(watcher.reached, found, divergence, moments, patterns, unfinished)
 
 
 def _known_divergences(result: Result) -> Divergence | None:

@@ -133,6 +133,7 @@ class Night:
             "findings": [finding.to_json() for finding in self.findings],
             "failed": [{"seed": candidate.seed, "reason": reason} for candidate, reason in self.hunt.failed],
             "failures": self.hunt.failures,
+            "unfinished": self.hunt.unfinished,
             "left_out": self.left_out[:SAMPLES],
             "versions": versions(),
         }

@@ -29,6 +29,7 @@ def to_html(night: dict[str, Any], nights: Sequence[dict[str, Any]]) -> str:
         night=night,
         began=text.started(night["started_at"]),
         headline=headline(night),
+        unfinished=unfinished_in_words(night.get("unfinished", 0)),
         kind="violated" if any(finding["status"] != "resolved" for finding in night["findings"]) else "holds",
         growth=_curve("local states by run of this night", night["growth"], "runs"),
         trend=_curve(
@@ -39,6 +40,14 @@ def to_html(night: dict[str, Any], nights: Sequence[dict[str, Any]]) -> str:
         if len(last) > 1
         else "",
         not_taken=night["coverage"]["branches"]["not_taken"][:MOST_BRANCHES],
+    )
+
+
+def unfinished_in_words(runs: int) -> str:
+    """Return a sentence about runs in which the swarm only needed more time."""
+    one = runs == 1
+    return (
+        f"not finished: {runs:,} run{'' if one else 's'} need{'s' if one else ''} a higher settle.limit_s to be judged"
     )
 
 

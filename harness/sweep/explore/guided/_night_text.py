@@ -8,6 +8,7 @@ from rich.console import Console
 
 from harness.proof.coverage import in_words as coverage_in_words
 from harness.sweep.explore.guided._night import Night, NightProgress
+from harness.sweep.explore.guided._night_page import unfinished_in_words
 
 REDRAW_EVERY_S = 0.1
 FIRST_LINE_S, LINES_GROW, LONGEST_S = 10.0, 1.5, 600.0
@@ -60,6 +61,8 @@ def in_words(night: Night) -> Iterator[str]:
         yield "no findings"
     for candidate, reason in night.hunt.failed[:3]:
         yield f"no verdict on the run with seed {candidate.seed}: {reason}"
+    if night.hunt.unfinished:
+        yield unfinished_in_words(night.hunt.unfinished)
     yield f"{night.hunt.runs:,} runs, {len(night.hunt.kept):,} kept in {night.directory}"
     yield from coverage_in_words(night.hunt.reached, night.existing_states)
     yield f"{night.report}"

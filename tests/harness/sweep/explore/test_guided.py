@@ -36,6 +36,7 @@ from harness.sweep.explore.guided._hunt_trial import (
     without_liveness_phase,
 )
 from harness.sweep.explore.guided._mutation import mutate
+from harness.sweep.explore.guided._night_text import in_words
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 
 ORDINARY = {
@@ -111,6 +112,15 @@ def test_run_with_a_new_pattern_of_failed_votes_is_kept(monkeypatch: pytest.Monk
     )
     hunt = Hunt(limits, Random(1))
     assert [kept for _, kept in hunt.begin([CandidateRun(document, seed)] * 3, 1)] == [True, False, True]
+
+
+def test_run_that_needs_more_time_is_counted_and_no_finding(tmp_path: Path) -> None:
+    slow = ordinary(network={}, settings={"max_block_bytes": 267, "vote_timeout_s": 100}, settle={"limit_s": 1})
+    hunted = night(tmp_path / "corpus", slow, runs=1)
+    assert (hunted.hunt.unfinished, hunted.findings, hunted.exit_status) == (1, [], 0)
+    assert hunted.to_json()["unfinished"] == 1
+    assert "not finished: 1 run needs a higher settle.limit_s to be judged" in in_words(hunted)
+    assert "not finished: " in (tmp_path / "corpus" / "report.html").read_text()
 
 
 def test_documents_near_a_livelock_are_changed_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
