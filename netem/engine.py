@@ -170,7 +170,7 @@ class Engine(ABC):
 
 @lru_cache(maxsize=1 << 15)
 def _differing(asked: LinkConditions, held: LinkConditions) -> tuple[str, ...]:
-    """Return the keys whose values differ by more than an engine can resolve."""
+    """Return the keys of the network conditions whose values differ by more than the precision of an engine."""
     wanted, actual = _flat(asked.to_json()), _flat(held.to_json())
     if not (asked.delay and asked.delay.jitter_s and held.delay and held.delay.jitter_s):
         for flat in (wanted, actual):

@@ -52,7 +52,7 @@ def _limit_files(most_bytes: int) -> None:
 
 
 class LabServer:
-    """Executes requests of the harness. They are trusted, but still checked."""
+    """Executes requests of the harness. The requests are trusted, but invalid ones are refused."""
 
     def __init__(self, control: socket.socket) -> None:
         control.setblocking(False)

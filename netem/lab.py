@@ -221,7 +221,7 @@ class Lab:
 
     @property
     def network(self) -> Self:
-        """The network itself. A network of containers returns the one on which it is built."""
+        """The virtual network itself. A network of containers returns the network on which it is built."""
         return self
 
     async def spawn(

@@ -155,7 +155,7 @@ class Relay:
         self._outputs[vehicle].send(frame)
 
     def count_missed(self) -> int:
-        """Return the updated number of broadcasts that did not fit into the buffer."""
+        """Update the number of broadcasts that did not fit into the buffer, and return it."""
         _, dropped = _COUNTS.unpack(self._input.getsockopt(_SOL_PACKET, _STATISTICS, _COUNTS.size))
         self.missed += dropped  # since the last call
         return self.missed

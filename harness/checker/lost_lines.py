@@ -113,7 +113,9 @@ def _other_states(
 
 
 def _differing(before: StateSummary, run: HandlerRun) -> Iterator[str]:
-    """Yield the names of the state fields that differ between one line and the start of the next handler run."""
+    """Yield the names of the state fields that differ between the end of one line and the start of the next handler
+    run.
+    """
     added = dict.fromkeys(("chain", "deque", "stack"), 0)
     for operation, _ in run.changes:
         if operation[:-1] in added:

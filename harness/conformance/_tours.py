@@ -34,7 +34,7 @@ _RESTART = "another agent starts"
 
 @dataclass(frozen=True)
 class SuspectedFailure:
-    """A deviation of an agent that may also be the fault of a slow machine."""
+    """A wrong answer of an agent whose cause may also be a slow machine."""
 
     path: tuple[str, ...]
     """All inputs since the start of the agent. The agent answered the last one wrongly."""

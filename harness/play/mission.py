@@ -136,7 +136,7 @@ class Swarm(Protocol):
         """Return the number of completed blocks of each agent that is neither dead nor paused."""
 
     async def snapshot(self) -> RunOutcome:
-        """Return the result so far, with exports and traces, to judge an active run."""
+        """Return the result of an active run so far, with exports and traces, so that the checker can judge it."""
 
 
 Story = Callable[[Swarm, Scenario], Awaitable[None]]

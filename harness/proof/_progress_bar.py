@@ -73,7 +73,9 @@ class ExplorationBudget:
         return time.monotonic() - self._began
 
     def ended(self, elsewhere_bytes: float = 0.0) -> Ended | None:
-        """Return the limit that is reached, or None. The other processes use `elsewhere_bytes` of memory."""
+        """Return the name of the limit that is reached, or None. The other processes use `elsewhere_bytes` bytes of
+        memory.
+        """
         if memory_bytes() + elsewhere_bytes > self._most_bytes:
             return "memory"
         return "time" if self.seconds > self._most_s else None

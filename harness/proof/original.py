@@ -55,7 +55,7 @@ class ProofComparison:
 
     @property
     def new(self) -> dict[str, str]:
-        """The violations that only the core in use has."""
+        """The violations that only the agent core in use has, and not the original core."""
         return {key: text for key, text in self.proof.findings.items() if key not in self.original.findings}
 
     @property

@@ -148,8 +148,8 @@ def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]
 
 
 def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, most: int) -> list[NetworkDivision]:
-    """Return the first grouping and the longest others, at most `most` in all. Each lasts until the next returned
-    one.
+    """Return the first division of the vehicles into groups, and those that lasted longest: at most `most` divisions.
+    Each counts as lasting until the next returned one.
     """
     if len(all_divisions) <= most:
         return list(all_divisions)
@@ -235,7 +235,9 @@ def _widen(low: float, high: float, shortest: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class MapProjection:
-    """A projection of `land` into a rectangle of pixels. `left` and `top` are its upper left corner."""
+    """Converts positions in the area `land` to pixels of a rectangle. `left` and `top` are the upper left corner of the
+    rectangle.
+    """
 
     land: GroundRectangle
     left: float

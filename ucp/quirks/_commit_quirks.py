@@ -233,7 +233,9 @@ def commit_others_twice(good: Helper, core: Core, block: Block) -> None:
 
 
 def run_as_if_not_reconciling(good: Handler, core: Core, *inputs: int | Message) -> str:
-    """Run `good` with `reconcile_in_progress` set to False, and restore the flag afterwards."""
+    """Run the correct handler `good` with the flag `reconcile_in_progress` set to False, and restore the flag
+    afterwards.
+    """
     reconciling, core.reconcile_in_progress = core.reconcile_in_progress, False
     try:
         return good(core, *inputs)

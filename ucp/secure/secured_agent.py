@@ -239,7 +239,9 @@ class SecuredAgent(Agent):
         return int(started_us)
 
     def boot(self, recovered: StoredState, now: float) -> None:
-        """Continue from the store. The boot becomes later than the stored one, even if the clock went back."""
+        """Continue from the stored data. The new start time is later than the stored one, even if the clock was set
+        back.
+        """
         secured = recovered.secured
         if secured is not None:
             self._signatures.restore(secured.signatures)

@@ -312,7 +312,8 @@ class Session:
         self._budgets[sender].take()
 
     def is_newest_request(self, request: Request, code: int) -> bool:
-        """Return whether a response of type `code` counts: no newer request of its type by the same sender is known.
+        """Return true if a response of type `code` counts. It does not count if a newer request of its type by the same
+        sender is known.
 
         If this vehicle sent the request, it must be its newest. A request of another vehicle need not have been
         received.

@@ -154,7 +154,9 @@ class MessageSummary(NamedTuple):
 
     @property
     def answers(self) -> tuple[str, bytes | None] | None:
-        """The type and subject of this answer, or None if it is not an answer."""
+        """The type of the answer in this datagram, and the chain or block that it is about. None if the datagram is not
+        an answer.
+        """
         return None if self.answer is None else (self.message, self._subject)
 
     @property

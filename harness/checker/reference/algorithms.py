@@ -123,7 +123,7 @@ def receive_request_add_block(state: State, sender: int, message: BlockAddReques
 
 @_algorithm(4, message=BlockAddResponse, tally="vote_count")
 def receive_vote_add_block(state: State, sender: int, message: BlockAddResponse) -> str:
-    """Algorithm 4, Receive Vote Add Block (Section 3.6.2): count a vote on the own proposal (reading 3)."""
+    """Algorithm 4, Receive Vote Add Block (Section 3.6.2): count a vote on the agent's own proposal (reading 3)."""
     if not state.voting_timer.active:
         return "no vote running"
     if state.candidate_block is None or message.block_hash != state.candidate_block.block_hash:
@@ -257,7 +257,9 @@ def reconcile_phase_1_timer_expiration(state: State) -> str:
 
 @_algorithm(12, local_event="Reconcile Phase 2", tally="reconcile_response_dictionary")
 def reconcile_phase_2(state: State) -> str:
-    """Algorithm 12, Reconcile Phase 2 (Section 3.6.3): ask which block follows the own top (reading 9)."""
+    """Algorithm 12, Reconcile Phase 2 (Section 3.6.3): ask which block follows the top of the agent's own chain
+    (reading 9).
+    """
     state.reconcile_response_dictionary = {}
     state.reconcile_responders = set()
     state.start(state.phase_two_timer, state.settings.phase2_timeout_s)

@@ -208,7 +208,7 @@ class StepComparer:
     # Lines that may be lost
 
     def has_effect(self, sender: int, message: Message, at_s: float) -> bool:
-        """Handle a message that no line shows. Return whether the agent changed, counted or sent anything."""
+        """Handle a message that is missing in the trace. Return true if the agent changed, counted or sent anything."""
         core = self._core
         core.now = self._header.local(at_s)
         core.running = handler = self._on_message[type(message)]

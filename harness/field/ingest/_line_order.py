@@ -64,7 +64,7 @@ def _repeated(runs: Sequence[HandlerRun]) -> Iterator[ReorderedPart]:
 
 
 def _happens_once(part: Sequence[HandlerRun]) -> bool:
-    """Return true if the runs have an effect that no agent can have twice at the same time."""
+    """Return true if these handler runs have an effect that no agent can have twice at the same time."""
     return any(
         run.changes or run.sent or run.tally or run.started or not isinstance(run.trigger, MessageTrigger)
         for run in part

@@ -106,8 +106,8 @@ class InferredInputPath:
         return self._datagram(owner, CommitBlock(block, self._chain_hashes[held + 1]))
 
     def _log(self, event_data: bytes) -> Cause | None:
-        """Return the next event that the block under construction lacks, or None if it lacks none or has different
-        ones.
+        """Return the next event that is missing in the block under construction. Return None if none is missing, or if
+        the block has other events.
         """
         logged = bytes(self._agent.state.current_block)
         if not event_data.startswith(logged):

@@ -259,8 +259,8 @@ class RecordPlayer:
             result.lost.append(follower.lost)
 
     def _excuse(self, deviations: list[Deviation]) -> str | None:
-        """Return a reason for the deviations other than an error of the agent, such as missing lines. None if there is
-        none.
+        """Return a reason for the deviations that is not an error of the agent, such as missing lines. Return None if
+        there is no such reason.
         """
         if (why := self.record.unrecorded.get(self.position)) is not None:
             return f"{why},"

@@ -88,7 +88,9 @@ class ResumptionSearch:
 
     @cached_property
     def _all_steps(self) -> _ChainSteps:
-        """Return the extensions of chains in all records. Reading them takes some time."""
+        """Return the blocks that agents added to their chains, from all records. This reads every trace, which takes
+        some time.
+        """
         steps = self._own_steps.copy()
         for trace in self._record.flight.traces.values():
             self._add_steps(trace, steps)

@@ -67,7 +67,8 @@ class ProgramRun:
         open_lab: OpenLab,
         keeps_disks: bool,
     ) -> None:
-        """
+        """Prepare the run. Nothing is started yet.
+
         - `kinds`: kind of each vehicle. Empty: a run without vehicles.
         - `interrupted`: ends the mission early when it is set.
         - `agent_commands`: command of each agent, without the mission file.

@@ -96,7 +96,7 @@ class RecurrenceSearch:
         return False
 
     def record_timer_ends(self, now: float, local_s: float, state: AgentState) -> None:
-        """Record that timers of an agent are about to expire. All answers have been counted by now."""
+        """Record that timers of an agent are about to expire. At this moment, the agent has counted all answers."""
         if now != self._next_s:
             self._delays_matter = True
         for timer in state.timers:

@@ -131,7 +131,7 @@ class PathScript:
         }
 
     def completions(self) -> Iterator[CompletionInterval]:
-        """Yield the interval for the completion of each block that the timer durations allow."""
+        """Yield, for each block, the interval in which it can be completed with these timer durations."""
         agents = [agent.agent_id for agent in self._agents]
         for move, (earliest_s, latest_s) in zip(
             self._moves, windows_s(len(self._moves), list(self._runs())), strict=True
@@ -306,7 +306,7 @@ class PathScript:
         self._fates.append({"message": flight.name, "sender": flight.sender, **whom, "count": flight.count, **what})
 
     def _delay_open_timers(self) -> None:
-        """Extend each timer that still runs at the end of the path beyond this end."""
+        """Delay each timer that still runs at the end of the path, so that it expires after this end."""
         for agent in self._agents:
             for number, ends_s in agent.timers.values():
                 if ends_s <= self._end_s:

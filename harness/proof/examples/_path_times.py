@@ -124,7 +124,7 @@ class BlockAges:
             self._older[self._events[other - 1]].add(self._events[oldest - 1])
 
     def date(self, events: list[dict[str, Any]]) -> bool:
-        """Set the timestamps of the events so that they meet the requirements, and return true.
+        """Choose timestamps of the events that meet the requirements, and return true.
 
         Return False if no timestamps meet them, because they contradict each other or an agent's clock would go back.
         """

@@ -185,7 +185,9 @@ class CanonicalOrder:
         return name - 2 if name - 2 < place else name - 1
 
     def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:
-        """Return a key of this order of the agents. Different keys belong to different states."""
+        """Return a description of the state with this order of the agents. If two descriptions differ, the states
+        differ.
+        """
         new_place = {old: new for new, old in enumerate(places)}
         named = [
             [sorted(new_place[other] for other in part) for part in self._named(locals_[old], old)] for old in places

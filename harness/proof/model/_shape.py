@@ -73,7 +73,9 @@ class HeldBlockOrder:
         return self._heights.get(chain_hash, ELSEWHERE)
 
     def ordinal(self, block_hash: bytes) -> int:
-        """Return the position of this block among the held blocks, or ELSEWHERE."""
+        """Return the position of this block among the blocks that the agent holds, or ELSEWHERE if it does not hold the
+        block.
+        """
         return self._ordinals.get(block_hash, ELSEWHERE)
 
     def between(self, timestamp_us: int, block_hash: bytes = b"") -> int:

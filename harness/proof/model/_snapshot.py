@@ -288,7 +288,9 @@ class SnapshotParts:
         return part
 
     def of(self, snapshot: Snapshot, like: Snapshot) -> Snapshot:
-        """Return the state made of stored parts. All parts of `like` must be stored already."""
+        """Return the state `snapshot` with its parts replaced by equal stored parts. All parts of `like` must be stored
+        already.
+        """
         return {
             name: value if like.get(name, self) is value else self.part(name, value) for name, value in snapshot.items()
         }

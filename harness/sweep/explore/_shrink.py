@@ -53,7 +53,9 @@ class Shrinker:
         self._pace_s = 1.0
 
     def first(self, candidates: Iterable[Document]) -> int | None:
-        """Use the first candidate that still violates. Return its index, or None. Raises BudgetSpentError."""
+        """Use the first candidate scenario that still violates the check. Return its index, or None. Raises
+        BudgetSpentError.
+        """
         if self.runs >= self._max_runs:
             raise BudgetSpentError
         jobs = self._jobs if self._pace_s > WORTH_FORKING_S else 1

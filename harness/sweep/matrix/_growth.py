@@ -19,7 +19,7 @@ Load = Literal["any", "below 1", "from 1"]
 
 
 class Growth(BaseModel):
-    """A law for the growth of `metric`. It is fitted to single runs.
+    """A power law for the growth of the figure `metric`. It is fitted to single runs.
 
     The runs have this `backend` and `loss`. They also have this `duration_s`, this number of `agents`, and a cell with
     this `load`; null stands for all of them.

@@ -189,7 +189,7 @@ class Inputs(abc.ABC):
 
 
 class DirectedInputs(Inputs):
-    """The stories of `directed_inputs`."""
+    """The sequences of inputs that `directed_inputs` generates."""
 
     @property
     def inputs(self) -> str:
