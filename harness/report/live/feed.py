@@ -25,6 +25,7 @@ their hashes.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, islice
+from math import isinf
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -139,7 +140,8 @@ class Feed:
         more = self._surroundings.read(until_s, LINES_AT_ONCE)
         for course in self._courses:
             more |= course.read(until_s, LINES_AT_ONCE)
-        self._polls += not more  # an agent with unread lines may still have received older messages
+        # In a film, an agent with unread lines may still have received older messages. A live page cannot wait for it.
+        self._polls += not more or isinf(until_s)
         changes = [*self._take_changes(), *self._messages(report_all=False)]
         changes.sort(key=lambda change: float(change[1]))
         at_s = max(self._surroundings.at_s, *(course.at_s for course in self._courses))

@@ -138,6 +138,17 @@ def test_message_gets_the_receivers_that_record_it_late(tmp_path: Path) -> None:
     assert receivers(told) == receivers(film(run))
 
 
+def test_live_feed_reports_messages_while_it_is_behind(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feeds, "LINES_AT_ONCE", 5)
+    feed, polls, told = Feed(run), 0, list[Change]()
+    while not of_kind("m", told):
+        changes, more = feed.poll()
+        told, polls = told + changes, polls + 1
+        assert more or of_kind("m", changes), "it has read everything before the first message"
+    feed.close()
+    assert polls < 10
+
+
 def test_each_incarnation_of_a_process_is_read_once(run: Path, tmp_path: Path) -> None:
     killed = tmp_path / "run"
     shutil.copytree(run, killed)
