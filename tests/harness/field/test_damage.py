@@ -216,3 +216,16 @@ def test_reconstruct_prints_both_explanations_of_a_doubtful_step(tmp_path: Path)
     either = next(remark for remark in made.remarks if remark.startswith("either agent 2 behaves as with "))
     assert " tie_is_majority " in either
     assert re.search(r", or before line \d+ perhaps a line is missing \(otherwise: ", either)
+
+
+def test_damaged_name_of_a_sent_block_is_no_deviation(whole: tuple[Path, Undamaged], tmp_path: Path) -> None:
+    """The datagram on the same line is intact, and another agent received it."""
+    shutil.copytree(whole[0], tmp_path / "home")
+    path = tmp_path / "home" / "1.trace.jsonl"
+    header, *lines = path.read_text().splitlines(keepends=True)
+    number = next(number for number, line in enumerate(lines) if '"branch":"approve"' in line)
+    lines[number] = re.sub(r'("seq":\d+,"block":"[0-9a-f]{20})[0-9a-f]', r"\1&", lines[number])
+    path.write_text("".join([header, *lines]))
+    found = RecordPlayer(open_record(tmp_path / "home", 1)).to_end()
+    assert [deviation.sentence(str) for deviation in found.deviations] == []
+    assert "one character of the line is damaged" in found.lost[0]
