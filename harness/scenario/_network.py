@@ -160,7 +160,7 @@ class ConditionOverrides(Model):
     messages are lost. `none`: no limit. It needs a `delay` or a `rate`."""
 
     def given(self) -> dict[str, Any]:
-        """Return the keys that have a value."""
+        """Return the conditions that have a value, by key."""
         return {key: value for key in KEYS if (value := getattr(self, key)) is not None}
 
 

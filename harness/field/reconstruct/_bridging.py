@@ -1,4 +1,4 @@
-"""Lead an agent over lost trace lines: guess inputs that lead to the next recorded state.
+"""Continue an agent after lost trace lines: guess inputs that lead to the next recorded state.
 
 The lost inputs are unknown, but their result is not: a chain, and the events in the current block. The inference plays
 the other agents of a swarm that already holds this chain. They answer each question of the agent, approve its blocks in

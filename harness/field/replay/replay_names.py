@@ -73,7 +73,9 @@ class RecordedBlocks(Blocks):
                 self.add(block)
 
     def _sources(self) -> Iterator[Iterator[Block]]:
-        """Yield the sources of blocks. The fastest one is first."""
+        """Yield the blocks from each source of blocks: the trace, the exports, and the traces of the flight. The
+        fastest source is first.
+        """
         yield _blocks_of(self._record.trace)
         yield self._of_exports()
         yield from map(_blocks_of, self._record.flight.traces.values())

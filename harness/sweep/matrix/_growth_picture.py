@@ -273,7 +273,7 @@ def _up(panel: Panel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
 
 
 def _x(panel: Panel, cell: Cell) -> float | None:
-    """Return the horizontal position of a summary, or None if a logarithmic axis cannot show it."""
+    """Return the value of a cell on the horizontal axis, or None if a logarithmic axis cannot show the value."""
     return float(cell.agents) if panel.over == "agents" else _mean("blocks", cell) or None
 
 

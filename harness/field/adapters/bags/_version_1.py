@@ -92,7 +92,7 @@ class _Reader:
 
 
 def _declared_length(buffer: Buffer, end: int, data: bytes) -> int:
-    """Return the length that the record declares for the data that end at `end`."""
+    """Return the length field of the record whose data end at `end`. The field is directly before `data`."""
     return int(_U32.unpack_from(buffer, end - len(data) - _U32.size)[0])
 
 

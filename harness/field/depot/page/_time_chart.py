@@ -49,7 +49,9 @@ def time_span_of(record: Consolidation) -> TimeSpan | None:
 
 
 def extended(time_span: TimeSpan, marks: Iterable["Mark"]) -> TimeSpan:
-    """Return the interval with the marks before and after it, up to its length away. Others have a wrong clock."""
+    """Return the interval, extended to the marks before and after it. A mark that is farther away than the length of
+    the interval comes from a wrong clock, and is ignored.
+    """
     length = time_span.last_us - time_span.first_us
     near = [at for at, _ in marks if time_span.first_us - length <= at <= time_span.last_us + length]
     return replace(time_span, first_us=min([time_span.first_us, *near]), last_us=max([time_span.last_us, *near]))

@@ -272,7 +272,9 @@ def check_fits(document: Any, base: Document, limits: MutationLimits) -> Documen
 
 
 def _is_part(value: Any, whole: Any) -> bool:
-    """Return true if a value equals the whole or a part of it. A scenario with fewer agents has fewer entries."""
+    """Return true if `value` equals `whole`, or is a mapping with a part of its entries. A scenario with fewer agents
+    has fewer entries.
+    """
     if isinstance(value, dict) and isinstance(whole, dict):
         return all(_is_part(part, whole.get(key)) for key, part in value.items())
     return bool(value == whole)
