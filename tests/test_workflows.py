@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from harness.api import load_matrix
 from tests.machine import do_without
 from tests.workflows import REPOSITORY, Runner, load, write_tool
 
@@ -25,7 +26,7 @@ SCHEMAS = {
     "gitlab-ci": [EXAMPLE / ".gitlab-ci.yml"],
     "citation-file-format": [REPOSITORY / "CITATION.cff"],
 }
-SMALL = {"duration_s": 200, "agents": 3, "events": {"source": "random"}, "vehicles": {"kind": "none"}}
+SMALL = {"duration_s": 200, "agents": 2, "events": {"source": "random"}, "vehicles": {"kind": "none"}}
 MUTE_AGENT = """#!/usr/bin/env python3
 import sys
 from ucp.core import Core
@@ -134,6 +135,7 @@ def test_example_repository_works_on_gitlab_too(runner: Runner) -> None:
 def test_own_nights_play_their_matrices_and_keep_the_baseline(runner: Runner) -> None:
     for path in ("scenarios/thesis_matrix.yaml", ".github/nightly.yaml"):
         (runner.workspace / path).parent.mkdir(exist_ok=True)
+        load_matrix(REPOSITORY / path)
         (runner.workspace / path).write_text((REPOSITORY / path).read_text())
         shrink(runner.workspace / path)
     for run_id, job in enumerate(("virtual-time", "processes"), 1):
