@@ -183,7 +183,7 @@ def test_foreign_agents_follow_the_story_in_virtual_time(pytester: pytest.Pytest
         ("9 s: end\n10 s: 1 logs\n", "line 2: a sentence follows the end"),
         (
             "agents: [\n1 s: end\n",
-            "the keys before its first sentence are wrong: not YAML at line 1: expected the node content",
+            "the keys before its first sentence are wrong: not YAML at line ",
         ),
         ("- 3\n1 s: end\n", "the text before its first sentence must be keys of a scenario with their values"),
         ("timeline: []\n1 s: end\n", "`timeline` is set by the sentences of the story: leave it out"),
