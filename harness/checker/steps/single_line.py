@@ -67,6 +67,8 @@ def damage_that_explains(
         return "two lines are in the wrong order"
     if (damage := _damage_to_events(before, line[1])) is not None:
         return damage
+    if _has_impossible_top(before, deviation, line, following):
+        return "the top chain hash on the line is damaged"
     if _is_malformed(line[1]):
         return "the line is damaged"
     for trial in _with_a_line_more(before, line[1], others):
@@ -148,6 +150,22 @@ def _was_received(before: StepComparer, expected: HandlerRun, run: HandlerRun, o
 
 def _differ_in_one_character(text: str, other: str) -> bool:
     return len(text) == len(other) and sum(ours != theirs for ours, theirs in zip(text, other, strict=True)) == 1
+
+
+def _has_impossible_top(before: StepComparer, deviation: Deviation, line: Line, following: Sequence[Line]) -> bool:
+    """Return whether the state differs in the top chain hash only, and the next lines agree with the expected one.
+
+    A cut joins the beginning of a line with the end of another, so such a line may also be the last before lost ones.
+    """
+    number, run = line
+    expected = deviation.expected
+    if expected is None or deviation.run is not run or expected.state == run.state:
+        return False
+    other = copy(run)
+    other.state = expected.state
+    alike = copy(run.state)
+    alike.top = expected.state.top
+    return alike == expected.state and _agrees(before.copy(), [(number, other), *following])
 
 
 def _is_malformed(run: HandlerRun) -> bool:

@@ -104,6 +104,13 @@ class Record:
         return {of_runs[position]: why for position, why in lost.items()}
 
     @property
+    def doubtful_runs(self) -> dict[int, str]:
+        """Positions in the trace of handler runs that damage to a single line may explain, with the reason."""
+        of_entries = [number for number, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
+        doubts = self.doubts or {}
+        return {number: doubts[entry] for number, entry in enumerate(of_entries) if entry in doubts}
+
+    @property
     def is_counted(self) -> bool:
         """True if run.json proves that no line is missing, because the agent counted its handler runs."""
         run = self.flight.record

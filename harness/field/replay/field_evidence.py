@@ -4,6 +4,7 @@ Each trace is judged as `replay` judges it. The other checks read a trace only u
 missing.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +17,23 @@ from harness.checker.steps.deviation import Deviation
 from harness.errors import FieldError
 from harness.field.ingest import Flight
 from harness.field.replay._agent_record import Record
-from harness.field.replay._player import RecordPlayer
+from harness.field.replay._player import RecordPlayer, ReplayResult
 from harness.field.replay._record_search import IngestedRecords
 
 
 def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
     """Return the evidence with the traces of a flight in place of its own traces."""
-    traces = {agent_id: _up_to_loss(trace) for agent_id, trace in flight.traces.items()}
+    results: dict[int, ReplayResult | str] = {}
+    traces: dict[int, Trace] = {}
+    for agent_id, recorded in flight.traces.items():
+        doubtful = dict[int, str]()
+        try:
+            record = Record(Path(), "", recorded, IngestedRecords(flight), [])
+            results[agent_id] = RecordPlayer(record).to_end()
+            doubtful = record.doubtful_runs
+        except FieldError as error:
+            results[agent_id] = str(error).removeprefix(".: ")
+        traces[agent_id] = _up_to_loss(recorded, doubtful)
     for agent_id, why in lacking_traces(traces):
         traces[agent_id].problem = traces[agent_id].problem or why
     for agent_id, export in evidence.exports.items():
@@ -30,12 +41,12 @@ def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
         if trace is not None and not trace.problem and trace.runs and trace.runs[-1].state.top != export.top_chain_hash:
             trace.problem = "it ends before the export"
     judged = replace(evidence, traces=traces, from_field=True)
-    return replace(judged, steps=_judge_steps(judged, flight))
+    return replace(judged, steps=_judge_steps(judged, results))
 
 
-def _up_to_loss(trace: Trace) -> Trace:
-    """Return the part of a trace before the first missing line. The reason becomes its problem."""
-    lost = lost_lines(trace)
+def _up_to_loss(trace: Trace, doubtful: Mapping[int, str]) -> Trace:
+    """Return the part of a trace before the first missing or doubtful line. The reason becomes its problem."""
+    lost = {**doubtful, **lost_lines(trace)}
     lost |= {gap.position: "lines are damaged" for gap in trace.gaps}
     lost |= dict.fromkeys(trace.jumps, "the clock of the agent was set")
     if trace.cut_off:
@@ -52,14 +63,13 @@ def _up_to_loss(trace: Trace) -> Trace:
     )
 
 
-def _judge_steps(evidence: Evidence, flight: Flight) -> Judgement:
+def _judge_steps(evidence: Evidence, results: Mapping[int, ReplayResult | str]) -> Judgement:
+    """Judge the results of the replays. A result in words is the reason why a trace cannot be judged."""
     deviations: list[Deviation] = []
     judged, unjudged, lost = 0, 0, list[str]()
-    for agent_id, trace in flight.traces.items():
-        try:
-            result = RecordPlayer(Record(Path(), "", trace, IngestedRecords(flight), [])).to_end()
-        except FieldError as error:
-            lost.append(f"the trace of agent {agent_id} cannot be judged: {str(error).removeprefix('.: ')}")
+    for agent_id, result in results.items():
+        if isinstance(result, str):
+            lost.append(f"the trace of agent {agent_id} cannot be judged: {result}")
             continue
         deviations += result.deviations
         judged, unjudged = judged + result.steps, unjudged + result.unjudged
@@ -70,7 +80,7 @@ def _judge_steps(evidence: Evidence, flight: Flight) -> Judgement:
         lost += [
             f"agent {trace.header.agent_id}: {trace.problem}" for trace in evidence.traces.values() if trace.problem
         ]
-    untraced = sorted({*(evidence.roster or ()), *evidence.exports} - {*flight.traces})
+    untraced = sorted({*(evidence.roster or ()), *evidence.exports} - {*results})
     lost += [f"there is no trace of agent {agent_id}" for agent_id in untraced]
     if lost or not judged:
         found = f"{judged} handler runs follow Algorithms 1 to 20, and {unjudged} could not be judged"

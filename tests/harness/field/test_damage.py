@@ -229,3 +229,24 @@ def test_damaged_name_of_a_sent_block_is_no_deviation(whole: tuple[Path, Undamag
     found = RecordPlayer(open_record(tmp_path / "home", 1)).to_end()
     assert [deviation.sentence(str) for deviation in found.deviations] == []
     assert "one character of the line is damaged" in found.lost[0]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "damaged"),
+    [
+        (r'("complete","[0-9a-f]{20})[0-9a-f]', r"\1&"),
+        (r'("top":"[0-9a-f]{20})[0-9a-f]{20}', r"\g<1>01234567890123456789"),
+    ],
+    ids=["completed block", "top chain hash"],
+)
+def test_damaged_hash_on_one_line_leads_to_no_accusation(
+    pattern: str, damaged: str, whole: tuple[Path, Undamaged], tmp_path: Path
+) -> None:
+    shutil.copytree(whole[0], tmp_path / "home")
+    path = tmp_path / "home" / "1.trace.jsonl"
+    header, *lines = path.read_text().splitlines(keepends=True)
+    number = next(number for number, line in enumerate(lines) if '"complete"' in line)
+    lines[number] = re.sub(pattern, damaged, lines[number])
+    path.write_text("".join([header, *lines]))
+    assert RecordPlayer(open_record(tmp_path / "home", 1)).to_end().deviations == []
+    assert _judge(tmp_path / "home").wrong == ()
