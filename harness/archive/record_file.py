@@ -123,7 +123,7 @@ def _remove(places: Sequence[Place]) -> None:
         holder[:] = [part for index, part in enumerate(holder) if index not in indices]
 
 
-MAX_BYTES = 48 * 1024 * 1024
+MAX_BYTES = 40 * 1024 * 1024
 MAX_WEIGHT = 2_000_000
 """Maximum weight of a record, with up to 100,000 scripted fates of a scenario."""
 

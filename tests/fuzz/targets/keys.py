@@ -17,7 +17,7 @@ from ucp.secure.bundle import load_bundle, write_bundle
 from ucp.secure.keyfile import KeyFileError
 
 NAMES = ("7.bundle.json", "public.json", "authority.key", "depot.key", "vehicles.key", "revocation.json")
-_GOOD = TemporaryDirectory(prefix="ucp-keys-")
+_GOOD = TemporaryDirectory(prefix="fuzz-keys-")  # the fuzzer ends without removing it
 
 
 def _home() -> Path:
