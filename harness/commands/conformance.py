@@ -71,6 +71,8 @@ def conformance_command(
     if matrix is not None:
         if command:
             raise ConformanceRequestError("--matrix and the command of one agent exclude each other: give one of them")
+        if as_json or junit is not None or keep is not None:
+            raise ConformanceRequestError("--matrix excludes --json, --junit and --keep: leave them out")
         refuse_existing([page])
         raise typer.Exit(_test_all(read_agents(matrix), only, page, virtual=virtual))
     if not command:

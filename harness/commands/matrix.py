@@ -21,6 +21,9 @@ from harness.sweep.matrix.nights import load_baseline
 from harness.sweep.matrix.variant_comparison import compare_runs
 from ucp.agent_files import write_atomically, write_json_atomically
 
+NIGHTS = "Compare nights"
+"""Panel of the options that compare with earlier results."""
+
 
 def matrix_command(
     file: Annotated[
@@ -38,7 +41,10 @@ def matrix_command(
         str | None, typer.Option(metavar="TCP://HOST:PORT", help="Dask scheduler whose workers play the runs.")
     ] = None,
     against: Annotated[
-        Path | None, typer.Option(metavar="BASELINE", help="Earlier matrix.json; exit status 1 if a figure is worse.")
+        Path | None,
+        typer.Option(
+            metavar="BASELINE", rich_help_panel=NIGHTS, help="Earlier matrix.json; exit status 1 if a figure is worse."
+        ),
     ] = None,
     coverage: Annotated[
         bool, typer.Option("--coverage", help="Also report how much of the protocol the runs reached; slower.")
@@ -52,10 +58,17 @@ def matrix_command(
     ] = None,
     nights: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Keep this night in DIR, and draw the trend of all nights in it."),
+        typer.Option(
+            metavar="DIR",
+            rich_help_panel=NIGHTS,
+            help="Keep this night in DIR, and draw the trend of all nights in it.",
+        ),
     ] = None,
     bisect: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Find the commits of worse figures, for 20m at most.")
+        str | None,
+        typer.Option(
+            metavar="TIME", rich_help_panel=NIGHTS, help="Find the commits of worse figures, for 20m at most."
+        ),
     ] = None,
     budget: Annotated[
         str | None, typer.Option(metavar="TIME", help="Begin no run after 6h; the most uncertain cells come first.")

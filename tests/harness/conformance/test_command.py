@@ -34,6 +34,7 @@ def phase_one() -> list[VectorSet]:
         ([], "the command of the agent is missing"),
         (["--only", "21", "--", "true"], "no such Algorithm; give a number from 1 to 20"),
         (["--", "./no such agent"], "no such agent"),
+        (["--matrix", "agents.yaml", "--junit", "junit.xml"], "--matrix excludes --json, --junit and --keep"),
     ],
 )
 def test_wrong_request_is_refused_in_one_sentence(arguments: list[str], says: str, tmp_path: Path) -> None:
