@@ -85,7 +85,7 @@ def test_violation_is_reported_with_evidence_and_report_path(pytester: pytest.Py
     ("expect", "sentence"),
     [
         ({"characteristics": {7: "holds"}}, "*no characteristic '7': use 1 to 6"),
-        ({"characteristics": {6: "hold"}}, "*is 'hold': it should be 'holds', 'violated' or 'not applicable'"),
+        ({"characteristics": {6: "hold"}}, "*is 'hold': it should be 'holds', 'violated' or *; did you mean `holds`?"),
         ({"figures": {"block": 1}}, "*no figure 'block': use one of agents, blocks, *"),
         ({"figures": {"blocks": "many"}}, "*is 'many': it should be a number, or {min: number, max: number}"),
         ({"figures": {"blocks": {"min": 3, "max": 2}}}, "*min 3 is more than max 2"),
