@@ -98,7 +98,7 @@ def check(evidence: Evidence) -> Judgement:
             findings.append(Finding(agent_id, "its export is older than the one from before the final reconcile"))
         findings += [replace(finding, detail=f"{finding.detail}, before the final reconcile") for finding in edited]
     if findings:
-        return violated(NAME, "a block was not made by an agent of this mission", findings)
+        return violated(NAME, "a block or an export is not as an agent of this mission made it", findings)
     if not evidence.exports:
         return Judgement(NAME, "not applicable", "the run has no chain exports")
     if unknown:
