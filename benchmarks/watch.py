@@ -21,8 +21,8 @@ import aiohttp
 
 from harness.play.progress import SilentProgress
 from harness.report.live.change_log import ChangeLog
-from harness.report.live.feed import Feed
-from harness.report.live.server import UPDATE_S, Server
+from harness.report.live.feed import ChangeFeed
+from harness.report.live.server import UPDATE_S, LivePageServer
 from harness.run.run import run
 from harness.scenario import Scenario
 
@@ -49,8 +49,8 @@ def written(directory: Path) -> Written:
 
 async def serve(directory: Path, lines: Written, speedup: float, ready: multiprocessing.Queue[object]) -> None:
     """Let the files of a run grow, and read them. The time to write them is not counted."""
-    with closing(Feed(directory)) as feed, closing(ChangeLog()) as log:
-        async with Server(log, directory, live=True).open(0) as address:
+    with closing(ChangeFeed(directory)) as feed, closing(ChangeLog()) as log:
+        async with LivePageServer(log, directory, live=True).open(0) as address:
             ready.put(address)
             log.append([feed.run_change(live=True)])
             files = {path: (directory / path).open("ab", buffering=0) for _, path, _ in lines}

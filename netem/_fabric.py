@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager
 
 from netem import _namespaces, addresses
 from netem._fabric_requests import address, bridge, default_route, forwarding, set_up, veth_pair
-from netem._netlink import Netlink, Request
+from netem._netlink import Netlink, NetlinkRequest
 from netem.errors import LabError
 
 BRIDGE = "air"
@@ -73,7 +73,7 @@ class VirtualSwitch:
         finally:
             _namespaces.enter_network(self.home)
 
-    def _cable(self, vehicle: int) -> Request:
+    def _cable(self, vehicle: int) -> NetlinkRequest:
         return veth_pair(
             addresses.port(vehicle),
             self.port_index(vehicle),
@@ -121,7 +121,7 @@ def _sysctl(name: str, value: bytes) -> None:
         os.close(fd)
 
 
-def _configure(vehicle: int) -> list[Request]:
+def _configure(vehicle: int) -> list[NetlinkRequest]:
     where = f"vehicle {vehicle}"
     own = addresses.address(vehicle)
     return [

@@ -9,7 +9,16 @@ import socket
 import struct
 
 from netem._attributes import attribute, nested, number, parse, text
-from netem._netlink import NEW, RTM_GETLINK, RTM_NEWADDR, RTM_NEWLINK, RTM_NEWROUTE, RTM_SETLINK, Netlink, Request
+from netem._netlink import (
+    NEW,
+    RTM_GETLINK,
+    RTM_NEWADDR,
+    RTM_NEWLINK,
+    RTM_NEWROUTE,
+    RTM_SETLINK,
+    Netlink,
+    NetlinkRequest,
+)
 
 _IFINFOMSG = struct.Struct("=BxHiII")  # family, type, index, flags, mask of changed flags
 _IFADDRMSG = struct.Struct("=4BI")  # family, prefix length, flags, scope, index
@@ -27,11 +36,11 @@ _RTA_OIF = 4
 _RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST = 254, 4, 253, 1
 
 
-def set_up(what: str, index: int) -> Request:
-    return Request(what, RTM_NEWLINK, _IFINFOMSG.pack(0, 0, index, _IFF_UP, _IFF_UP))
+def set_up(what: str, index: int) -> NetlinkRequest:
+    return NetlinkRequest(what, RTM_NEWLINK, _IFINFOMSG.pack(0, 0, index, _IFF_UP, _IFF_UP))
 
 
-def bridge(name: str, index: int) -> Request:
+def bridge(name: str, index: int) -> NetlinkRequest:
     """Return a request that creates and activates a bridge.
 
     Without spanning tree and forward delay, ports forward at once. Without multicast snooping, multicast reaches all
@@ -45,7 +54,9 @@ def bridge(name: str, index: int) -> Request:
     return _link(f"create bridge {name}", index, name, _of_kind("bridge", *settings))
 
 
-def veth_pair(name: str, index: int, bridge: int, *, far_name: str, far_index: int, mac: str, network: int) -> Request:
+def veth_pair(
+    name: str, index: int, bridge: int, *, far_name: str, far_index: int, mac: str, network: int
+) -> NetlinkRequest:
     """Return a request for a cable from an active port of the bridge to a network namespace.
 
     `network` is a file descriptor of the namespace, and `mac` is the address of the cable's far end.
@@ -60,22 +71,24 @@ def veth_pair(name: str, index: int, bridge: int, *, far_name: str, far_index: i
     return _link(f"create veth pair {name}", index, name, number(_IFLA_MASTER, bridge), kind)
 
 
-def address(what: str, index: int, own: str, prefix_length: int, broadcast: str) -> Request:
+def address(what: str, index: int, own: str, prefix_length: int, broadcast: str) -> NetlinkRequest:
     """Return a request that gives a link an IPv4 address."""
     attributes = [
         attribute(kind, socket.inet_aton(each))
         for kind, each in ((_IFA_LOCAL, own), (_IFA_ADDRESS, own), (_IFA_BROADCAST, broadcast))
     ]
     message = _IFADDRMSG.pack(socket.AF_INET, prefix_length, 0, 0, index)
-    return Request(what, RTM_NEWADDR, message + b"".join(attributes), NEW)
+    return NetlinkRequest(what, RTM_NEWADDR, message + b"".join(attributes), NEW)
 
 
-def default_route(what: str, index: int) -> Request:
+def default_route(what: str, index: int) -> NetlinkRequest:
     """Return a request for a default route without a gateway, so that all addresses count as neighbours on this
     link.
     """
     kind = (_RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST)
-    return Request(what, RTM_NEWROUTE, _RTMSG.pack(socket.AF_INET, 0, 0, 0, *kind, 0) + number(_RTA_OIF, index), NEW)
+    return NetlinkRequest(
+        what, RTM_NEWROUTE, _RTMSG.pack(socket.AF_INET, 0, 0, 0, *kind, 0) + number(_RTA_OIF, index), NEW
+    )
 
 
 def forwarding(netlink: Netlink) -> set[int]:
@@ -89,15 +102,17 @@ def _forwards(port: bytes) -> bool:
     return of_bridge.get(_IFLA_BRPORT_STATE) == bytes([_BR_STATE_FORWARDING])
 
 
-def flood_broadcasts(port: str, index: int, on: bool) -> Request:
+def flood_broadcasts(port: str, index: int, on: bool) -> NetlinkRequest:
     """Return a request that makes the bridge send broadcasts of other ports to this port, or stops it."""
     flag = nested(_IFLA_PROTINFO, attribute(_IFLA_BRPORT_BCAST_FLOOD, bytes([on])))
-    return Request(f"set bcast_flood of {port}", RTM_SETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, index, 0, 0) + flag)
+    return NetlinkRequest(
+        f"set bcast_flood of {port}", RTM_SETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, index, 0, 0) + flag
+    )
 
 
-def _link(what: str, index: int, name: str, *attributes: bytes) -> Request:
+def _link(what: str, index: int, name: str, *attributes: bytes) -> NetlinkRequest:
     message = _IFINFOMSG.pack(0, 0, index, _IFF_UP, _IFF_UP) + text(_IFLA_IFNAME, name)
-    return Request(what, RTM_NEWLINK, message + b"".join(attributes), NEW)
+    return NetlinkRequest(what, RTM_NEWLINK, message + b"".join(attributes), NEW)
 
 
 def _of_kind(kind: str, *data: bytes) -> bytes:

@@ -20,12 +20,12 @@ Answer = tuple[dict[str, Any], socket.socket | None]
 
 
 @dataclass
-class _Request:
+class _LabRequest:
     what: str
     answer: asyncio.Future[Answer]
 
 
-class Channel:
+class LabConnection:
     """The connection to the process `netem.init`. After this process has ended, each request fails with the same
     error.
     """
@@ -37,7 +37,7 @@ class Channel:
         self._loop = asyncio.get_running_loop()
         self._receiver = MessageReceiver()
         self._numbers = itertools.count(1)
-        self._requests: dict[int, _Request] = {}
+        self._requests: dict[int, _LabRequest] = {}
         self._children: dict[int, asyncio.Future[int]] = {}
         self._inside: asyncio.Future[bool] = self._loop.create_future()
         self._writing = asyncio.Lock()
@@ -62,7 +62,7 @@ class Channel:
             data = encode({"id": number, "request": what, **arguments})
         except WireError as error:
             raise LabError(f"The lab cannot be asked to {what}: {error}") from error
-        self._requests[number] = _Request(what, answer)
+        self._requests[number] = _LabRequest(what, answer)
         try:
             async with self._writing:
                 # A partial message would corrupt the stream, so it is sent completely even if the caller is cancelled.

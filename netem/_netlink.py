@@ -41,7 +41,7 @@ _BATCH_BYTES = 64 << 10  # a socket accepts about three times as much at once
 
 
 @dataclass(frozen=True)
-class Request:
+class NetlinkRequest:
     """One request to the kernel. `what` names it in error messages."""
 
     what: str
@@ -65,12 +65,12 @@ class Netlink:
     def close(self) -> None:
         self._socket.close()
 
-    def send(self, requests: Sequence[Request]) -> None:
+    def send(self, requests: Sequence[NetlinkRequest]) -> None:
         """Send the requests in order, and wait until the kernel has processed all of them.
 
         Raises NetlinkError for the first refused request. Later requests of the same batch were tried, too.
         """
-        batch: list[Request] = []
+        batch: list[NetlinkRequest] = []
         encoded = bytearray()
         for request in requests:
             message = self._encode(request.message, request.type, request.flags | NLM_F_ACK)
@@ -82,7 +82,7 @@ class Netlink:
         if batch:
             self._send(batch, encoded, self._sequence - len(batch) + 1)
 
-    def _send(self, requests: Sequence[Request], encoded: bytes | bytearray, first: int) -> None:
+    def _send(self, requests: Sequence[NetlinkRequest], encoded: bytes | bytearray, first: int) -> None:
         self._socket.send(encoded)
         error: NetlinkError | None = None
         waiting = len(requests)

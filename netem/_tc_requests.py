@@ -30,7 +30,7 @@ from netem._netlink import (
     RTM_NEWTCLASS,
     RTM_NEWTFILTER,
     Netlink,
-    Request,
+    NetlinkRequest,
 )
 from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkConditions
 
@@ -87,12 +87,16 @@ class TrafficControl:
     def __init__(self, index: int) -> None:
         self.index = index
 
-    def install(self) -> list[Request]:
+    def install(self) -> list[NetlinkRequest]:
         """Return the requests that install the queueing discipline HTB without traffic classes."""
         settings = struct.pack("=5I", 3, 10, 0, 0, 0)  # version, rate2quantum, default class, debug, direct packets
-        return [Request("add qdisc htb", RTM_NEWQDISC, self._message("htb", _ROOT, _HTB, attribute(2, settings)), NEW)]
+        return [
+            NetlinkRequest(
+                "add qdisc htb", RTM_NEWQDISC, self._message("htb", _ROOT, _HTB, attribute(2, settings)), NEW
+            )
+        ]
 
-    def guard(self) -> list[Request]:
+    def guard(self) -> list[NetlinkRequest]:
         """Return the requests for filters that drop all packets at this port until `accept_group` allows a group.
 
         Frames with the mark of a relay pass.
@@ -100,45 +104,47 @@ class TrafficControl:
         drop = nested(1, text(1, "gact"), nested(2, attribute(2, struct.pack("=IIiii", 0, 0, _ACT_SHOT, 0, 0))))
         message = self._filter("basic", _EGRESS, _DROP_PRIORITY, _ONLY, nested(3, drop))
         return [
-            Request("add qdisc clsact", RTM_NEWQDISC, self._message("clsact", _CLSACT, _CLSACT_HANDLE), NEW),
-            Request("add filter basic with action gact", RTM_NEWTFILTER, message, NEW),
+            NetlinkRequest("add qdisc clsact", RTM_NEWQDISC, self._message("clsact", _CLSACT, _CLSACT_HANDLE), NEW),
+            NetlinkRequest("add filter basic with action gact", RTM_NEWTFILTER, message, NEW),
             self.accept_group(RELAYED),
         ]
 
-    def uninstall(self) -> list[Request]:
+    def uninstall(self) -> list[NetlinkRequest]:
         return [
-            Request("delete qdisc htb", RTM_DELQDISC, self._message("htb", _ROOT, _HTB)),
-            Request("delete qdisc clsact", RTM_DELQDISC, self._message("clsact", _CLSACT, _CLSACT_HANDLE)),
+            NetlinkRequest("delete qdisc htb", RTM_DELQDISC, self._message("htb", _ROOT, _HTB)),
+            NetlinkRequest("delete qdisc clsact", RTM_DELQDISC, self._message("clsact", _CLSACT, _CLSACT_HANDLE)),
         ]
 
-    def add_class(self, kind: int, link: LinkConditions) -> list[Request]:
+    def add_class(self, kind: int, link: LinkConditions) -> list[NetlinkRequest]:
         rate = struct.pack("=BBHhHI", 0, 1, 0, 0, 0, _RATE)  # 1: Ethernet
         figures = attribute(1, rate + rate + struct.pack("=5I", _BURST, _BURST, _QUANTUM, 0, 0))
         message = self._message("htb", _HTB, _HTB | kind, figures)
-        return [Request("set class of htb", RTM_NEWTCLASS, message, _SET), self.change_class(kind, link)]
+        return [NetlinkRequest("set class of htb", RTM_NEWTCLASS, message, _SET), self.change_class(kind, link)]
 
-    def change_class(self, kind: int, link: LinkConditions, *, table: bool = True) -> Request:
+    def change_class(self, kind: int, link: LinkConditions, *, table: bool = True) -> NetlinkRequest:
         """Return the request that sets the conditions of a traffic class. Without `table`, its distribution stays."""
         options = _options(link, table)
         message = self._header(_HTB | kind, (0x8000 | kind) << 16) + text(_KIND, "netem") + options
-        return Request("set qdisc netem", RTM_NEWQDISC, message, _SET)
+        return NetlinkRequest("set qdisc netem", RTM_NEWQDISC, message, _SET)
 
-    def remove_class(self, kind: int) -> Request:
-        return Request("delete class of htb", RTM_DELTCLASS, self._message("htb", _HTB, _HTB | kind))
+    def remove_class(self, kind: int) -> NetlinkRequest:
+        return NetlinkRequest("delete class of htb", RTM_DELTCLASS, self._message("htb", _HTB, _HTB | kind))
 
-    def mark(self, kind: int, group: int) -> Request:
+    def mark(self, kind: int, group: int) -> NetlinkRequest:
         """Return the request that assigns a kind and a group to packets that enter at this port."""
         parameters = attribute(2, struct.pack("=IIiii", 0, 0, _ACT_OK, 0, 0))
         edit = nested(1, text(1, "skbedit"), nested(2, parameters, number(3, _HTB | kind), number(5, group)))
         message = self._filter("basic", _INGRESS, 1, _ONLY, nested(3, edit))
-        return Request("set filter basic with action skbedit", RTM_NEWTFILTER, message, _SET)
+        return NetlinkRequest("set filter basic with action skbedit", RTM_NEWTFILTER, message, _SET)
 
-    def accept_group(self, group: int) -> Request:
+    def accept_group(self, group: int) -> NetlinkRequest:
         """Return the request that lets packets of a group leave at this port."""
-        return Request("add filter fw", RTM_NEWTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group), NEW)
+        return NetlinkRequest(
+            "add filter fw", RTM_NEWTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group), NEW
+        )
 
-    def reject_group(self, group: int) -> Request:
-        return Request("delete filter fw", RTM_DELTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group))
+    def reject_group(self, group: int) -> NetlinkRequest:
+        return NetlinkRequest("delete filter fw", RTM_DELTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group))
 
     def read_mark(self, netlink: Netlink) -> tuple[int, int] | None:
         """Return the kind and group that the kernel assigns to packets that enter at this port."""

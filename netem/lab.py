@@ -28,7 +28,7 @@ from types import TracebackType
 from typing import Literal, Self
 
 from netem import _namespaces, addresses
-from netem._lab_channel import Channel
+from netem._lab_channel import LabConnection
 from netem._udp_counters import UdpCounters
 from netem.conditions import NetworkConditions
 from netem.engine import AppliedConditions
@@ -50,7 +50,7 @@ _CLOSE_DEADLINE_S = 5.0
 class LabProcess:
     """A program in the virtual network. It ends at the latest when the network is closed."""
 
-    def __init__(self, channel: Channel, vehicle: int | None, pid: int, ended: asyncio.Future[int]) -> None:
+    def __init__(self, channel: LabConnection, vehicle: int | None, pid: int, ended: asyncio.Future[int]) -> None:
         self._channel = channel
         self._ended = ended
         self.vehicle = vehicle
@@ -100,7 +100,7 @@ class LabProcess:
 class Lab:
     """A private network of real processes, in Linux namespaces. Create it with `Lab.open`."""
 
-    def __init__(self, vehicles: tuple[int, ...], process: asyncio.subprocess.Process, channel: Channel) -> None:
+    def __init__(self, vehicles: tuple[int, ...], process: asyncio.subprocess.Process, channel: LabConnection) -> None:
         self._process = process
         self._channel = channel
         self.vehicles = vehicles
@@ -183,7 +183,7 @@ class Lab:
         except BaseException:
             own_end.close()
             raise
-        return cls(vehicles, process, Channel(own_end, log))
+        return cls(vehicles, process, LabConnection(own_end, log))
 
     async def _start(
         self, engine: EngineName | None, needs: Sequence[str], networks: Mapping[int, int], log: Path

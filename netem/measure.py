@@ -171,7 +171,7 @@ def studies(engine: str) -> tuple[NetworkStudy, ...]:
 
 
 @dataclass(frozen=True)
-class _Case:
+class _LinkCase:
     """The conditions of a link, and the comparisons to make as (quantity, requested value, estimate, unit)."""
 
     condition: str
@@ -179,12 +179,14 @@ class _Case:
     figures: tuple[tuple[str, float, Callable[[ReceivedStream], Estimate], str], ...]
 
 
-def _losses() -> list[_Case]:
+def _losses() -> list[_LinkCase]:
     shares = (0.01, 0.05, 0.15, 0.5)
-    return [_Case(f"loss {share:g}", LinkConditions(share), (("lost", share, estimates.lost, ""),)) for share in shares]
+    return [
+        _LinkCase(f"loss {share:g}", LinkConditions(share), (("lost", share, estimates.lost, ""),)) for share in shares
+    ]
 
 
-def _other_conditions(noticed: float) -> list[_Case]:
+def _other_conditions(noticed: float) -> list[_LinkCase]:
     """Return the conditions other than loss and duplicates. `noticed` is the share of corrupted packets that are
     detected.
     """
@@ -193,7 +195,7 @@ def _other_conditions(noticed: float) -> list[_Case]:
     rate, limit = 500_000.0, 50
     shapes = [Delay(fixed.mean_s, jitter_s, shape) for shape in get_args(Distribution)]
     return [
-        _Case(
+        _LinkCase(
             f"loss in bursts, p {bursts.p:g}, r {bursts.r:g}",
             LinkConditions(bursts),
             (
@@ -201,20 +203,20 @@ def _other_conditions(noticed: float) -> list[_Case]:
                 ("mean burst", 1 / bursts.r, estimates.burst_length, "packets"),
             ),
         ),
-        _Case("delay 100 ms", LinkConditions(delay=fixed), (("mean", fixed.mean_s, estimates.delay_mean, "s"),)),
+        _LinkCase("delay 100 ms", LinkConditions(delay=fixed), (("mean", fixed.mean_s, estimates.delay_mean, "s"),)),
         *(_jittered(delay) for delay in shapes),
-        _Case(
+        _LinkCase(
             "reorder 0.25, delay 100 ms",
             LinkConditions(delay=fixed, reorder=0.25),
             (("came at once", 0.25, partial(estimates.undelayed, delay_s=fixed.mean_s), ""),),
         ),
-        _Case("corrupt 0.2", LinkConditions(corrupt=0.2), (("lost", 0.2 * noticed, estimates.lost, ""),)),
-        _Case(
+        _LinkCase("corrupt 0.2", LinkConditions(corrupt=0.2), (("lost", 0.2 * noticed, estimates.lost, ""),)),
+        _LinkCase(
             f"rate {rate / 1000:g} kbit/s",
             LinkConditions(rate=rate),
             (("rate", rate, partial(estimates.rate, packet_bits=_FRAME_BITS), "bit/s"),),
         ),
-        _Case(
+        _LinkCase(
             f"limit {limit}, delay 100 ms",
             LinkConditions(delay=fixed, limit=limit),
             (("waited", limit, partial(estimates.waiting_when_lost, delay_s=fixed.mean_s), "packets"),),
@@ -222,22 +224,22 @@ def _other_conditions(noticed: float) -> list[_Case]:
     ]
 
 
-def _jittered(delay: Delay) -> _Case:
+def _jittered(delay: Delay) -> _LinkCase:
     deviations = [entry / SCALE for entry in table(delay.distribution, _TABLE_SIZE)]
     mean_s = delay.mean_s + delay.jitter_s * fmean(deviations)
     deviation_s = delay.jitter_s * pstdev(deviations)
-    return _Case(
+    return _LinkCase(
         f"delay {delay.mean_s * 1000:g} ± {delay.jitter_s * 1000:g} ms {delay.distribution}",
         LinkConditions(delay=delay),
         (("mean", mean_s, estimates.delay_mean, "s"), ("deviation", deviation_s, estimates.delay_deviation, "s")),
     )
 
 
-def _duplicates() -> list[_Case]:
-    return [_Case("duplicate 0.3", LinkConditions(duplicate=0.3), (("came twice", 0.3, estimates.duplicated, ""),))]
+def _duplicates() -> list[_LinkCase]:
+    return [_LinkCase("duplicate 0.3", LinkConditions(duplicate=0.3), (("came twice", 0.3, estimates.duplicated, ""),))]
 
 
-def _receivers(cases: Sequence[_Case]) -> NetworkStudy:
+def _receivers(cases: Sequence[_LinkCase]) -> NetworkStudy:
     """Return a measurement with one sender, and a receiver for each of these conditions."""
     numbered = dict(enumerate(cases, _FIRST_FREE))
     questions = [

@@ -104,24 +104,24 @@ class Medium:
         """
         return self._air[sender].draw(now, data_bytes)
 
-    def _air_of(self, number: int, sender: int, conditions: NetworkConditions) -> _Air:
+    def _air_of(self, number: int, sender: int, conditions: NetworkConditions) -> _SenderLinks:
         links = [conditions.link(sender, receiver) for receiver in self._vehicles]
         hears = [number != index and self.hears(number, index) for index in range(len(links))]
         if all(_is_plain(link) for link in set(links)):
             self._links[number] = []
-            return _PlainAir(links, hears, self._words[number], self.latency)
+            return _PlainSenderLinks(links, hears, self._words[number], self.latency)
         before: Sequence[_Link | None] = self._links[number] or [None] * len(links)
         self._links[number] = [_Link(link, earlier, self.latency) for link, earlier in zip(links, before, strict=True)]
         if number not in self._rare:
             concerns = ("duplication", "reordering", "corruption")
             self._rare[number] = tuple(self._stream(concern, sender) for concern in concerns)
-        return _AnyAir(self._links[number], hears, self._words[number], self._rare[number])
+        return _GeneralSenderLinks(self._links[number], hears, self._words[number], self._rare[number])
 
     def _stream(self, concern: str, sender: int) -> Random:
         return Random(f"{self._seed}/{concern}/{sender}")
 
 
-class _Air(Protocol):
+class _SenderLinks(Protocol):
     """The links of one sender under one set of conditions."""
 
     soonest_of_all: float
@@ -150,7 +150,7 @@ def _is_plain(link: LinkConditions) -> bool:
     return uniform and not (link.duplicate or link.reorder or link.corrupt or link.remembers)
 
 
-class _PlainAir:
+class _PlainSenderLinks:
     """Links with independent loss and uniform latency. Each receiver needs two random numbers of 32 bits."""
 
     def __init__(self, links: list[LinkConditions], hears: list[bool], words: _RandomWords, latency: Delay) -> None:
@@ -177,7 +177,7 @@ class _PlainDraws:
 
     __slots__ = ("_air", "_at", "_latency", "_loss", "latest")
 
-    def __init__(self, air: _PlainAir, loss: array[int], latency: array[int], at: int, latest: float) -> None:
+    def __init__(self, air: _PlainSenderLinks, loss: array[int], latency: array[int], at: int, latest: float) -> None:
         self._air = air
         self._loss = loss
         self._latency = latency
@@ -235,7 +235,7 @@ def _draw(stream: Random, count: int) -> array[int]:
     return words
 
 
-class _AnyAir:
+class _GeneralSenderLinks:
     """Links with any conditions. The random numbers of each receiver are independent of the other receivers."""
 
     soonest_of_all = 0.0

@@ -96,13 +96,15 @@ async def _observe(
         folder = Path(name)
         async with await Lab.open(study.vehicles, engine=engine, log=folder / "lab.log") as lab:
             await lab.apply(study.conditions)
-            listeners = {vehicle: await _Program.start(lab, folder, vehicle, "receive", _PORT) for vehicle in vehicles}
+            listeners = {
+                vehicle: await _ProbeProgram.start(lab, folder, vehicle, "receive", _PORT) for vehicle in vehicles
+            }
             for listener in listeners.values():
                 await listener.wait_for("ready")
             senders = {}
             for sender, own in numbers.items():
                 stream = (_PORT, packets, own.start, lab.broadcast, DATA_BYTES, pause_s)
-                senders[sender] = await _Program.start(lab, folder, sender, "broadcast", *stream)
+                senders[sender] = await _ProbeProgram.start(lab, folder, sender, "broadcast", *stream)
             timers_s = {sender: (await program.end())["late_s"] for sender, program in senders.items()}
             counted = await _wait_until_quiet(lab)
             reports = {vehicle: await listener.stop() for vehicle, listener in listeners.items()}
@@ -129,7 +131,7 @@ async def _observe(
 def check(
     study: NetworkStudy,
     reports: Mapping[int, Mapping[str, Any]],
-    received_packets: Mapping[tuple[int, int], Sequence[Arrival]],
+    received_packets: Mapping[tuple[int, int], Sequence[PacketArrival]],
     counted: AppliedConditions,
 ) -> None:
     """Raise DisturbedError if the machine lost packets. With corruption, the cause of a loss is unknown."""
@@ -142,7 +144,7 @@ def check(
             raise DisturbedError(f"The machine itself lost {missing} of the packets to vehicle {vehicle}; {_TRY_AGAIN}")
 
 
-class Arrival(NamedTuple):
+class PacketArrival(NamedTuple):
     """A received copy of a packet, which has a number from 0. Times are in seconds."""
 
     number: int
@@ -150,10 +152,10 @@ class Arrival(NamedTuple):
     at_s: float
 
 
-def _arrivals(report: Mapping[str, Any], own: range) -> list[Arrival]:
+def _arrivals(report: Mapping[str, Any], own: range) -> list[PacketArrival]:
     """Return the received packets of one sender, which have these numbers."""
     each = zip(report["numbers"], report["at_s"], report["delays_s"], strict=True)
-    return [Arrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
+    return [PacketArrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
 
 
 async def _wait_until_quiet(lab: Lab) -> AppliedConditions:
@@ -165,7 +167,7 @@ async def _wait_until_quiet(lab: Lab) -> AppliedConditions:
     return now
 
 
-class _Program:
+class _ProbeProgram:
     """A program of `netem._probe` that runs in a vehicle."""
 
     def __init__(self, process: LabProcess, output: Path) -> None:
@@ -173,7 +175,7 @@ class _Program:
         self._output = output
 
     @classmethod
-    async def start(cls, lab: Lab, folder: Path, vehicle: int, program: str, *arguments: object) -> _Program:
+    async def start(cls, lab: Lab, folder: Path, vehicle: int, program: str, *arguments: object) -> _ProbeProgram:
         output = folder / f"{program}-{vehicle}.log"
         argv = [sys.executable, "-I", "-S", str(Path(_probe.__file__)), program, *map(str, arguments)]
         environment = {"PATH": os.environ["PATH"]}

@@ -33,7 +33,7 @@ from dataclasses import dataclass, replace
 from errno import ENOENT
 
 from netem._fabric import VirtualSwitch
-from netem._netlink import Netlink, Request
+from netem._netlink import Netlink, NetlinkRequest
 from netem._tc_requests import MAX_KIND, TrafficClass, TrafficControl
 from netem.conditions import NetworkConditions
 from netem.engine import AppliedConditions, Engine, ReceiverFigures
@@ -53,7 +53,7 @@ def may_refuse(conditions: NetworkConditions) -> bool:
 
 
 @dataclass
-class _Totals:
+class _RemovedClassTotals:
     """The counters of packets in traffic classes that were removed."""
 
     passed: int = 0
@@ -78,7 +78,7 @@ class NetemEngine(Engine):
         super().__init__(fabric)
         self._netlink: Netlink = fabric.netlink
         self._ports = {vehicle: TrafficControl(fabric.port_index(vehicle)) for vehicle in self._vehicles}
-        self._removed = {vehicle: _Totals() for vehicle in self._vehicles}
+        self._removed = {vehicle: _RemovedClassTotals() for vehicle in self._vehicles}
         self._kinds: _Numbers = {}
         self._groups: _Numbers = {}
         self._loss_conditions: NetworkConditions | None = None  # the conditions of the present classes; None if unknown
@@ -145,7 +145,7 @@ class NetemEngine(Engine):
     def _set(self, receiver: int, links: dict[int, LinkConditions]) -> None:
         """Set the conditions at the receiver's port. Only differences are sent to the kernel."""
         port, held = self._ports[receiver], self._classes[receiver]
-        requests: list[Request] = []
+        requests: list[NetlinkRequest] = []
         changed: dict[int, _ClassState] = {}
         for kind, link in links.items():
             before = held.get(kind)

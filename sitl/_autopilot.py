@@ -1,13 +1,8 @@
 """Simulate the autopilot of the embedded vehicle: modes, arming, flight and missions, without sockets, clocks or
 parsers.
 
-`Autopilot` is the vehicle. A client talks to it through a `Channel` (serial_channel.py). The messages that it sends at
-intervals are in streams.py. Times are simulated seconds since boot.
-
-The autopilot answers like ArduPilot wherever a client can see a difference. It refuses to arm until its position is
-known. It acknowledges a mode that is set in the first seconds after boot, and then undoes it. A copter begins a mission
-on command, a plane and a rover as soon as they are armed in AUTO mode. A course of closed formulas moves the vehicle. A
-new movement begins at the exact second at which the previous one ends, whatever the step size of `advance` is.
+`Autopilot` is the vehicle. A client exchanges bytes with it through a `ClientChannel` (serial_channel.py). The module
+streams.py decides which messages the vehicle sends at intervals. Times are simulated seconds since boot.
 """
 
 from __future__ import annotations
@@ -19,7 +14,7 @@ from typing import Any, Protocol
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl._failsafes import STATION, WIND, WIND_FROM, Failsafe, Failsafes
-from sitl._kinematics import Fall, Motion, PlannedMotion, Point, RestSegment, Segment, end_of
+from sitl._kinematics import FallSegment, LocalPlace, MotionState, PlannedMotion, RestSegment, Segment, end_of
 from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl.modes import BOOT_MODES, MODES
 from sitl.vehicle import READY_S, Home, VehicleType
@@ -37,7 +32,7 @@ TKOFF_ALT_M = 50.0  # ArduPlane's parameter TKOFF_ALT, the altitude of mode TAKE
 ACCEPTED, FAILED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_FAILED)
 
 
-class Listener(Protocol):
+class MessageListener(Protocol):
     """An object that receives the messages that the vehicle sends without a request."""
 
     def send(self, message: Any) -> None: ...
@@ -59,7 +54,7 @@ class Autopilot:
         self.now_s = 0.0
         self.used_mah = 0.0
         self.take_off_altitude_m = TKOFF_ALT_M
-        self.listeners: list[Listener] = []
+        self.listeners: list[MessageListener] = []
         self.mission: Sequence[Any] = ()  # MISSION_ITEM_INTs; the first is home, as in ArduPilot
         self.current_item = 0
         self.failsafes = Failsafes(vehicle_type)
@@ -67,8 +62,8 @@ class Autopilot:
         self._speed_ms = self._model.cruise_ms
         self._in_mission = False
         self._then: Callable[[], None] = self._stand
-        self._goal: tuple[Point, float] | None = None  # in GUIDED: target and speed
-        self._course = PlannedMotion(0.0, [RestSegment(Motion(yaw_rad=math.radians(home.heading_deg)))])
+        self._goal: tuple[LocalPlace, float] | None = None  # in GUIDED: target and speed
+        self._course = PlannedMotion(0.0, [RestSegment(MotionState(yaw_rad=math.radians(home.heading_deg)))])
 
     @property
     def _model(self) -> MotionModel:
@@ -93,7 +88,7 @@ class Autopilot:
         return self.failsafes.volts(self.battery_used)
 
     @property
-    def motion(self) -> Motion:
+    def motion(self) -> MotionState:
         return self._course.at(self.now_s)
 
     def advance(self, now_s: float) -> None:
@@ -149,7 +144,7 @@ class Autopilot:
         if self.armed:
             self._disarm()
             if self.airborne:
-                fall = Fall(self.motion)
+                fall = FallSegment(self.motion)
                 self._begin([fall], lambda: self._hit_ground(fall.impact_ms))
             else:
                 self._stand()
@@ -203,7 +198,7 @@ class Autopilot:
         self._speed_ms = speed_ms
         return ACCEPTED
 
-    def go_to(self, place: Point) -> int:
+    def go_to(self, place: LocalPlace) -> int:
         """Go to a place and stay there, in GUIDED mode. Return the result code."""
         if self.mode != "GUIDED" or not self.armed or not (self.airborne or self.vehicle_type == "rover"):
             return FAILED
@@ -305,7 +300,7 @@ class Autopilot:
     def _stand(self) -> None:
         self._begin([RestSegment(self.motion)], self._stand)
 
-    def _land(self, place: Point, before: Point | None = None) -> None:
+    def _land(self, place: LocalPlace, before: LocalPlace | None = None) -> None:
         self._begin(self._model.land(self.motion, place, before), self._landed)
 
     def _landed(self) -> None:
@@ -329,7 +324,7 @@ class Autopilot:
             self._stand()
             return
         altitude_m = max(self.motion.up_m, RTL_ALTITUDE_M[self.vehicle_type])
-        home = Point(0.0, 0.0, altitude_m if self.airborne else self.motion.up_m)
+        home = LocalPlace(0.0, 0.0, altitude_m if self.airborne else self.motion.up_m)
         if self.vehicle_type == "copter":
             up = self._model.take_off(self.motion, altitude_m)
             self._begin([*up, *self._model.go_to(end_of(up), home, self._speed_ms)], lambda: self._land(home))
@@ -372,14 +367,14 @@ class Autopilot:
             case mavlink.MAV_CMD_NAV_LAND:
                 self._land(place, self._place_before(number))
 
-    def _go_on_to(self, place: Point, number: int) -> None:
+    def _go_on_to(self, place: LocalPlace, number: int) -> None:
         """Fly to a place from the current position, in the current wind."""
         here = self.motion.point
         bearing_rad = math.atan2(place.east_m - here.east_m, place.north_m - here.north_m)
         speed_ms = self.failsafes.over_ground(self._speed_ms, bearing_rad)
         self._begin(self._model.go_to(self.motion, place, speed_ms, self._place_before(number)), self._item_reached)
 
-    def _place_before(self, number: int) -> Point | None:
+    def _place_before(self, number: int) -> LocalPlace | None:
         """Return the place of the previous mission item, or None if it has no place."""
         for item in reversed(self.mission[1:number]):
             match item.command:
@@ -390,7 +385,7 @@ class Autopilot:
             return None
         return None
 
-    def _place_after(self, number: int) -> Point | None:
+    def _place_after(self, number: int) -> LocalPlace | None:
         """Return the place of the next mission item other than a change of speed, or None."""
         places = (item for item in self.mission[number + 1 :] if item.command != mavlink.MAV_CMD_DO_CHANGE_SPEED)
         item = next(places, None)
@@ -410,7 +405,7 @@ class Autopilot:
         else:
             self._stay()
 
-    def place(self, frame: int, lat_e7: int, lon_e7: int, alt_m: float) -> Point:
+    def place(self, frame: int, lat_e7: int, lon_e7: int, alt_m: float) -> LocalPlace:
         """Return a place that is given in one of `FRAMES`, in metres from home.
 
         Latitude and longitude 0 mean the current position.
@@ -419,7 +414,7 @@ class Autopilot:
         if lat_e7 == lon_e7 == 0:
             return self.motion.point._replace(up_m=up_m)
         north_m, east_m, _ = self.home.metres_to(lat_e7 / 1e7, lon_e7 / 1e7, 0.0)
-        return Point(north_m, east_m, up_m)
+        return LocalPlace(north_m, east_m, up_m)
 
 
 SAID: dict[Failsafe, str] = {

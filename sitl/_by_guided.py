@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl._by_mission import MissionFlight
-from sitl._kinematics import Point
+from sitl._kinematics import LocalPlace
 from sitl._mission_upload import SPEED_TYPES, on_earth
 from sitl._pilot_link import PilotLink
 from sitl._route import Waypoint, is_near, landing_begins, limit_s
@@ -103,7 +103,7 @@ class GuidedFlight:
         position = self._to.state.position
         if position is None:
             return False
-        place = Point(*self._home.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
+        place = LocalPlace(*self._home.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
         return is_near(place, waypoint, self._to.vehicle_type)
 
     def _on_its_way(self) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl._mission_upload import Mission, MissionUpload
+from sitl._mission_upload import MissionItems, MissionUpload
 from sitl._pilot_link import PilotLink
 from sitl._route import Waypoint, limit_s
 from sitl.procedure import ARM, HEARTBEAT, READY, Commander, HopelessError, ProcedureStep
@@ -33,7 +33,7 @@ class MissionFlight:
         self._to = Commander(link, vehicle_type)
         self._waypoints = waypoints
         self._legs = [ProcedureStep(waypoint.leg, limit_s(waypoints, at)) for at, waypoint in enumerate(waypoints)]
-        self._mission = Mission(waypoints, link.home, link.sysid, vehicle_type)
+        self._mission = MissionItems(waypoints, link.home, link.sysid, vehicle_type)
         self._upload = MissionUpload(link, self._mission)
         self._under_way = under_way
         self._done = 0  # waypoints

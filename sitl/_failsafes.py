@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from sitl._kinematics import Point
+from sitl._kinematics import LocalPlace
 from sitl.vehicle import VehicleType
 
 BATTERY_FULL_V, BATTERY_USED_V = 16.8, 3.6  # full, and what of that a battery loses until it is empty
@@ -113,7 +113,7 @@ class Failsafes:
             return (STATION_ACTIONS if failsafe == "station" else RC_ACTIONS).get(self.parameters[enabled])
         return self._actions.get(self.parameters[WHEN_LOW if failsafe == "battery low" else WHEN_CRITICAL])
 
-    def breaches_fence(self, place: Point) -> bool:
+    def breaches_fence(self, place: LocalPlace) -> bool:
         """Return true if a place, in metres from home, is outside the fence."""
         kind = int(self.parameters[FENCE_TYPE])
         too_high = bool(kind & TOP) and place.up_m >= self.parameters.get(FENCE_TOP, math.inf)
@@ -127,7 +127,7 @@ class Failsafes:
         silent = heard_s is not None and now_s - heard_s >= self.parameters[STATION_SILENT]
         return silent and self._is_on(WHEN_SILENT)
 
-    def look(self, now_s: float, used: float, place: Point, station_heard_s: float | None) -> Failsafe | None:
+    def look(self, now_s: float, used: float, place: LocalPlace, station_heard_s: float | None) -> Failsafe | None:
         """Return the next failsafe that acts now, or None. The caller repeats the call until it returns None.
 
         `place` is in metres from home. `station_heard_s` is the time of the last heartbeat of the ground station. None

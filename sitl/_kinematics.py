@@ -18,7 +18,7 @@ GRAVITY_MS2 = 9.81
 NEAR_M = 1e-6  # closer than this is there
 
 
-class Point(NamedTuple):
+class LocalPlace(NamedTuple):
     """A place in metres from home."""
 
     north_m: float
@@ -27,7 +27,7 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionState:
     """The position and movement of a vehicle relative to home, in metres, metres per second and radians."""
 
     north_m: float = 0.0
@@ -41,13 +41,13 @@ class Motion:
     yaw_rate_rads: float = 0.0
 
     @property
-    def point(self) -> Point:
-        return Point(self.north_m, self.east_m, self.up_m)
+    def point(self) -> LocalPlace:
+        return LocalPlace(self.north_m, self.east_m, self.up_m)
 
     @property
-    def halted(self) -> Motion:
+    def halted(self) -> MotionState:
         """Return the same position and heading without movement."""
-        return Motion(self.north_m, self.east_m, self.up_m, yaw_rad=self.yaw_rad)
+        return MotionState(self.north_m, self.east_m, self.up_m, yaw_rad=self.yaw_rad)
 
 
 class Segment(Protocol):
@@ -57,18 +57,18 @@ class Segment(Protocol):
     def duration_s(self) -> float:
         """The duration of the segment in seconds, or math.inf if it has no end."""
 
-    def at(self, since_s: float) -> Motion:
+    def at(self, since_s: float) -> MotionState:
         """Return the motion at a time since the beginning, 0 to `duration_s`."""
 
 
 class RestSegment:
     """A segment without movement."""
 
-    def __init__(self, start: Motion, duration_s: float = math.inf) -> None:
+    def __init__(self, start: MotionState, duration_s: float = math.inf) -> None:
         self.duration_s = duration_s
         self._motion = start.halted
 
-    def at(self, since_s: float) -> Motion:
+    def at(self, since_s: float) -> MotionState:
         return self._motion
 
 
@@ -80,12 +80,18 @@ class StraightLine:
     """
 
     def __init__(
-        self, start: Motion, end: Point, speed_ms: float, accel_ms2: float, from_ms: float = 0.0, to_ms: float = 0.0
+        self,
+        start: MotionState,
+        end: LocalPlace,
+        speed_ms: float,
+        accel_ms2: float,
+        from_ms: float = 0.0,
+        to_ms: float = 0.0,
     ) -> None:
         north, east, up = (there - here for here, there in zip(start.point, end, strict=True))
         self._start, self._end = start, end
         self._length_m = math.hypot(north, east, up)
-        self._along = Point(*(part / max(self._length_m, NEAR_M) for part in (north, east, up)))
+        self._along = LocalPlace(*(part / max(self._length_m, NEAR_M) for part in (north, east, up)))
         self._yaw_rad = math.atan2(east, north) % math.tau if math.hypot(north, east) > NEAR_M else start.yaw_rad
         self._from_ms, self._accel_ms2 = from_ms, accel_ms2
         peak_ms = math.sqrt(accel_ms2 * self._length_m + (from_ms**2 + to_ms**2) / 2)
@@ -97,7 +103,7 @@ class StraightLine:
         self._slowing_from_s = self._speeding_up_s + steady_s
         self.duration_s = self._slowing_from_s + slowing_s
 
-    def at(self, since_s: float) -> Motion:
+    def at(self, since_s: float) -> MotionState:
         speeding_s = min(since_s, self._speeding_up_s)
         steady_s = min(since_s, self._slowing_from_s) - speeding_s
         slowing_s = max(0.0, since_s - self._slowing_from_s)
@@ -107,15 +113,15 @@ class StraightLine:
         speed_ms = self._from_ms + self._accel_ms2 * (speeding_s - slowing_s)
         place = self._end
         if since_s < self.duration_s:
-            place = Point(*(was + part * gone_m for was, part in zip(self._start.point, self._along, strict=True)))
+            place = LocalPlace(*(was + part * gone_m for was, part in zip(self._start.point, self._along, strict=True)))
         north_ms, east_ms, up_ms = (part * speed_ms for part in self._along)
-        return Motion(*place, north_ms, east_ms, up_ms, yaw_rad=self._yaw_rad)
+        return MotionState(*place, north_ms, east_ms, up_ms, yaw_rad=self._yaw_rad)
 
 
 class CircularArc:
     """A part of a level circle at constant speed. `turn_rad` is positive clockwise, and may be infinite."""
 
-    def __init__(self, start: Motion, centre: tuple[float, float], turn_rad: float, speed_ms: float) -> None:
+    def __init__(self, start: MotionState, centre: tuple[float, float], turn_rad: float, speed_ms: float) -> None:
         north, east = start.north_m - centre[0], start.east_m - centre[1]
         self._centre, self._up_m = centre, start.up_m
         self._radius_m = math.hypot(north, east)
@@ -124,10 +130,10 @@ class CircularArc:
         self._speed_ms = speed_ms
         self.duration_s = turn_rad / self._rate_rads
 
-    def at(self, since_s: float) -> Motion:
+    def at(self, since_s: float) -> MotionState:
         bearing = self._bearing_rad + self._rate_rads * since_s
         yaw = bearing + math.copysign(math.pi / 2, self._rate_rads)
-        return Motion(
+        return MotionState(
             self._centre[0] + self._radius_m * math.cos(bearing),
             self._centre[1] + self._radius_m * math.sin(bearing),
             self._up_m,
@@ -149,17 +155,17 @@ class ClimbingSegment:
         self._climbs_s = (up_m - self._from_m) / self._rate_ms if rate_ms else 0.0
         self.duration_s = level.duration_s
 
-    def at(self, since_s: float) -> Motion:
+    def at(self, since_s: float) -> MotionState:
         if since_s < self._climbs_s:
             climbed_m = self._rate_ms * since_s
             return replace(self._level.at(since_s), up_m=self._from_m + climbed_m, up_ms=self._rate_ms)
         return replace(self._level.at(since_s), up_m=self._up_m)
 
 
-class Fall:
+class FallSegment:
     """A fall to the ground without power and drag."""
 
-    def __init__(self, start: Motion) -> None:
+    def __init__(self, start: MotionState) -> None:
         self._start = start
         self.duration_s = (start.up_ms + math.sqrt(start.up_ms**2 + 2 * GRAVITY_MS2 * start.up_m)) / GRAVITY_MS2
 
@@ -168,7 +174,7 @@ class Fall:
         """The downward speed at the ground."""
         return GRAVITY_MS2 * self.duration_s - self._start.up_ms
 
-    def at(self, since_s: float) -> Motion:
+    def at(self, since_s: float) -> MotionState:
         start = self._start
         up_m = start.up_m + start.up_ms * since_s - GRAVITY_MS2 * since_s**2 / 2 if since_s < self.duration_s else 0.0
         return replace(
@@ -193,24 +199,24 @@ class PlannedMotion:
         """The time from which the position stays the same, or infinity if there is none."""
         return self._begin_s[-1] if isinstance(self._segments[-1], RestSegment) else self.end_s
 
-    def at(self, now_s: float) -> Motion:
+    def at(self, now_s: float) -> MotionState:
         """Return the motion at the time `now_s`, or at the nearer end of the sequence if that time is outside it."""
         index = max(0, bisect.bisect_right(self._begin_s, now_s) - 1)
         segment = self._segments[index]
         return segment.at(min(max(0.0, now_s - self._begin_s[index]), segment.duration_s))
 
 
-class CoursePart:
+class MotionInterval:
     """A part of a motion, from `begin_s` to `end_s` on its clock."""
 
     def __init__(self, course: PlannedMotion, begin_s: float, end_s: float) -> None:
         self._course, self._begin_s = course, begin_s
         self.duration_s = end_s - begin_s
 
-    def at(self, since_s: float) -> Motion:
+    def at(self, since_s: float) -> MotionState:
         return self._course.at(self._begin_s + since_s)
 
 
-def end_of(segments: Sequence[Segment]) -> Motion:
+def end_of(segments: Sequence[Segment]) -> MotionState:
     """Return the motion at the end of the last segment."""
     return segments[-1].at(segments[-1].duration_s)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from sitl._kinematics import CoursePart, Motion, PlannedMotion, Segment, end_of
+from sitl._kinematics import MotionInterval, MotionState, PlannedMotion, Segment, end_of
 from sitl._models import AT_ONCE
 from sitl._route import CLIMBED, Waypoint, is_near, limit_s, to_go_m
 from sitl.vehicle import VehicleType
@@ -15,7 +15,7 @@ FAST = 4.0  # limit of a vehicle's speed as a multiple of the commanded one
 
 
 def leg_by_leg(
-    waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion
+    waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState
 ) -> tuple[list[Segment], Segment]:
     """Return the segments up to the last completed waypoint, and the motion after them without further commands.
 
@@ -35,9 +35,9 @@ def leg_by_leg(
             made_s = _made_s(course, now_s, waypoint, vehicle_type, now_s + limit_s(waypoints, index))
         if math.isinf(made_s):
             break
-        flown.append(CoursePart(course, now_s, made_s))
+        flown.append(MotionInterval(course, now_s, made_s))
         motion, now_s = end_of(flown), made_s
-    return flown, CoursePart(course, now_s, math.inf)
+    return flown, MotionInterval(course, now_s, math.inf)
 
 
 def _made_s(

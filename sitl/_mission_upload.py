@@ -11,7 +11,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from sitl._kinematics import Point
+from sitl._kinematics import LocalPlace
 from sitl._pilot_link import PilotLink
 from sitl._route import Waypoint
 from sitl.vehicle import Home, VehicleType
@@ -40,13 +40,13 @@ _COMMANDS = {
 }
 
 
-def on_earth(place: Point, home: Home) -> tuple[int, int]:
+def on_earth(place: LocalPlace, home: Home) -> tuple[int, int]:
     """Return latitude and longitude in 1e-7 degrees of a place in metres from home."""
     there = home.offset(place.north_m, place.east_m)
     return round(there.lat_deg * 1e7), round(there.lon_deg * 1e7)
 
 
-class Mission:
+class MissionItems:
     """The mission items (MISSION_ITEM_INT) of a route, and the item number of each waypoint.
 
     If a plane's plan does not end with a landing, the mission ends with a circle around the last place. Without it,
@@ -57,7 +57,7 @@ class Mission:
         self.items: list[Any] = []
         self.numbers: list[int] = []  # of the item of each waypoint
         self._sysid = sysid
-        self._add(mavlink.MAV_CMD_NAV_WAYPOINT, (0.0,) * 4, on_earth(Point(0, 0, 0), home), 0.0)
+        self._add(mavlink.MAV_CMD_NAV_WAYPOINT, (0.0,) * 4, on_earth(LocalPlace(0, 0, 0), home), 0.0)
         speed_ms: float | None = None
         for waypoint in waypoints:
             if waypoint.kind != "take_off" and waypoint.speed_ms != speed_ms:
@@ -94,7 +94,7 @@ class MissionUpload:
     vehicle that rejects the mission.
     """
 
-    def __init__(self, link: PilotLink, mission: Mission) -> None:
+    def __init__(self, link: PilotLink, mission: MissionItems) -> None:
         self.accepted = False
         self.refused: str | None = None
         self._link = link

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from sitl._copter import Copter
-from sitl._kinematics import Motion, Point, Segment
+from sitl._kinematics import LocalPlace, MotionState, Segment
 from sitl._plane import Plane
 from sitl._rover import TURN_RATE_RADS, Rover
 from sitl.vehicle import VehicleType
@@ -22,23 +22,25 @@ class MotionModel(Protocol):
     def cruise_ms(self) -> float:
         """The default speed in metres per second."""
 
-    def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]: ...
+    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[Segment]: ...
 
-    def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
+    def go_to(
+        self, start: MotionState, place: LocalPlace, speed_ms: float, before: LocalPlace | None = None
+    ) -> Sequence[Segment]:
         """Go to a place. A plane first returns to the straight line from its previous place `before`."""
 
     def loiter(
-        self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
+        self, start: MotionState, place: LocalPlace, speed_ms: float, seconds: float, after: LocalPlace | None = None
     ) -> Sequence[Segment]:
         """Go to `place` and stay there for `seconds`, which may be infinite.
 
         A plane continues its circle until it heads for `after`, its next place.
         """
 
-    def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
+    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[Segment]:
         """Land at `place`, and stop there. `before` is used as in `go_to`."""
 
-    def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
         """Take off without a mission, and then continue with the default behaviour without end."""
 
 

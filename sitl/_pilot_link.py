@@ -16,7 +16,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl._tlog import TelemetryLog
-from sitl._vehicle_state import Battery, ReportedPosition, VehicleState, Version
+from sitl._vehicle_state import Battery, FirmwareVersion, ReportedPosition, VehicleState
 from sitl.parameters import MAX_PARAMETERS
 from sitl.vehicle import Home
 
@@ -350,7 +350,7 @@ class PilotLink(asyncio.Protocol):
             self.listed.add(message.param_index)
 
     def _on_version(self, message: Any) -> None:
-        self.state.version = Version.of(message.flight_sw_version, bytes(message.flight_custom_version))
+        self.state.version = FirmwareVersion.of(message.flight_sw_version, bytes(message.flight_custom_version))
 
     def _on_item(self, message: Any) -> None:
         self.state.item = message.seq

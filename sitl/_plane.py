@@ -16,8 +16,8 @@ from sitl._kinematics import (
     NEAR_M,
     CircularArc,
     ClimbingSegment,
-    Motion,
-    Point,
+    LocalPlace,
+    MotionState,
     RestSegment,
     Segment,
     StraightLine,
@@ -62,32 +62,34 @@ class Plane:
 
     cruise_ms = CRUISE_MS
 
-    def take_off(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
         run, path = _lift_off(start, altitude_m, altitude_m)
         path.straight(LEVEL_OFF_M)
         return [*run, *path.segments]
 
-    def ascent(self, start: Motion, altitude_m: float) -> Sequence[Segment]:
+    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
         """Take off as in mode TAKEOFF: fly to the left side of a circle ahead, and circle without end."""
         run, path = _lift_off(start, altitude_m, min(LEVEL_M, altitude_m))
         place = _ahead(start, AHEAD_M)._replace(up_m=altitude_m)
         path.straight_to(_on_circle(place, LOITER_RADIUS_M, start.yaw_rad - math.pi / 2))
-        circle = _Path(end_of(path.segments), CRUISE_MS * OVER_GROUND, altitude_m, TAKE_OFF_CLIMB_MS)
+        circle = _PlanePath(end_of(path.segments), CRUISE_MS * OVER_GROUND, altitude_m, TAKE_OFF_CLIMB_MS)
         circle.arc(place[:2], math.inf)
         return [*run, *path.segments, *circle.segments]
 
-    def go_to(self, start: Motion, place: Point, speed_ms: float, before: Point | None = None) -> Sequence[Segment]:
+    def go_to(
+        self, start: MotionState, place: LocalPlace, speed_ms: float, before: LocalPlace | None = None
+    ) -> Sequence[Segment]:
         return _back_and_on(start, place, before, speed_ms * OVER_GROUND, CLIMB_MS, REACHED_M)
 
     def loiter(
-        self, start: Motion, place: Point, speed_ms: float, seconds: float, after: Point | None = None
+        self, start: MotionState, place: LocalPlace, speed_ms: float, seconds: float, after: LocalPlace | None = None
     ) -> Sequence[Segment]:
         """Circle clockwise around the place for `seconds`, counted from the turn onto the circle.
 
         From inside, the plane crosses the circle straight. From outside, it flies towards the place and passes it on
         its left.
         """
-        path, radius_m = _Path(start, speed_ms * OVER_GROUND, place.up_m, CLIMB_MS), loiter_radius_m(speed_ms)
+        path, radius_m = _PlanePath(start, speed_ms * OVER_GROUND, place.up_m, CLIMB_MS), loiter_radius_m(speed_ms)
         if math.dist(start.point[:2], place[:2]) < radius_m:
             joins_rad = start.yaw_rad - JOIN_RAD
         else:
@@ -102,7 +104,7 @@ class Plane:
             path.arc(place[:2], _until_heading_for(after, place, end_of(path.segments)))
         return path.segments
 
-    def land(self, start: Motion, place: Point, before: Point | None = None) -> Sequence[Segment]:
+    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[Segment]:
         """Glide straight to the ground before the place, and roll to a stop.
 
         A plane that is too high circles down first.
@@ -119,7 +121,7 @@ class Plane:
         return [*glide, StraightLine(ground, stand, LANDING_MS, ROLL_OUT_ACCEL_MS2, from_ms=LANDING_MS)]
 
 
-def _until_heading_for(there: Point, centre: Point, here: Motion) -> float:
+def _until_heading_for(there: LocalPlace, centre: LocalPlace, here: MotionState) -> float:
     """Return the angle in radians to continue on a circle, until the plane flies towards a place within ArduPlane's
     tolerance.
 
@@ -142,10 +144,10 @@ def _duration_s(segments: Sequence[Segment]) -> float:
     return sum(part.duration_s for part in segments)
 
 
-class _Path:
+class _PlanePath:
     """A path under construction at one speed, with a climb or descent to one altitude."""
 
-    def __init__(self, start: Motion, speed_ms: float, up_m: float, rate_ms: float) -> None:
+    def __init__(self, start: MotionState, speed_ms: float, up_m: float, rate_ms: float) -> None:
         self.segments: list[Segment] = []
         self.speed_ms = speed_ms
         self._end, self._up_m, self._rate_ms = start, up_m, rate_ms
@@ -153,14 +155,14 @@ class _Path:
     def straight(self, length_m: float) -> None:
         self.straight_to(_ahead(self._end, length_m))
 
-    def straight_to(self, place: Point) -> None:
+    def straight_to(self, place: LocalPlace) -> None:
         end = place._replace(up_m=self._end.up_m)
         self._add(StraightLine(self._end, end, self.speed_ms, RUNWAY_ACCEL_MS2, self.speed_ms, self.speed_ms))
 
     def arc(self, centre: tuple[float, float], turn_rad: float) -> None:
         self._add(CircularArc(self._end, centre, turn_rad, self.speed_ms))
 
-    def fly_by(self, place: Point, reached_m: float, rather_left_m: float = 0.0) -> None:
+    def fly_by(self, place: LocalPlace, reached_m: float, rather_left_m: float = 0.0) -> None:
         """Turn towards `place` by the shorter turn, and fly straight until the distance is `reached_m`.
 
         The right turn must be shorter by more than `rather_left_m`.
@@ -180,7 +182,7 @@ class _Path:
             self.arc(turn.centre, turn.turn_rad)
         self.straight(max(0.0, turn.ahead_m - reached_m))
 
-    def bearing_rad(self, place: Point) -> float:
+    def bearing_rad(self, place: LocalPlace) -> float:
         """Return the bearing of a place from the end of the path."""
         return _bearing_rad(self._end.point, place)
 
@@ -190,16 +192,16 @@ class _Path:
             self._end = end_of(self.segments)
 
 
-def _lift_off(start: Motion, altitude_m: float, straight_to_m: float) -> tuple[Sequence[Segment], _Path]:
+def _lift_off(start: MotionState, altitude_m: float, straight_to_m: float) -> tuple[Sequence[Segment], _PlanePath]:
     """Return the motion on the ground before take-off, and a path that climbs to `altitude_m`."""
     run = StraightLine(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
-    path = _Path(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
+    path = _PlanePath(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
     path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
     return [RestSegment(start, SPOOL_UP_S), run], path
 
 
 def _back_and_on(
-    start: Motion, place: Point, before: Point | None, speed_ms: float, rate_ms: float, reached_m: float
+    start: MotionState, place: LocalPlace, before: LocalPlace | None, speed_ms: float, rate_ms: float, reached_m: float
 ) -> Sequence[Segment]:
     """Return to the line from `before` to `place`, and follow it until the distance to `place` is `reached_m`."""
     aim = None if before is None else _back_on_line(start.point, before, place)
@@ -208,18 +210,20 @@ def _back_and_on(
     line_rad = _bearing_rad(before, place)
     turn_rad = (line_rad - start.yaw_rad + math.pi) % math.tau - math.pi
     sways_m = math.copysign(SWAY_M, turn_rad) if abs(turn_rad) < math.pi / 2 else 0.0
-    swayed = _beside(Motion(*aim, yaw_rad=line_rad), sways_m)
-    back = _fly_by(start, Point(*swayed, aim.up_m), max(speed_ms, CRUISE_MS * OVER_GROUND), rate_ms, REACHED_M)
+    swayed = _beside(MotionState(*aim, yaw_rad=line_rad), sways_m)
+    back = _fly_by(start, LocalPlace(*swayed, aim.up_m), max(speed_ms, CRUISE_MS * OVER_GROUND), rate_ms, REACHED_M)
     return [*back, *_fly_by(end_of(back), place, speed_ms, rate_ms, reached_m)]
 
 
-def _fly_by(start: Motion, place: Point, speed_ms: float, rate_ms: float, reached_m: float) -> Sequence[Segment]:
-    path = _Path(start, speed_ms, place.up_m, rate_ms)
+def _fly_by(
+    start: MotionState, place: LocalPlace, speed_ms: float, rate_ms: float, reached_m: float
+) -> Sequence[Segment]:
+    path = _PlanePath(start, speed_ms, place.up_m, rate_ms)
     path.fly_by(place, reached_m)
     return path.segments
 
 
-class _Turn(NamedTuple):
+class _TurnToPlace(NamedTuple):
     """A turn after which a place is straight ahead: its centre, its clockwise angle, and the remaining distance."""
 
     centre: tuple[float, float]
@@ -227,7 +231,7 @@ class _Turn(NamedTuple):
     ahead_m: float
 
 
-def _turn_towards(start: Motion, place: Point, radius_m: float, rather_left_m: float) -> _Turn | None:
+def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather_left_m: float) -> _TurnToPlace | None:
     """Return the turn with the shorter path, or None if the place is inside both possible circles."""
     ways = []
     for side in (1, -1):  # to the right, to the left
@@ -241,7 +245,7 @@ def _turn_towards(start: Motion, place: Point, radius_m: float, rather_left_m: f
         turn_rad = side * (leaves - enters) % math.tau
         if math.tau - turn_rad < NEAR_M:  # straight ahead, but for rounding
             turn_rad = 0.0
-        ways.append(_Turn(centre, side * turn_rad, math.sqrt(away_m**2 - radius_m**2)))
+        ways.append(_TurnToPlace(centre, side * turn_rad, math.sqrt(away_m**2 - radius_m**2)))
     lengths_m = {way: abs(way.turn_rad) * radius_m + way.ahead_m for way in ways}
     still_right_m = STILL_RIGHT_M if start.yaw_rate_rads > 0 else 0.0
     return min(
@@ -251,7 +255,7 @@ def _turn_towards(start: Motion, place: Point, radius_m: float, rather_left_m: f
     )
 
 
-def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
+def _back_on_line(here: LocalPlace, before: LocalPlace, place: LocalPlace) -> LocalPlace | None:
     """Return the point to aim at on the line between two places, or None if the place itself is as near."""
     north, east = place.north_m - before.north_m, place.east_m - before.east_m
     length_m = math.hypot(north, east)
@@ -261,35 +265,35 @@ def _back_on_line(here: Point, before: Point, place: Point) -> Point | None:
     if along_m > length_m - LINE_AHEAD_M:
         return None
     part = along_m / length_m
-    return Point(before.north_m + part * north, before.east_m + part * east, place.up_m)
+    return LocalPlace(before.north_m + part * north, before.east_m + part * east, place.up_m)
 
 
-def _bearing_rad(here: Point, there: Point) -> float:
+def _bearing_rad(here: LocalPlace, there: LocalPlace) -> float:
     return math.atan2(there.east_m - here.east_m, there.north_m - here.north_m)
 
 
-def _on_circle(place: Point, radius_m: float, bearing_rad: float) -> Point:
+def _on_circle(place: LocalPlace, radius_m: float, bearing_rad: float) -> LocalPlace:
     """Return the point on the circle around a place that lies in this direction from its centre."""
     north_m, east_m = radius_m * math.cos(bearing_rad), radius_m * math.sin(bearing_rad)
-    return Point(place.north_m + north_m, place.east_m + east_m, place.up_m)
+    return LocalPlace(place.north_m + north_m, place.east_m + east_m, place.up_m)
 
 
-def _towards(place: Point, other: Point, length_m: float) -> Point:
+def _towards(place: LocalPlace, other: LocalPlace, length_m: float) -> LocalPlace:
     """Return the point at this distance from a place, in the direction of the other place."""
     away_m = max(math.dist(place[:2], other[:2]), NEAR_M)
     part = min(1.0, length_m / away_m)
     north_m, east_m = (a + part * (b - a) for a, b in zip(place[:2], other[:2], strict=True))
-    return Point(north_m, east_m, place.up_m)
+    return LocalPlace(north_m, east_m, place.up_m)
 
 
-def _ahead(start: Motion, length_m: float) -> Point:
-    return Point(
+def _ahead(start: MotionState, length_m: float) -> LocalPlace:
+    return LocalPlace(
         start.north_m + length_m * math.cos(start.yaw_rad),
         start.east_m + length_m * math.sin(start.yaw_rad),
         start.up_m,
     )
 
 
-def _beside(start: Motion, right_m: float) -> tuple[float, float]:
+def _beside(start: MotionState, right_m: float) -> tuple[float, float]:
     """Return north and east of the point at this distance to the right of the vehicle."""
     return start.north_m - right_m * math.sin(start.yaw_rad), start.east_m + right_m * math.cos(start.yaw_rad)

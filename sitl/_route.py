@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from sitl._kinematics import Point
+from sitl._kinematics import LocalPlace
 from sitl._models import MODELS
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
 from sitl.vehicle import VehicleType
@@ -35,7 +35,7 @@ class Waypoint:
 
     leg: str  # of the plan, in words: "leg 2 of 5 (...)"
     kind: Kind
-    place: Point
+    place: LocalPlace
     speed_ms: float
     seconds: float = 0.0
 
@@ -44,7 +44,7 @@ def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Wa
     """Return the waypoints of a plan for a vehicle whose home has this heading. Raises PlanError."""
     plan.check(vehicle_type)
     cruise_ms = MODELS[vehicle_type].cruise_ms
-    place, speed_ms = Point(0.0, 0.0, 0.0), cruise_ms
+    place, speed_ms = LocalPlace(0.0, 0.0, 0.0), cruise_ms
     waypoints: list[Waypoint] = []
     for number, leg in enumerate(plan.legs, start=1):
         name = f"leg {number} of {len(plan.legs)} ({leg})"
@@ -53,7 +53,7 @@ def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Wa
                 place = place._replace(up_m=altitude_m)
                 waypoints.append(Waypoint(name, "take_off", place, cruise_ms))
             case GoTo(north_m, east_m, altitude_m):
-                place = Point(north_m, east_m, place.up_m if altitude_m is None else altitude_m)
+                place = LocalPlace(north_m, east_m, place.up_m if altitude_m is None else altitude_m)
                 speed_ms = cruise_ms if leg.speed_ms is None else leg.speed_ms
                 waypoints.append(Waypoint(name, "go_to", place, speed_ms))
             case Loiter(seconds):
@@ -68,19 +68,19 @@ def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Wa
 def limit_s(waypoints: Sequence[Waypoint], index: int) -> float:
     """Return the time limit, in simulated seconds, of one waypoint after the previous one."""
     waypoint = waypoints[index]
-    start = waypoints[index - 1].place if index else Point(0.0, 0.0, 0.0)
+    start = waypoints[index - 1].place if index else LocalPlace(0.0, 0.0, 0.0)
     way_s = math.dist(start[:2], waypoint.place[:2]) / (SLOWEST * waypoint.speed_ms)
     climb_s = abs(waypoint.place.up_m - start.up_m) / SLOWEST_CLIMB_MS
     return GRACE_S + way_s + climb_s + waypoint.seconds / SLOWEST
 
 
-def is_near(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> bool:
+def is_near(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) -> bool:
     """Return true if a vehicle in GUIDED mode has reached the waypoint."""
     level = vehicle_type == "rover" or abs(place.up_m - waypoint.place.up_m) <= NEAR_UP_M
     return level and to_go_m(place, waypoint, vehicle_type) <= 0
 
 
-def to_go_m(place: Point, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
+def to_go_m(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
     """Return the remaining distance over the ground in metres. It is negative inside the tolerance."""
     return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
 
@@ -90,10 +90,12 @@ def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> 
     return len(waypoints) - 2 if vehicle_type == "plane" and waypoints[-1].kind == "land" else None
 
 
-def _approach(place: Point, heading_deg: float) -> Point:
+def _approach(place: LocalPlace, heading_deg: float) -> LocalPlace:
     """Return the place at which a plane begins to land at `place`.
 
     It lies before it on the runway, along home's heading.
     """
     before_m, heading = place.up_m / APPROACH_SLOPE, math.radians(heading_deg)
-    return Point(place.north_m - before_m * math.cos(heading), place.east_m - before_m * math.sin(heading), place.up_m)
+    return LocalPlace(
+        place.north_m - before_m * math.cos(heading), place.east_m - before_m * math.sin(heading), place.up_m
+    )

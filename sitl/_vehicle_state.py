@@ -33,14 +33,14 @@ class Battery:
 
 
 @dataclass(frozen=True)
-class Version:
+class FirmwareVersion:
     """A firmware version such as "4.7.0-dev", and the first digits of its git commit if reported."""
 
     number: str
     commit: str | None = None
 
     @classmethod
-    def of(cls, number: int, custom: bytes) -> Version:
+    def of(cls, number: int, custom: bytes) -> FirmwareVersion:
         """Return the version in a MAVLink message AUTOPILOT_VERSION."""
         major, minor, patch, kind = number.to_bytes(4, "big")
         stages = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc"}
@@ -56,7 +56,7 @@ class VehicleState:
 
     mode: int | None = None  # ArduPilot's custom_mode
     mav_type: int | None = None  # MAV_TYPE
-    version: Version | None = None
+    version: FirmwareVersion | None = None
     armed: bool = False
     ready_to_arm: bool | None = None
     position: ReportedPosition | None = None  # as it last said while its estimate was good

@@ -11,7 +11,7 @@ from sitl.vehicle import VehicleError
 
 
 @dataclass(frozen=True)
-class Address:
+class ListenAddress:
     """The address at which a ground station listens."""
 
     host: str
@@ -36,7 +36,7 @@ class Address:
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
-def connected(address: Address) -> socket.socket:
+def connected(address: ListenAddress) -> socket.socket:
     """Return a UDP socket for this address only. Nothing is sent. Raises VehicleError if the address cannot be reached.
 
     If a name has both, the IPv4 address is used, because ground stations listen on it.
@@ -55,7 +55,7 @@ def connected(address: Address) -> socket.socket:
     return sock
 
 
-def _no_way_to(address: Address, error: OSError | UnicodeError) -> VehicleError:
+def _no_way_to(address: ListenAddress, error: OSError | UnicodeError) -> VehicleError:
     """Return the error for an unreachable address."""
     reason = "it is no name" if isinstance(error, UnicodeError) else error.strerror or str(error)
     return VehicleError(

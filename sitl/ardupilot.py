@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from sitl._vehicle_state import Version
+from sitl._vehicle_state import FirmwareVersion
 from sitl.airframes import BINARIES, Airframe, airframe
 from sitl.installed import current, install_command, sha256
 from sitl.parameters import in_lines
@@ -265,14 +265,14 @@ def models(binary: Path) -> list[str]:
     return [line.strip() for line in listed.splitlines() if re.fullmatch(r"  [\w+.-]+", line)] if found else []
 
 
-def build_of(binary: Path) -> Version | None:
+def build_of(binary: Path) -> FirmwareVersion | None:
     """Return the version and the commit in a binary, as it prints them at its start, or None."""
     try:
         with binary.open("rb") as file:
             found = _BUILD.search(file.read(MAX_BINARY_BYTES))
     except OSError:
         return None
-    return Version(found[1].decode(), found[2].decode()) if found else None
+    return FirmwareVersion(found[1].decode(), found[2].decode()) if found else None
 
 
 _BUILD = re.compile(rb"Ardu(?:Copter|Plane|Rover) V(\d[\w.-]{0,30}) \(([0-9a-f]{7,12})\)", re.ASCII)

@@ -44,7 +44,7 @@ class UnreachableError(DownloadError):
 
 
 @dataclass(frozen=True)
-class _Origin:
+class _PartialDownload:
     """The size and version mark that the server reported for a partly downloaded file."""
 
     size: int
@@ -67,7 +67,7 @@ def download(url: str, target: Path, limit: int, progress: Progress, stall_s: fl
             part.unlink(missing_ok=True)
             noted.unlink(missing_ok=True)
             if validator := _validator(answer):
-                noted.write_text(json.dumps(asdict(_Origin(size, validator))))
+                noted.write_text(json.dumps(asdict(_PartialDownload(size, validator))))
         else:
             answer.close()
             if origin is None:
@@ -165,16 +165,16 @@ def _endless(url: str) -> DownloadError:
     return DownloadError(f"{urlsplit(url).netloc} does not say how large {url} is: use another --url")
 
 
-def _kept(part: Path, noted: Path) -> tuple[int, _Origin] | None:
+def _kept(part: Path, noted: Path) -> tuple[int, _PartialDownload] | None:
     """Return the size and origin of an earlier partial download, or None."""
     try:
-        have, origin = part.stat().st_size, _Origin(**json.loads(noted.read_text()))
+        have, origin = part.stat().st_size, _PartialDownload(**json.loads(noted.read_text()))
         return (have, origin) if have else None
     except (OSError, ValueError, TypeError):
         return None
 
 
-def _fits(answer: Any, have: int, origin: _Origin) -> bool:
+def _fits(answer: Any, have: int, origin: _PartialDownload) -> bool:
     """Return true if a partial answer continues the file after its first `have` bytes."""
     match = re.fullmatch(r"bytes (\d+)-(\d+)/(\d+)", answer.headers.get("Content-Range", ""))
     wanted = (have, origin.size - 1, origin.size)

@@ -139,7 +139,7 @@ def _complain(sysid: int, port: int, reason: str) -> int:
     return 2
 
 
-class _Clock:
+class _BootClock:
     """The simulated seconds since boot. They do not advance while the process is suspended, as in ArduPilot."""
 
     def __init__(self, speedup: float) -> None:
@@ -161,7 +161,7 @@ class _Clock:
 def _fly(
     autopilot: Autopilot, ports: Sequence[VehiclePort], selector: selectors.BaseSelector, speedup: float
 ) -> NoReturn:
-    clock = _Clock(speedup)
+    clock = _BootClock(speedup)
     next_batch = time.monotonic()
     while True:
         due_s = [port.channel.next_due_s() for port in ports if port.channel]

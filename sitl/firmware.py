@@ -32,7 +32,7 @@ from urllib.parse import urlsplit
 
 from sitl.airframes import BINARIES, DEFAULTS, stacked
 from sitl.download import STALL_S, DownloadError, NotThereError, UnreachableError, download, fetch_text
-from sitl.installed import CURRENT, DownloadedFile, InstalledVersion, Manifest, cache
+from sitl.installed import CURRENT, DownloadedFile, DownloadManifest, InstalledVersion, cache
 from sitl.vehicle import VehicleError, VehicleType
 
 FIRMWARE = "https://firmware.ardupilot.org"
@@ -56,7 +56,7 @@ _NUMBER = re.compile(r"\d+\.\d+\.\d+")
 
 
 @dataclass(frozen=True)
-class _Processor:
+class _ProcessorKind:
     """A kind of processor: its directory on the server, and the beginning of an ELF file for it."""
 
     directory: str
@@ -64,8 +64,8 @@ class _Processor:
     header: re.Pattern[bytes]
 
 
-_X86_64 = _Processor("SITL_x86_64_linux_gnu", "x86_64", re.compile(rb"\x7fELF\x02\x01.{12}\x3e\x00", re.DOTALL))
-_ARM = _Processor("SITL_arm_linux_gnueabihf", "32-bit ARM", re.compile(rb"\x7fELF\x01\x01.{12}\x28\x00", re.DOTALL))
+_X86_64 = _ProcessorKind("SITL_x86_64_linux_gnu", "x86_64", re.compile(rb"\x7fELF\x02\x01.{12}\x3e\x00", re.DOTALL))
+_ARM = _ProcessorKind("SITL_arm_linux_gnueabihf", "32-bit ARM", re.compile(rb"\x7fELF\x01\x01.{12}\x28\x00", re.DOTALL))
 _BOARDS = {"x86_64": _X86_64, "aarch64": _ARM, "armv7l": _ARM}
 """Boards by platform.machine(). Both are little endian, with 64 and 32 bits and e_machine 62 and 40."""
 _FROM_SOURCE = "build ArduPilot SITL from source and set ARDUPILOT_SITL to its directory"
@@ -98,7 +98,7 @@ class InstallOutcome:
 
 
 @dataclass(frozen=True)
-class _Build:
+class _FirmwareBuild:
     """The version and commit in the file `git-version.txt`."""
 
     version: str
@@ -136,7 +136,7 @@ def install(
             f"ArduPilot publishes SITL for Linux on x86_64 and 32-bit ARM, and this is {sys.platform} on "
             f"{platform.machine()}: {_FROM_SOURCE}"
         )
-    server = _Server(vehicle, version, board, base, stall_s)
+    server = _ReleaseServer(vehicle, version, board, base, stall_s)
     home = cache(environ) / vehicle
     with _ways_out(home), _locked(home, watcher):
         number = version.removeprefix("stable-")
@@ -151,22 +151,24 @@ def install(
         binary = server.fetch_binary(part, watcher)
         files = {BINARIES[vehicle]: binary, **server.fetch_parameters(part, build)}
         fetched_at = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-        Manifest(vehicle, build.version, build.commit, fetched_at, files).write(part)
+        DownloadManifest(vehicle, build.version, build.commit, fetched_at, files).write(part)
         shutil.rmtree(place, ignore_errors=True)  # damaged
         part.rename(place)
         return _use(InstalledVersion(vehicle, place), already=False)
 
 
-class _Server:
+class _ReleaseServer:
     """One release of one vehicle type on ArduPilot's server or a mirror. Raises RequestError for an invalid `base`."""
 
-    def __init__(self, vehicle: VehicleType, version: str, board: _Processor, base: str | None, stall_s: float) -> None:
+    def __init__(
+        self, vehicle: VehicleType, version: str, board: _ProcessorKind, base: str | None, stall_s: float
+    ) -> None:
         self._vehicle, self._version, self._board, self._stall_s = vehicle, version, board, stall_s
         firmware, self._source = (_checked(base),) * 2 if base else (FIRMWARE, SOURCE)
         self._releases = f"{firmware}/{vehicle.title()}/"
         self._release = f"{self._releases}{f'stable-{version}' if version[0].isdigit() else version}/{board.directory}/"
 
-    def build(self) -> _Build:
+    def build(self) -> _FirmwareBuild:
         """Return the current build of the release."""
         url = f"{self._release}git-version.txt"
         try:
@@ -177,7 +179,7 @@ class _Server:
         version = re.search(r"^APMVERSION: .*V(\d[\w.-]{0,40})\s*$", text, re.MULTILINE | re.ASCII)
         if not (commit and version):
             raise DownloadError(f"{url} does not name a commit and a version: is this ArduPilot's server, or a mirror?")
-        return _Build(version[1], commit[1])
+        return _FirmwareBuild(version[1], commit[1])
 
     def fetch_binary(self, directory: Path, watcher: InstallWatcher) -> DownloadedFile:
         """Download the binary to `directory` unless it is there, and make it executable."""
@@ -201,7 +203,7 @@ class _Server:
             _refuse_what_does_not_run(path)
         return DownloadedFile.of(path, url)
 
-    def fetch_parameters(self, directory: Path, build: _Build) -> dict[str, DownloadedFile]:
+    def fetch_parameters(self, directory: Path, build: _FirmwareBuild) -> dict[str, DownloadedFile]:
         """Download the default parameters of the vehicle and its frames at the commit of the binary."""
         own = DEFAULTS[self._vehicle]
         places = {own: _PARAMETERS[self._vehicle]}
@@ -213,10 +215,10 @@ class _Server:
             raise DownloadError(f"{self._tree(build)}/{places[own][-1]} does not exist: install another --version")
         return files
 
-    def _tree(self, build: _Build) -> str:
+    def _tree(self, build: _FirmwareBuild) -> str:
         return f"{self._source}/ArduPilot/ardupilot/{build.commit}/{_AUTOTEST}"
 
-    def _fetch_parameters(self, path: Path, build: _Build, places: tuple[str, ...]) -> DownloadedFile | None:
+    def _fetch_parameters(self, path: Path, build: _FirmwareBuild, places: tuple[str, ...]) -> DownloadedFile | None:
         """Download a parameter file from the first address that has it. Return None if there is none."""
         for place in places:
             url = f"{self._tree(build)}/{place}"

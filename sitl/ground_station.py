@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sitl._mavlink_frames import FrameSplitter
 from sitl._operator import CommandLog
-from sitl.address import Address, connected
+from sitl.address import ListenAddress, connected
 
 MOST_DATAGRAMS_PER_S = 1000
 """Maximum rate of datagrams from the ground station. Further ones are dropped and counted."""
@@ -34,7 +34,9 @@ class GroundStation(asyncio.DatagramProtocol):
     It may be used in one event loop only.
     """
 
-    def __init__(self, address: Address, now: Callable[[], float], taken_over: Callable[[list[int]], None]) -> None:
+    def __init__(
+        self, address: ListenAddress, now: Callable[[], float], taken_over: Callable[[list[int]], None]
+    ) -> None:
         """Create the object. Callers use `open` instead. `now` returns the mission second, for the log of commands.
 
         `taken_over` receives the vehicles that the operator flies from now on.
@@ -43,7 +45,7 @@ class GroundStation(asyncio.DatagramProtocol):
         self._now = now
         self._taken_over = taken_over
         self._transport: asyncio.DatagramTransport | None = None
-        self._vehicles: dict[int, _Vehicle] = {}
+        self._vehicles: dict[int, _VehicleConnection] = {}
         """The vehicles by MAVLink system ID."""
         self._out_of_reach: set[int] = set()
         self._mav = mavlink.MAVLink(None)
@@ -54,7 +56,9 @@ class GroundStation(asyncio.DatagramProtocol):
         """True while the network accepts no more data."""
 
     @classmethod
-    async def open(cls, address: Address, now: Callable[[], float], taken_over: Callable[[list[int]], None]) -> Self:
+    async def open(
+        cls, address: ListenAddress, now: Callable[[], float], taken_over: Callable[[list[int]], None]
+    ) -> Self:
         """Return an open station. Raises VehicleError if the address cannot be reached."""
         station = cls(address, now, taken_over)
         sock = await asyncio.to_thread(connected, address)  # a name may have to be looked up
@@ -68,7 +72,7 @@ class GroundStation(asyncio.DatagramProtocol):
         It replaces an earlier connection.
         """
         sock.setblocking(False)
-        vehicle = _Vehicle(vehicle_id, lambda frames: self._forward(sysid, frames))
+        vehicle = _VehicleConnection(vehicle_id, lambda frames: self._forward(sysid, frames))
         await asyncio.get_running_loop().create_connection(lambda: vehicle, sock=sock)
         if before := self._vehicles.get(sysid):
             before.close()
@@ -157,7 +161,7 @@ class GroundStation(asyncio.DatagramProtocol):
         """Ignore the error, which means that no program listens at the address at the moment."""
 
 
-class _Vehicle(asyncio.Protocol):
+class _VehicleConnection(asyncio.Protocol):
     """The connection to the port of one vehicle for ground stations."""
 
     def __init__(self, vehicle_id: int, forward: Callable[[list[bytes]], None]) -> None:

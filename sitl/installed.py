@@ -3,7 +3,7 @@
     $XDG_CACHE_HOME/ucp-harness/sitl/copter/4.6.3/arducopter      (XDG Base Directory Specification; else ~/.cache)
                                                   copter.parm     ArduPilot's default parameters of that commit
                                                   copter-hexa.parm, ...                    and those of its frames
-                                                  manifest.json   `Manifest`
+                                                  manifest.json   `DownloadManifest`
                                            current -> 4.6.3       the version that runs use
 
 ArduPilot's server publishes no checksums. Therefore the SHA-256 hash of each file is recorded after its download over
@@ -42,7 +42,7 @@ class DownloadedFile:
 
 
 @dataclass(frozen=True)
-class Manifest:
+class DownloadManifest:
     """The list of downloaded files, with ArduPilot's version and git commit, and the time (ISO 8601, UTC)."""
 
     vehicle: str
@@ -55,7 +55,7 @@ class Manifest:
         (directory / MANIFEST).write_text(json.dumps(asdict(self), indent=1) + "\n")
 
     @classmethod
-    def read(cls, directory: Path) -> Manifest:
+    def read(cls, directory: Path) -> DownloadManifest:
         """Return the manifest of a directory.
 
         Raises OSError, ValueError, TypeError, LookupError or AttributeError if it is missing or damaged.
@@ -87,10 +87,10 @@ class InstalledVersion:
         return False
 
     @cached_property
-    def manifest(self) -> Manifest | None:
+    def manifest(self) -> DownloadManifest | None:
         """The list of downloaded files, or None if it cannot be read."""
         with contextlib.suppress(OSError, ValueError, TypeError, LookupError, AttributeError):
-            return Manifest.read(self.directory)
+            return DownloadManifest.read(self.directory)
         return None
 
     @cached_property

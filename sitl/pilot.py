@@ -146,11 +146,11 @@ class Pilot:
 
     async def stay_in_touch(self) -> None:
         """Wait, and raise FlightError when the vehicle is silent or disconnects. Return after `terminate_flight`."""
-        await self._pursue(_Listening())
+        await self._pursue(_ListenOnlyProcedure())
 
     async def _pursue(self, procedure: PilotProcedure) -> None:
         """Request each step of the procedure at every heartbeat until all steps are complete."""
-        clocks = _StepClocks(self.link)
+        clocks = _StepWaitingTimes(self.link)
         asked: tuple[ProcedureStep, int] | None = None
         while (step := self._next_step(procedure)) is not None:
             self._awaited = step
@@ -182,7 +182,7 @@ class Pilot:
             return False
         left = self.link.has_left_its_mode or self.link.has_disarmed
         handed_over = self._handed_over or (self._befallen and left)
-        return self._terminated or (handed_over and not isinstance(procedure, _Listening))
+        return self._terminated or (handed_over and not isinstance(procedure, _ListenOnlyProcedure))
 
     def _next_step(self, procedure: PilotProcedure) -> ProcedureStep | None:
         try:
@@ -208,7 +208,7 @@ class Pilot:
         )
 
 
-class _Listening:
+class _ListenOnlyProcedure:
     """A procedure without steps, which only receives messages."""
 
     purpose = "stay in touch"
@@ -221,7 +221,7 @@ class _Listening:
         pass
 
 
-class _StepClocks:
+class _StepWaitingTimes:
     """The time for which the pilot has waited for each step, in simulated seconds and in seconds of wall time."""
 
     def __init__(self, link: PilotLink) -> None:

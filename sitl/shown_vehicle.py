@@ -1,6 +1,6 @@
 """Show a vehicle on a computed flight path in a ground station.
 
-It uses the same `Channel` as the embedded vehicle, and refuses each command of an operator with a text.
+It uses the same `ClientChannel` as the embedded vehicle, and refuses each command of an operator with a text.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sitl._autopilot import Autopilot
 from sitl._failsafes import BATTERY_FULL_V
-from sitl._kinematics import Motion, Point
-from sitl.track import Track
+from sitl._kinematics import LocalPlace, MotionState
+from sitl.track import VehicleTrack
 from sitl.vehicle import READY_S, Home, VehicleType
 
 REFUSAL = "Virtual time: this track is computed"
@@ -25,7 +25,7 @@ class ShownVehicle(Autopilot):
 
     takes_missions = False
 
-    def __init__(self, sysid: int, home: Home, epoch_us: int, vehicle_type: VehicleType, track: Track) -> None:
+    def __init__(self, sysid: int, home: Home, epoch_us: int, vehicle_type: VehicleType, track: VehicleTrack) -> None:
         super().__init__(sysid, home, epoch_us, vehicle_type)
         self._track = track
         self.armed = True
@@ -47,7 +47,7 @@ class ShownVehicle(Autopilot):
         return True
 
     @property
-    def motion(self) -> Motion:
+    def motion(self) -> MotionState:
         return self._track.course.at(self.now_s - READY_S)
 
     def _no(self) -> int:
@@ -72,7 +72,7 @@ class ShownVehicle(Autopilot):
     def set_speed(self, speed_ms: float) -> int:
         return self._no()
 
-    def go_to(self, place: Point) -> int:
+    def go_to(self, place: LocalPlace) -> int:
         return self._no()
 
     def load(self, mission: Sequence[Any]) -> None:

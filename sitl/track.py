@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import Motion, PlannedMotion, RestSegment, Segment, end_of
+from sitl._kinematics import MotionState, PlannedMotion, RestSegment, Segment, end_of
 from sitl._leg_by_leg import leg_by_leg
 from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl._route import Waypoint, landing_begins, route
@@ -19,7 +19,7 @@ from sitl.vehicle import VehicleType
 
 
 @dataclass(frozen=True)
-class Track:
+class VehicleTrack:
     """The computed path of one vehicle, in mission seconds and metres. It never ends."""
 
     course: PlannedMotion
@@ -45,7 +45,7 @@ def track(
     heading_deg: float = 0.0,
     takeoff_altitude_m: float = 20.0,
     by: By = "mission",
-) -> Track:
+) -> VehicleTrack:
     """Return the path of a vehicle that begins to fly `plan` at mission second `begin_s`.
 
     Before that it stands at home. After the plan it stays, or circles if it is a plane, unless it has landed.
@@ -53,17 +53,17 @@ def track(
     heading of home. Without a plan, a copter takes off to `takeoff_altitude_m` and stays, a plane circles, and a rover
     stands. Raises PlanError if the type cannot fly the plan.
     """
-    start = Motion(yaw_rad=math.radians(heading_deg))
+    start = MotionState(yaw_rad=math.radians(heading_deg))
     segments: Sequence[Segment]
     if plan is None:
         segments = AT_ONCE[vehicle_type].ascent(start, takeoff_altitude_m)
     else:
         fly = _mission if by == "mission" else _guided
         segments = fly(route(plan, vehicle_type, heading_deg), vehicle_type, start)
-    return Track(PlannedMotion(begin_s, segments), home_offset)
+    return VehicleTrack(PlannedMotion(begin_s, segments), home_offset)
 
 
-def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:
+def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState) -> Sequence[Segment]:
     """Return the segments for the waypoints in AUTO mode, and for the unlimited stay after the last one."""
     model, last = MODELS[vehicle_type], waypoints[-1]
     segments: list[Segment] = [RestSegment(start, 0.0)]
@@ -74,7 +74,7 @@ def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mo
     return segments
 
 
-def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Motion) -> Sequence[Segment]:
+def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState) -> Sequence[Segment]:
     """Return the segments in GUIDED mode. The landing of a plane is always a mission."""
     begins = landing_begins(waypoints, vehicle_type)
     led, staying = leg_by_leg(waypoints[:begins], vehicle_type, start)
@@ -84,7 +84,7 @@ def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mot
 
 
 def _manoeuvre(
-    model: MotionModel, waypoint: Waypoint, start: Motion, before: Waypoint | None, after: Waypoint | None
+    model: MotionModel, waypoint: Waypoint, start: MotionState, before: Waypoint | None, after: Waypoint | None
 ) -> Sequence[Segment]:
     """Return the segments for one waypoint from the current motion, with regard to its neighbours."""
     led = before.place if before is not None and before.kind in ("go_to", "loiter") else None

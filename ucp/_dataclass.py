@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, get_origin
 _CLASS_VAR: Any = ClassVar
 
 
-class _Options(dict[str, Any]):
+class _FieldOptions(dict[str, Any]):
     """The options of a dataclass field, as in `dataclasses.field`."""
 
 
-class _Described:
+class _DescribedFields:
     """The fields of a dataclass in the form of the standard library. They are computed at the first access."""
 
-    def __init__(self, kinds: dict[str, Any], fields: dict[str, _Options]) -> None:
+    def __init__(self, kinds: dict[str, Any], fields: dict[str, _FieldOptions]) -> None:
         self._kinds = kinds
         self._fields = fields
 
@@ -34,7 +34,7 @@ class _Described:
 
 
 def _field(**options: Any) -> Any:
-    return _Options(options)
+    return _FieldOptions(options)
 
 
 def _dataclass(
@@ -56,21 +56,21 @@ def _dataclass(
         elif eq and not (frozen or unsafe_hash):
             content["__hash__"] = None
         content["__match_args__"] = tuple(name for name, options in fields.items() if options.get("init", True))
-        content["__dataclass_fields__"] = _Described(kinds, fields)
+        content["__dataclass_fields__"] = _DescribedFields(kinds, fields)
         return type(plain)(plain.__name__, plain.__bases__, content)
 
     return make
 
 
-def _options(content: dict[str, Any], name: str) -> _Options:
+def _options(content: dict[str, Any], name: str) -> _FieldOptions:
     """Return the options of a field, and remove its default value from the class."""
     if name not in content:
-        return _Options()
+        return _FieldOptions()
     default = content.pop(name)
-    return default if isinstance(default, _Options) else _Options(default=default)
+    return default if isinstance(default, _FieldOptions) else _FieldOptions(default=default)
 
 
-def _methods(fields: dict[str, _Options], *, frozen: bool, eq: bool, then: bool) -> dict[str, Any]:
+def _methods(fields: dict[str, _FieldOptions], *, frozen: bool, eq: bool, then: bool) -> dict[str, Any]:
     """Return the methods that are generated from the fields. If `then` is true, `__init__` calls `__post_init__` at its
     end.
     """

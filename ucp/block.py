@@ -7,7 +7,7 @@ therefore does not change if it is popped and committed again.
 from functools import lru_cache
 
 from ucp._dataclass import dataclass, field
-from ucp.wire import Kind, struct_of
+from ucp.wire import FieldKind, struct_of
 
 try:  # hashlib loads OpenSSL, which needs a quarter of an agent's memory
     from _sha2 import sha256  # type: ignore[import-not-found]
@@ -26,7 +26,7 @@ LATEST_US = 2**64 - 1
 CHAIN_HASHES_KEPT = 4096
 """Number of chain hashes in the cache. Agents of one process, and their judge, compute the same ones."""
 
-BLOCK_FIELDS = {"agent_id": Kind.U32, "timestamp_us": Kind.U64}
+BLOCK_FIELDS = {"agent_id": FieldKind.U32, "timestamp_us": FieldKind.U64}
 """The header of a block."""
 BLOCK_HEADER = struct_of(BLOCK_FIELDS)
 

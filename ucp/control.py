@@ -64,7 +64,7 @@ class ControlServer:
     def _accept(self) -> None:
         assert self._listener is not None, "it listens"
         with contextlib.suppress(OSError):  # the client may have disconnected already
-            _Client(self._listener.accept()[0], self.answer, self._loop)
+            _ControlClient(self._listener.accept()[0], self.answer, self._loop)
 
     def answer(self, line: bytes) -> dict[str, Any]:
         """Return the answer to one line with a request."""
@@ -88,7 +88,7 @@ class ControlServer:
             return {"ok": False, "error": str(error)}
 
 
-class _Client:
+class _ControlClient:
     """A connection to the control socket. It answers requests line by line, no faster than the client reads.
 
     It ends if the client disconnects or sends a line above the limit. Other connections continue.

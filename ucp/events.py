@@ -8,9 +8,9 @@ from random import Random
 from typing import Literal
 
 from ucp._dataclass import dataclass
-from ucp.wire import Kind, struct_of
+from ucp.wire import FieldKind, struct_of
 
-EVENT_FIELDS = {"timestamp_us": Kind.U64, "event_id": Kind.U8, "length": Kind.U16}
+EVENT_FIELDS = {"timestamp_us": FieldKind.U64, "event_id": FieldKind.U8, "length": FieldKind.U16}
 """The header of an event."""
 _HEADER = struct_of(EVENT_FIELDS)
 EVENT_HEADER_BYTES = _HEADER.size

@@ -18,19 +18,19 @@ from typing import Any, ClassVar, NamedTuple
 
 from ucp._dataclass import dataclass
 from ucp.block import BLOCK_HEADER, HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block
-from ucp.wire import VARIABLE, Fields, Kind, struct_of
+from ucp.wire import VARIABLE, FieldKind, Fields, struct_of
 
 PORT = 14600
 """Default UDP port. The mission file of an agent contains its port."""
 MAGIC = b"UC"
 VERSION = 1
 HEADER_FIELDS = {
-    "magic": Kind.MAGIC,
-    "version": Kind.U8,
-    "type": Kind.U8,
-    "sender": Kind.U32,
-    "sequence": Kind.U32,
-    "length": Kind.U16,
+    "magic": FieldKind.MAGIC,
+    "version": FieldKind.U8,
+    "type": FieldKind.U8,
+    "sender": FieldKind.U32,
+    "sequence": FieldKind.U32,
+    "length": FieldKind.U16,
 }
 HEADER = struct_of(HEADER_FIELDS)
 MAX_DATAGRAM_BYTES = 1472
@@ -50,7 +50,7 @@ class BlockAddRequest:
     """A request for votes on a block that will follow the position with this chain hash (Algorithms 2 and 3)."""
 
     NAME: ClassVar[str] = "Block Add Request"
-    WIRE: ClassVar[Fields] = {"block_hash": Kind.HASH, "chain_hash": Kind.HASH}
+    WIRE: ClassVar[Fields] = {"block_hash": FieldKind.HASH, "chain_hash": FieldKind.HASH}
     block_hash: bytes
     chain_hash: bytes
 
@@ -70,7 +70,11 @@ class BlockAddResponse:
     """
 
     NAME: ClassVar[str] = "Block Add Response"
-    WIRE: ClassVar[Fields] = {"approve": Kind.FLAG, "block_hash": Kind.HASH, "chain_hash": Kind.OPTIONAL_HASH}
+    WIRE: ClassVar[Fields] = {
+        "approve": FieldKind.FLAG,
+        "block_hash": FieldKind.HASH,
+        "chain_hash": FieldKind.OPTIONAL_HASH,
+    }
     block_hash: bytes
     approve: bool
     chain_hash: bytes | None = None
@@ -92,7 +96,7 @@ class CommitBlock:
     """The announcement of a committed block (Algorithms 5, 6 and 20), with the hash of the chain up to this block."""
 
     NAME: ClassVar[str] = "Commit Block"
-    WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH, "block": Kind.BLOCK}
+    WIRE: ClassVar[Fields] = {"chain_hash": FieldKind.HASH, "block": FieldKind.BLOCK}
     block: Block
     chain_hash: bytes
 
@@ -110,7 +114,7 @@ class ChainContainQuery:
     """A query: does the receiver's chain contain this chain hash? (Algorithms 8 and 9)"""
 
     NAME: ClassVar[str] = "Chain Contain Query"
-    WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH}
+    WIRE: ClassVar[Fields] = {"chain_hash": FieldKind.HASH}
     chain_hash: bytes
 
     def body(self) -> bytes:
@@ -126,7 +130,7 @@ class ChainContainResponse:
     """The answer yes or no to a Chain Contain Query (Algorithms 9 and 10)."""
 
     NAME: ClassVar[str] = "Chain Contain Response"
-    WIRE: ClassVar[Fields] = {"contained": Kind.FLAG, "chain_hash": Kind.HASH}
+    WIRE: ClassVar[Fields] = {"contained": FieldKind.FLAG, "chain_hash": FieldKind.HASH}
     chain_hash: bytes
     contained: bool
 
@@ -145,7 +149,7 @@ class ChainHashSuccessorQuery:
     """A query: which block follows this chain hash in the receiver's chain? (Algorithms 12 and 13)"""
 
     NAME: ClassVar[str] = "Chain Hash Successor Query"
-    WIRE: ClassVar[Fields] = {"chain_hash": Kind.HASH}
+    WIRE: ClassVar[Fields] = {"chain_hash": FieldKind.HASH}
     chain_hash: bytes
 
     def body(self) -> bytes:
@@ -165,7 +169,11 @@ class NextInSequenceResponse:
     """
 
     NAME: ClassVar[str] = "Next in Sequence Response"
-    WIRE: ClassVar[Fields] = {"timestamp_us": Kind.U64, "chain_hash": Kind.HASH, "block_hash": Kind.OPTIONAL_HASH}
+    WIRE: ClassVar[Fields] = {
+        "timestamp_us": FieldKind.U64,
+        "chain_hash": FieldKind.HASH,
+        "block_hash": FieldKind.OPTIONAL_HASH,
+    }
     chain_hash: bytes
     block_hash: bytes | None
     timestamp_us: int
@@ -187,7 +195,7 @@ class RequestForBlock:
     """A request for the block with this hash (Algorithms 16 and 17)."""
 
     NAME: ClassVar[str] = "Request for Block"
-    WIRE: ClassVar[Fields] = {"block_hash": Kind.HASH}
+    WIRE: ClassVar[Fields] = {"block_hash": FieldKind.HASH}
     block_hash: bytes
 
     def body(self) -> bytes:
@@ -203,7 +211,7 @@ class BlockResponse:
     """The requested block (Algorithms 17 and 18)."""
 
     NAME: ClassVar[str] = "Block Response"
-    WIRE: ClassVar[Fields] = {"block": Kind.BLOCK}
+    WIRE: ClassVar[Fields] = {"block": FieldKind.BLOCK}
     block: Block
 
     def body(self) -> bytes:

@@ -21,9 +21,9 @@ it. `opened` decrypts a Sealed packet with the bundle of a vehicle:
 
     from ucp.scapy import SecuredUCP, opened
     from ucp.secure.bundle import load_bundle
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
 
-    opened(rdpcap("7.pcapng")[0], Opener(load_bundle(Path("7.bundle.json")))).show()
+    opened(rdpcap("7.pcapng")[0], DatagramOpener(load_bundle(Path("7.bundle.json")))).show()
 """
 
 from collections.abc import Callable
@@ -72,10 +72,10 @@ from ucp.secure.envelope import (
     read_clear_header,
 )
 from ucp.secure.envelope import VERSION as SECURED_VERSION
-from ucp.wire import Fields, Kind
+from ucp.wire import FieldKind, Fields
 
 if TYPE_CHECKING:
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
 
 
 class HashField(XStrFixedLenField):
@@ -115,17 +115,17 @@ class CiphertextField(XStrField):
         return s[-TAG_BYTES:], s[:-TAG_BYTES]
 
 
-_FIELDS: dict[Kind, Callable[[str], Any]] = {
-    Kind.U8: lambda name: ByteField(name, 0),
-    Kind.U16: lambda name: ShortField(name, 0),
-    Kind.U32: lambda name: IntField(name, 0),
-    Kind.U64: lambda name: LongField(name, 0),
-    Kind.MAGIC: lambda name: StrFixedLenField(name, MAGIC, len(MAGIC)),
-    Kind.FLAG: lambda name: ByteEnumField(name, 0, {0: "no", 1: "yes"}),
-    Kind.HASH: HashField,
-    Kind.BOOT: lambda name: XStrFixedLenField(name, bytes(BOOT_BYTES), BOOT_BYTES),
-    Kind.OPTIONAL_HASH: OptionalHashField,
-    Kind.BLOCK: lambda name: PacketField(name, Block(), Block),
+_FIELDS: dict[FieldKind, Callable[[str], Any]] = {
+    FieldKind.U8: lambda name: ByteField(name, 0),
+    FieldKind.U16: lambda name: ShortField(name, 0),
+    FieldKind.U32: lambda name: IntField(name, 0),
+    FieldKind.U64: lambda name: LongField(name, 0),
+    FieldKind.MAGIC: lambda name: StrFixedLenField(name, MAGIC, len(MAGIC)),
+    FieldKind.FLAG: lambda name: ByteEnumField(name, 0, {0: "no", 1: "yes"}),
+    FieldKind.HASH: HashField,
+    FieldKind.BOOT: lambda name: XStrFixedLenField(name, bytes(BOOT_BYTES), BOOT_BYTES),
+    FieldKind.OPTIONAL_HASH: OptionalHashField,
+    FieldKind.BLOCK: lambda name: PacketField(name, Block(), Block),
 }
 
 
@@ -307,7 +307,7 @@ def to_layer(message: Message) -> Packet:
     return LAYERS[type(message)](message.body())
 
 
-def opened(packet: Packet, opener: "Opener") -> Packet:
+def opened(packet: Packet, opener: "DatagramOpener") -> Packet:
     """Return the decrypted packet (UCP header and message) for an encrypted one.
 
     Raises MalformedDatagramError with the reason if the keys do not open the packet.

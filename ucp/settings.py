@@ -20,7 +20,7 @@ MAX_TIMER_S = 1e9
 
 
 @dataclass(eq=False, frozen=True, slots=True)
-class Number:
+class NumberSetting:
     """The declaration of a setting whose value is a number."""
 
     sentence: str
@@ -36,7 +36,7 @@ class Number:
 
 
 @dataclass(eq=False, frozen=True, slots=True)
-class Choice:
+class ChoiceSetting:
     """The declaration of a setting with a few possible values. An agent needs a feature for each value except the
     default.
     """
@@ -62,16 +62,16 @@ Phase1Tie = Literal["phase2", "pop"]
 Phase2Tie = Literal["oldest", "block"]
 
 
-def _timer(sentence: str) -> Number:
-    return Number(sentence, f"more than 0 seconds, at most {MAX_TIMER_S:g}", math.ulp(0.0), MAX_TIMER_S)
+def _timer(sentence: str) -> NumberSetting:
+    return NumberSetting(sentence, f"more than 0 seconds, at most {MAX_TIMER_S:g}", math.ulp(0.0), MAX_TIMER_S)
 
 
-def _size(sentence: str, most: str) -> Number:
-    return Number(sentence, f"1..{most}", 1, MAX_EVENT_DATA_BYTES, whole=True)
+def _size(sentence: str, most: str) -> NumberSetting:
+    return NumberSetting(sentence, f"1..{most}", 1, MAX_EVENT_DATA_BYTES, whole=True)
 
 
-def _reading(sentence: str, constant: str, values: tuple[bool, ...] | tuple[str, ...] = (False, True)) -> Choice:
-    return Choice(sentence, values, is_reading=True, always_written=True, constant=constant)
+def _reading(sentence: str, constant: str, values: tuple[bool, ...] | tuple[str, ...] = (False, True)) -> ChoiceSetting:
+    return ChoiceSetting(sentence, values, is_reading=True, always_written=True, constant=constant)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class Settings:
     phase3_timeout_s: Annotated[float, _timer("Duration of the phase 3 timer (Algorithm 16).")] = 5.0
     finalize_gap_s: Annotated[
         float,
-        Number(
+        NumberSetting(
             "Pause between the commits of Algorithm 20, so that other agents can follow (Section 4.2). 0 is no pause.",
             f"0..{MAX_TIMER_S:g} seconds",
             0,
@@ -113,14 +113,14 @@ class Settings:
     ] = False
     asks_after_commit: Annotated[
         bool,
-        Choice(
+        ChoiceSetting(
             "Algorithms 5, 7 and 20: a finalize gap after its commit, an agent asks which agents do not follow. An "
             "agent that has diverged then reconciles."
         ),
     ] = False
     top_needs_majority: Annotated[
         bool,
-        Choice(
+        ChoiceSetting(
             'Algorithm 15: "Is Top Of Chain" ends the search only if a vote would be approved: more than half of the '
             "agents have this very chain."
         ),
@@ -144,7 +144,7 @@ class Settings:
 
     answer_spread_s: Annotated[
         float,
-        Number(
+        NumberSetting(
             "Greatest wait before an answer is sent (Algorithms 3, 9, 13 and 17). Each answer waits for its own share "
             "of this time, so that the answers of many agents do not collide on a shared channel. 0 is no wait.",
             "at least 0 seconds, less than each of the four timers",
@@ -181,10 +181,12 @@ class Settings:
         return {name: value for name, value in values.items() if name not in ADDED or value != getattr(usual, name)}
 
 
-DECLARED: dict[str, Number | Choice] = {name: kind.__metadata__[0] for name, kind in Settings.__annotations__.items()}
+DECLARED: dict[str, NumberSetting | ChoiceSetting] = {
+    name: kind.__metadata__[0] for name, kind in Settings.__annotations__.items()
+}
 """Name of each setting -> its declaration."""
-NUMBERS = {name: declared for name, declared in DECLARED.items() if isinstance(declared, Number)}
-CHOICES = {name: declared for name, declared in DECLARED.items() if isinstance(declared, Choice)}
+NUMBERS = {name: declared for name, declared in DECLARED.items() if isinstance(declared, NumberSetting)}
+CHOICES = {name: declared for name, declared in DECLARED.items() if isinstance(declared, ChoiceSetting)}
 ADDED = (
     *(name for name, choice in CHOICES.items() if not choice.always_written),
     *(name for name, number in NUMBERS.items() if number.is_feature),

@@ -5,7 +5,7 @@ import reprlib
 MAX_CHARACTERS = 120
 
 
-class _Short(reprlib.Repr):
+class _ShortRepr(reprlib.Repr):
     def __init__(self) -> None:
         super().__init__()
         self.maxlevel = 2  # a few lines of YAML aliases can stand for gigabytes
@@ -24,5 +24,5 @@ def shown_key(key: object) -> str:
 
 def shown(value: object) -> str:
     """Return the `repr` of a value for an error message. A long text is shortened."""
-    text = _Short().repr(value)
+    text = _ShortRepr().repr(value)
     return text if len(text) <= MAX_CHARACTERS else f"{text[: MAX_CHARACTERS - 3]}..."

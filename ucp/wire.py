@@ -9,7 +9,7 @@ from enum import Enum
 from struct import Struct
 
 
-class Kind(Enum):
+class FieldKind(Enum):
     """The kind of a field in a message. For a field of fixed size, the value is its format in Python's `struct`,
     big-endian.
     """
@@ -30,9 +30,9 @@ class Kind(Enum):
     """The last field: the remaining bytes, a block."""
 
 
-Fields = Mapping[str, Kind]
+Fields = Mapping[str, FieldKind]
 
-VARIABLE = frozenset((Kind.OPTIONAL_HASH, Kind.BLOCK))
+VARIABLE = frozenset((FieldKind.OPTIONAL_HASH, FieldKind.BLOCK))
 """Kinds that have no fixed size."""
 
 

@@ -16,7 +16,7 @@ from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from harness.scenario.agent_options import Stagger
 from harness.sweep.matrix._estimate import METRICS, Figures, Metric, figure
-from harness.sweep.matrix._matrix_file import Matrix, Point, load_matrix
+from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint, load_matrix
 from harness.sweep.matrix.matrix_table import say_interval, say_mean
 from ucp.agent_files import write_atomically
 
@@ -52,7 +52,7 @@ class Task(NamedTuple):
     """One run of a matrix."""
 
     cure: str
-    point: Point
+    point: MatrixPoint
     seed: int
 
 

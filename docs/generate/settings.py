@@ -5,7 +5,7 @@ from pathlib import Path
 
 from docs.generate.matrix_thesis import put_between_markers
 from ucp.agent_files import write_atomically
-from ucp.settings import ADDED, ALTERNATIVES, DECLARED, Choice, Number, Settings
+from ucp.settings import ADDED, ALTERNATIVES, DECLARED, ChoiceSetting, NumberSetting, Settings
 
 PAGE = Path(__file__).parents[2] / "ucp" / "contract" / "CONTRACT.md"
 
@@ -19,9 +19,9 @@ def table() -> str:
 def _row(name: str) -> list[str]:
     declared = DECLARED[name]
     default = f"{_code(getattr(Settings(), name))}{', not written' if name in ADDED else ''}"
-    allowed = ", ".join(map(_code, declared.values)) if isinstance(declared, Choice) else declared.allowed
+    allowed = ", ".join(map(_code, declared.values)) if isinstance(declared, ChoiceSetting) else declared.allowed
     by_value = [f"`{feature}`" for feature, (setting, _) in ALTERNATIVES.items() if setting == name]
-    features = f"`{name}`" if isinstance(declared, Number) and declared.is_feature else ", ".join(by_value)
+    features = f"`{name}`" if isinstance(declared, NumberSetting) and declared.is_feature else ", ".join(by_value)
     return [f"`{name}`", allowed, default, features or "none", declared.sentence]
 
 

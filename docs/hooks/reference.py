@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from harness.json_schemas import generate
 from harness.scenario import Scenario
 from ucp.quirks import QUIRKS
-from ucp.settings import DECLARED, Number
+from ucp.settings import DECLARED, NumberSetting
 
 MARK = "<!-- keys -->"
 ABOUT = {
@@ -72,7 +72,7 @@ def _table(name: str, schema: dict[str, Any], models: dict[str, type[BaseModel]]
             or documented.get(f"{key}_")
             or (f"{declared.sentence}" if declared else "")
         )
-        kind = f"{_type(value)}, {declared.allowed}" if isinstance(declared, Number) else _type(value)
+        kind = f"{_type(value)}, {declared.allowed}" if isinstance(declared, NumberSetting) else _type(value)
         cells = (f"`{key}`", kind, default, text.replace("<", "&lt;"))
         rows.append("| " + " | ".join(" ".join(cell.replace("|", "\\|").split()) for cell in cells) + " |")
     return f"{about}\n\n" + "\n".join(rows)

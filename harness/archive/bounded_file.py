@@ -32,7 +32,7 @@ class BoundedFile(io.BufferedReader):
         """Open the file to read at most `most_bytes` of content. Raises OSError if it is not a readable regular
         file.
         """
-        self._content = _Content(path, most_bytes)
+        self._content = _LimitedContent(path, most_bytes)
         super().__init__(self._content, 16 * 1024)
 
     @property
@@ -45,7 +45,7 @@ class BoundedFile(io.BufferedReader):
         return self._content.problem
 
 
-class _Content(io.RawIOBase):
+class _LimitedContent(io.RawIOBase):
     def __init__(self, path: Path, most_bytes: int) -> None:
         self.problem = ""
         self._left = self._most = most_bytes

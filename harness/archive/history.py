@@ -60,7 +60,7 @@ class Vote:
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
+class ReconcilePhase:
     """A phase of a reconcile, with the number of its rounds."""
 
     name: PhaseName
@@ -80,12 +80,12 @@ class Reconcile:
     start_s: float
     end_s: float
     reason: str
-    phases: list[Phase]
+    phases: list[ReconcilePhase]
     done: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Commit:
+class BlockCommit:
     """The addition of a block to a chain. `how` is one of the values of COMMITTED_BY."""
 
     agent: int
@@ -114,7 +114,7 @@ class ActivityStart(NamedTuple):
     detail: str
 
 
-HistoryEvent = ActivityStart | Vote | Reconcile | Phase2Tie | Commit
+HistoryEvent = ActivityStart | Vote | Reconcile | Phase2Tie | BlockCommit
 """A change of an agent's history that one handler run causes."""
 
 
@@ -140,7 +140,7 @@ class History:
 
     votes: list[Vote]
     reconciles: list[Reconcile]
-    commits: list[Commit]
+    commits: list[BlockCommit]
     ties: list[Phase2Tie]
     messages: list[Message] | None
 
@@ -185,7 +185,7 @@ def _append(history: History, steps: Iterable[HistoryEvent]) -> None:
                 history.reconciles.append(step)
             case Phase2Tie():
                 history.ties.append(step)
-            case Commit():
+            case BlockCommit():
                 history.commits.append(step)
 
 
@@ -202,7 +202,7 @@ class HistoryReader:
         self._vote: tuple[str, float] | None = None
         self._reconcile: tuple[str, float] | None = None
         self._phase: tuple[PhaseName, float, int] | None = None
-        self._phases: list[Phase] = []
+        self._phases: list[ReconcilePhase] = []
 
     def feed(self, run: HandlerRun) -> Iterator[HistoryEvent]:
         """Yield the parts of the history that the next handler run begins or ends."""
@@ -219,7 +219,7 @@ class HistoryReader:
             yield from self._continue_reconcile(run)
         for operation, block in run.changes:
             if operation == "chain+":
-                yield Commit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
+                yield BlockCommit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
 
     def end(self, at_s: float) -> Iterator[HistoryEvent]:
         """Yield the vote and the reconcile that the end of the agent at `at_s` interrupts."""
@@ -251,7 +251,7 @@ class HistoryReader:
         if self._phase is not None:
             name, since_s, rounds = self._phase
             if at_s > since_s:
-                self._phases.append(Phase(name, since_s, at_s, rounds))
+                self._phases.append(ReconcilePhase(name, since_s, at_s, rounds))
             self._phase = None
 
     def _end_reconcile(self, at_s: float, *, done: bool) -> Iterator[Reconcile]:

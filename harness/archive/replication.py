@@ -39,7 +39,7 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -
         for incarnation, runs in enumerate(incarnations(trace), 1):
             steps += [(run.t, incarnation, agent, run) for run in runs if run.changes]
     steps.sort(key=lambda step: step[:3])
-    chains = _Chains(traces)
+    chains = _LivingChains(traces)
     states = [chains.replication(0.0)]
     for number, (at_s, incarnation, agent, step) in enumerate(steps):
         if isinstance(step, FaultRecord):
@@ -55,7 +55,7 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -
     return states
 
 
-class _Chains:
+class _LivingChains:
     """The chains of the living agents, with counts of the blocks in them.
 
     Each chain is a path of prefix numbers. Equal prefixes of different chains have the same number, so a common prefix

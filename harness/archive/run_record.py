@@ -29,11 +29,11 @@ AgentKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,4}$")]
 """The ID of an agent, or of its vehicle, as a JSON key."""
 
 
-class _Model(BaseModel):
+class _RecordModel(BaseModel):
     model_config = ConfigDict(extra="ignore", populate_by_name=True, allow_inf_nan=False)
 
 
-class FindingRecord(_Model):
+class FindingRecord(_RecordModel):
     """One piece of evidence. `block` is the name of the block, such as 4.11."""
 
     agent_id: int
@@ -44,7 +44,7 @@ class FindingRecord(_Model):
     """The event handler that the evidence concerns. null if it concerns none."""
 
 
-class CharacteristicRecord(_Model):
+class CharacteristicRecord(_RecordModel):
     """The judgement on one of the six characteristics (Section 4.3)."""
 
     name: str
@@ -53,7 +53,7 @@ class CharacteristicRecord(_Model):
     evidence: list[FindingRecord]
 
 
-class JudgementRecord(_Model):
+class JudgementRecord(_RecordModel):
     """The judgement of a further check: `steps`, `records` or `liveness`."""
 
     name: str
@@ -62,7 +62,7 @@ class JudgementRecord(_Model):
     evidence: list[FindingRecord]
 
 
-class NetworkState(_Model):
+class NetworkState(_RecordModel):
     """The state of the network from mission second `at_s` on.
 
     `what` names the change, and `detail` describes the state in words. `fully_connected` is true without any loss or
@@ -77,7 +77,7 @@ class NetworkState(_Model):
     """Mission second of the change in the scenario, if the change was made later."""
 
 
-class FaultRecord(_Model):
+class FaultRecord(_RecordModel):
     """A change of the network, or a fault of agents, at mission second `at_s`. `detail` describes it in words."""
 
     at_s: float
@@ -103,7 +103,7 @@ class FaultRecord(_Model):
         return self.kind.loses_data(self.disk)
 
 
-class FinalReconcile(_Model):
+class FinalReconcile(_RecordModel):
     """The final reconcile. `complete` is true if a last round of reconciles changed no chain."""
 
     at_s: float
@@ -111,7 +111,7 @@ class FinalReconcile(_Model):
     complete: bool
 
 
-class CycleStep(_Model):
+class CycleStep(_RecordModel):
     """A handler run in a cycle, `after_s` mission seconds after the start of a period. `branch` is null if no trace has
     it."""
 
@@ -121,7 +121,7 @@ class CycleStep(_Model):
     branch: str | None = None
 
 
-class CycleWait(_Model):
+class CycleWait(_RecordModel):
     """An agent that cannot finish. The agents in `for_agents` never answer its questions, and those in `refused_by`
     refuse its blocks."""
 
@@ -131,7 +131,7 @@ class CycleWait(_Model):
     """Also empty if no trace has the votes."""
 
 
-class Cycle(_Model):
+class Cycle(_RecordModel):
     """A sequence of handler runs that agents repeat without end, at the latest from mission second `since_s` on.
 
     `period_s` is null for a standstill: no message is under way, no timer runs, and `agents` are not idle. `proven` is
@@ -150,7 +150,7 @@ class Cycle(_Model):
     waits: list[CycleWait] = []
 
 
-class HandlerRuns(_Model):
+class HandlerRuns(_RecordModel):
     """Number of handler runs that an agent counted in one incarnation, until a moment between `from_s` and `until_s`.
 
     Both are equal if the agent reported its own mission time with the number.
@@ -161,7 +161,7 @@ class HandlerRuns(_Model):
     until_s: float
 
 
-class AgentRecord(_Model):
+class AgentRecord(_RecordModel):
     """The outcome of one agent: exported, not exported, killed, rebooting, crashed, hung, broken, not supported,
     paused, running or not started.
 
@@ -194,7 +194,7 @@ class AgentRecord(_Model):
     """Its last report in each incarnation. null for an incarnation without a report."""
 
 
-class CapturedFrames(_Model):
+class CapturedFrames(_RecordModel):
     """Number of frames at the interface of a vehicle (`received`), and number of those missing in its capture
     (`dropped`)."""
 
@@ -202,7 +202,7 @@ class CapturedFrames(_Model):
     dropped: int
 
 
-class ChannelLateness(_Model):
+class ChannelLateness(_RecordModel):
     """How late the process of a shared channel delivered messages, in mission seconds."""
 
     deliveries: int
@@ -233,7 +233,7 @@ class ChannelLateness(_Model):
         return f"{late}{missing if self.missed or self.unsent else ''}"
 
 
-class AnswerTimes(_Model):
+class AnswerTimes(_RecordModel):
     """How long agents took from the arrival of a question to their answer, in mission seconds."""
 
     count: int
@@ -242,7 +242,7 @@ class AnswerTimes(_Model):
     """One in twenty answers took longer."""
 
 
-class ChannelRecord(_Model):
+class ChannelRecord(_RecordModel):
     """Frames on a radio channel that all vehicles shared. `model` has the preset and all figures of the radio."""
 
     model: dict[str, Any]
@@ -276,7 +276,7 @@ class ChannelRecord(_Model):
         return sum((self.lost.get(reason) or self.dropped.get(reason, {})).values())
 
 
-class ReceiverCounters(_Model):
+class ReceiverCounters(_RecordModel):
     """Packets to one vehicle: numbers that the kernel passed, lost, and cut off by a partition. Further keys are the
     applied conditions."""
 
@@ -287,7 +287,7 @@ class ReceiverCounters(_Model):
     cut: int | None = None
 
 
-class Counters(_Model):
+class Counters(_RecordModel):
     """Counters of the kernel, by receiver."""
 
     model_config = ConfigDict(extra="allow")
@@ -295,7 +295,7 @@ class Counters(_Model):
     receivers: dict[AgentKey, ReceiverCounters] = {}
 
 
-class DatagramsRead(_Model):
+class DatagramsRead(_RecordModel):
     """UDP datagrams in the network of a vehicle, as the kernel counted them over the whole run.
 
     `broadcasts` datagrams arrived, also the agent's own ones. `read` datagrams were read, `before_start` of them before
@@ -311,7 +311,7 @@ class DatagramsRead(_Model):
     others: int = 0
 
 
-class BlockHolders(_Model):
+class BlockHolders(_RecordModel):
     """The vehicles that held a block directly after a loss of vehicles (`holders`), and at the end. `agent_id`
     completed it."""
 
@@ -322,7 +322,7 @@ class BlockHolders(_Model):
     holders_at_end: list[int]
 
 
-class Loss(_Model):
+class Loss(_RecordModel):
     """The loss of vehicles, with all their data, at mission second `at_s`. Counts are null if traces are missing.
 
     `completed` counts the blocks of all agents until then. Of these, `survived` counts blocks that another vehicle
@@ -341,7 +341,7 @@ class Loss(_Model):
     """Blocks that the lost vehicles completed, and blocks that are gone, oldest first."""
 
 
-class LeastHeld(_Model):
+class LeastHeld(_RecordModel):
     """The smallest set of vehicles whose loss would lose a block: the holders of the block with the fewest holders."""
 
     vehicles: int
@@ -355,7 +355,7 @@ class LeastHeld(_Model):
     """Number of all blocks."""
 
 
-class Survival(_Model):
+class Survival(_RecordModel):
     """The survival of blocks after losses of vehicles. `completed` counts all blocks, and `gone` those on no vehicle at
     the end.
 
@@ -369,7 +369,7 @@ class Survival(_Model):
     before_final_reconcile: LeastHeld | None = None
 
 
-class InjectedMessages(_Model):
+class InjectedMessages(_RecordModel):
     """Messages of one type in an injection: their number, and the handler runs that they caused.
 
     `handled` maps each branch of the handler to its number of runs. `changed` counts the runs that changed the data of
@@ -384,7 +384,7 @@ class InjectedMessages(_Model):
     unhandled: int | None = 0
 
 
-class RogueInjection(_Model):
+class RogueInjection(_RecordModel):
     """The effect of one injection. `refused` counts datagrams that are no message, by reason. Agents drop and count
     them.
 
@@ -404,7 +404,7 @@ class RogueInjection(_Model):
 WRITTEN_FROM_THE_START = ("scenario", "seed", "backend", "versions", "started_at")
 
 
-class JudgedRecord(_Model):
+class JudgedRecord(_RecordModel):
     """The part of a record that the checker needs."""
 
     schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
@@ -439,7 +439,7 @@ class JudgedRecord(_Model):
         return self.switched_off.get(agent_id, self.mission_s)
 
 
-class OperatorCommand(_Model):
+class OperatorCommand(_RecordModel):
     """A command of an operator at mission second `at_s`, repeated `times` times until `until_s`. `values` are the
     fields of the message."""
 
@@ -453,7 +453,7 @@ class OperatorCommand(_Model):
     values: dict[str, Any] = {}
 
 
-class GroundStationRecord(_Model):
+class GroundStationRecord(_RecordModel):
     """Traffic between the vehicles and a ground station, in datagrams. `dropped` datagrams were too many, or
     damaged."""
 

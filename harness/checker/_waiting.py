@@ -46,7 +46,7 @@ ALL_TIMERS = (*VOTE_TIMERS, *RECONCILE_TIMERS)
 
 
 @dataclass(slots=True)
-class _Wait:
+class _UnfinishedOperation:
     """A vote or reconcile of an agent that must continue within `longest` mission seconds after its last step."""
 
     what: str
@@ -67,8 +67,8 @@ def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
             continue  # only known names show the steps of votes and reconciles
         vote_s, reconcile_s = longest(trace, VOTE_TIMERS), longest(trace, RECONCILE_TIMERS)
         for incarnation in trace.incarnations():
-            vote = _Wait("a vote began and did not end", vote_s)
-            reconcile = _Wait("a reconcile did not continue", reconcile_s)
+            vote = _UnfinishedOperation("a vote began and did not end", vote_s)
+            reconcile = _UnfinishedOperation("a reconcile did not continue", reconcile_s)
             yield from _find_in_incarnation(evidence, agent_id, incarnation, vote, reconcile)
         whole = agent_id in evidence.exports and not trace.problem
         if whole and (ended_at_s := evidence.end_of(agent_id)) is not None:
@@ -76,7 +76,11 @@ def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _find_in_incarnation(
-    evidence: Evidence, agent_id: int, incarnation: Iterator[tuple[int, HandlerRun]], vote: _Wait, reconcile: _Wait
+    evidence: Evidence,
+    agent_id: int,
+    incarnation: Iterator[tuple[int, HandlerRun]],
+    vote: _UnfinishedOperation,
+    reconcile: _UnfinishedOperation,
 ) -> Iterator[Finding]:
     for line, run in incarnation:
         step = run.handler in STEPS
@@ -92,7 +96,7 @@ def _find_in_incarnation(
             reconcile.line, reconcile.since = line, run.t
 
 
-def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Wait) -> Iterator[Finding]:
+def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _UnfinishedOperation) -> Iterator[Finding]:
     for wait in waits:
         if now > wait.since + wait.longest:
             if not evidence.was_paused(agent_id, wait.since, now):

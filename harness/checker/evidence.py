@@ -41,7 +41,7 @@ from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun, SentMessage
 from ucp.trigger import MessageTrigger
 
 if TYPE_CHECKING:
-    from ucp.secure.crypto_suite import SignatureClaim
+    from ucp.secure.crypto_suite import UnverifiedSignature
 
 Derived = TypeVar("Derived")
 
@@ -72,7 +72,7 @@ class InjectedDatagram(BaseModel):
     injection: int | None = None
 
 
-class Condition(BaseModel):
+class NetworkLogEntry(BaseModel):
     """A line of `network.jsonl`: a change of the network, or a fault of agents."""
 
     model_config = ConfigDict(extra="ignore")
@@ -131,14 +131,14 @@ class Evidence:
     errors: list[str] = field(default_factory=list)
     before_final_reconcile: dict[int, Export] = field(default_factory=dict)
     injected: RogueTraffic = field(default_factory=RogueTraffic)
-    conditions: list[Condition] | None = None
+    conditions: list[NetworkLogEntry] | None = None
     """The lines of `network.jsonl`. None without this file."""
     captures: Captures | None = None
     lag: MeasuredLag | None = None
     """The measured lag of machine and agents. None if it was not measured."""
     keys: TrustedKeys | None = None
     """The public keys of a secured mission, which verify the signatures of blocks and exports."""
-    verified: "Callable[[SignatureClaim], bool] | None" = None
+    verified: "Callable[[UnverifiedSignature], bool] | None" = None
     """A function that returns true for a valid signature without verifying it, for a swarm played in this process."""
     watch: Watch | None = None
     """A function that gets each step of the step judge."""
@@ -407,7 +407,7 @@ def gather(archive: RunArchive) -> Evidence:
         problems,
         archive.before_final_reconcile,
         injected,
-        archive.conditions(Condition),
+        archive.conditions(NetworkLogEntry),
         _captures(archive),
         archive.lag(),
         TrustedKeys(archive.public_keys, archive.anchor) if archive.public_keys else None,
@@ -439,7 +439,7 @@ def check_variant(archive: RunArchive) -> None:
 
 def _link_losses(archive: RunArchive) -> list[tuple[float, dict[Link, float]]]:
     """Return the loss rate of each link over time, or an empty list if the computation would take too long."""
-    changes = len(archive.conditions(Condition) or ())
+    changes = len(archive.conditions(NetworkLogEntry) or ())
     if changes * len(archive.roster) ** 2 > MAX_LINK_CHANGES:
         return []
     return [*archive.link_losses(archive.roster)]

@@ -54,7 +54,7 @@ _Key = tuple[Any, Any, Any]
 
 
 @dataclass
-class _Tally:
+class _InjectionTally:
     sent: Counter[str] = field(default_factory=Counter)
     bytes: int = 0
     refused: Counter[str] = field(default_factory=Counter)
@@ -70,7 +70,7 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
     injections = injections_of(scenario)
     if not injections:
         return []
-    tallies = {injection.number: _Tally() for injection in injections}
+    tallies = {injection.number: _InjectionTally() for injection in injections}
     has_unknown_names = any(
         {"message", "trigger"} & unknown_names(trace.runs).keys() for trace in archive.traces.values()
     )
@@ -114,7 +114,9 @@ def describe_handling(messages: InjectedMessages) -> str:
     )
 
 
-def _count_line(line: _RogueLine, tally: _Tally, copies: dict[_Key, list[tuple[float, int]]], *, secured: bool) -> None:
+def _count_line(
+    line: _RogueLine, tally: _InjectionTally, copies: dict[_Key, list[tuple[float, int]]], *, secured: bool
+) -> None:
     tally.bytes += line.bytes
     if isinstance(line.refused, str):
         tally.refused[line.refused] += 1
@@ -158,7 +160,7 @@ def _pair_with_copies(
             yield number, copy, left.pop()
 
 
-def _to_record(at_s: float, what: str, detail: str, tally: _Tally, has_unknown_names: bool) -> RogueInjection:
+def _to_record(at_s: float, what: str, detail: str, tally: _InjectionTally, has_unknown_names: bool) -> RogueInjection:
     """Return the record of an injection's effect. `has_unknown_names` is true if traces contain undefined message
     names.
     """

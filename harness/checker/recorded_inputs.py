@@ -77,7 +77,7 @@ def stored_blocks(record: RecordedBytes | None) -> Iterator[Block]:
         offset = end
 
 
-class Blocks:
+class BlockIndex:
     """An index of all blocks on record by hash. They come from exports and from messages."""
 
     def __init__(self, exported: Iterable[ExportedBlock]) -> None:

@@ -16,7 +16,7 @@ from ucp.block import Block
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.crypto_suite import SignatureClaim
+    from ucp.secure.crypto_suite import UnverifiedSignature
     from ucp.secure.export_head import ExportHead
 
 _Content = tuple[int, int, str, str, str | None]
@@ -88,7 +88,7 @@ def vouch(exports: Iterable[Export], keys: TrustedKeys | None) -> tuple[list[str
 class SignatureChecks:
     """Checks of the signatures in exports. Each signature is verified once."""
 
-    def __init__(self, keys: "PublicKeys", verified: "Callable[[SignatureClaim], bool] | None" = None) -> None:
+    def __init__(self, keys: "PublicKeys", verified: "Callable[[UnverifiedSignature], bool] | None" = None) -> None:
         from ucp.secure.crypto_suite import verify
 
         self._keys = keys

@@ -13,7 +13,7 @@ from harness.errors import MachineError, RunDirectoryError, ScenarioError, extra
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
     from ucp.secure.sealing import Depot
 
 RARE = "Rare options"
@@ -52,7 +52,7 @@ def _may_hold_scenario(path: Path) -> bool:
     return not path.name.startswith(".") and (path.is_dir() or path.suffix in (".yaml", ".yml"))
 
 
-def opener_of(bundle: Path | None) -> "Opener | None":
+def opener_of(bundle: Path | None) -> "DatagramOpener | None":
     """Return an object that decrypts the datagrams of a secured mission, or None without a key file. Raises KeysError,
     MachineError.
     """
@@ -62,9 +62,9 @@ def opener_of(bundle: Path | None) -> "Opener | None":
         from harness.play.keyring import KeysError
         from ucp.secure.bundle import load_bundle
         from ucp.secure.keyfile import KeyFileError
-        from ucp.secure.opening import Opener
+        from ucp.secure.opening import DatagramOpener
     try:
-        return Opener(load_bundle(bundle))
+        return DatagramOpener(load_bundle(bundle))
     except KeyFileError as error:
         raise KeysError(f"--bundle: {error}") from None
 

@@ -13,7 +13,7 @@ from harness.errors import WRONG_REQUEST, ExportError
 from harness.report import logbook
 from harness.report.logbook.logbook_text import document, lines
 from harness.report.logbook.map_files import geojson, kml
-from harness.report.logbook.positions import Track, recorded_tracks, tracks
+from harness.report.logbook.positions import EventTrack, recorded_tracks, tracks
 
 
 def chain_command(
@@ -49,7 +49,7 @@ def chain_command(
 
 
 def _write_maps(
-    map_tracks: list[Track], shown: logbook.Logbook, geojson_file: Path | None, kml_file: Path | None
+    map_tracks: list[EventTrack], shown: logbook.Logbook, geojson_file: Path | None, kml_file: Path | None
 ) -> None:
     """Write the paths of vehicles to the requested files. Raises ExportError if there are none."""
     if not map_tracks:

@@ -12,7 +12,7 @@ from harness.commands._shared_options import refuse_existing, write_new
 from harness.commands.terminal import complain, output, print_json
 from harness.conformance.conformance_page import read_agents, to_html
 from harness.conformance.conformance_run import ConformanceRequest, conform
-from harness.conformance.results import TITLES, Results
+from harness.conformance.results import TITLES, ConformanceResults
 from harness.conformance.results_table import progress, render, summary, to_junit
 from harness.conformance.vectors import generate, to_lines
 from harness.errors import HarnessError, MachineError
@@ -99,7 +99,7 @@ def conformance_command(
 def _test_all(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *, virtual: bool) -> int:
     """Test each agent, write the page with all results, and return the highest exit status."""
     console = output(highlight=False)
-    outcomes: dict[str, Results | str] = {}
+    outcomes: dict[str, ConformanceResults | str] = {}
     for name, command in agents.items():
         with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as show:
             try:
@@ -111,11 +111,11 @@ def _test_all(agents: Mapping[str, Sequence[str]], only: str | None, page: Path,
                 outcomes[name] = str(error)
         outcome = outcomes[name]
         console.print(Text(f"{name}: {outcome if isinstance(outcome, str) else summary(outcome)}"), soft_wrap=True)
-        if isinstance(outcome, Results) and outcome.interrupted:
+        if isinstance(outcome, ConformanceResults) and outcome.interrupted:
             break
     write_new(page, [to_html(outcomes)])
     console.print(Text(str(page)), soft_wrap=True)
-    statuses = [outcome.exit_status if isinstance(outcome, Results) else 2 for outcome in outcomes.values()]
+    statuses = [outcome.exit_status if isinstance(outcome, ConformanceResults) else 2 for outcome in outcomes.values()]
     return max(statuses, default=0)
 
 

@@ -18,7 +18,7 @@ from harness.field.depot.consolidation import Consolidation, consolidate
 from harness.field.depot.record_lines import ReconcileResult
 from harness.field.depot.record_outputs import in_words
 from harness.report.logbook.map_files import geojson, kml
-from harness.report.logbook.positions import Track
+from harness.report.logbook.positions import EventTrack
 
 if TYPE_CHECKING:
     from harness.field.depot.depot_reconcile import Reconciliation
@@ -119,7 +119,7 @@ def _write_outputs(
         yield from _maps(_tracks(record), {kml_file: kml, geojson_file: _geojson})
 
 
-def _tracks(record: Consolidation) -> list[Track]:
+def _tracks(record: Consolidation) -> list[EventTrack]:
     """Return the logged paths of vehicles, and those in flight logs of vehicles that logged no position."""
     logged = record_outputs.tracks(record)
     known = {track.agent_id for track in logged}
@@ -127,7 +127,7 @@ def _tracks(record: Consolidation) -> list[Track]:
     return [*logged, *(track for track in flown if track.agent_id not in known)]
 
 
-def _maps(tracks: list[Track], forms: dict[Path | None, Callable[[Iterable[Track]], str]]) -> Iterator[str]:
+def _maps(tracks: list[EventTrack], forms: dict[Path | None, Callable[[Iterable[EventTrack]], str]]) -> Iterator[str]:
     if not tracks:
         yield NO_MAP
         return
@@ -137,5 +137,5 @@ def _maps(tracks: list[Track], forms: dict[Path | None, Callable[[Iterable[Track
             yield f"{path}: {sum(len(track.fixes) for track in tracks)} positions of {len(tracks)} vehicles"
 
 
-def _geojson(tracks: Iterable[Track]) -> str:
+def _geojson(tracks: Iterable[EventTrack]) -> str:
     return json.dumps(geojson(tracks), ensure_ascii=False) + "\n"

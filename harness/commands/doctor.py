@@ -11,7 +11,7 @@ from harness.commands.terminal import output, print_json
 from harness.errors import CANNOT_HERE, VIOLATED
 from harness.play.machine import capabilities
 from harness.play.machine.capabilities import examine
-from harness.play.machine.uml_kernel import Kernel, run_inside
+from harness.play.machine.uml_kernel import UmlKernel, run_inside
 
 
 def doctor_command(
@@ -20,14 +20,14 @@ def doctor_command(
         bool, typer.Option("--measure", help="Also measure what the network does to packets; up to a minute.")
     ] = False,
     kernel: Annotated[
-        Kernel, typer.Option(help="Kernel to examine: this machine's, or User Mode Linux.")
-    ] = Kernel.host,
+        UmlKernel, typer.Option(help="Kernel to examine: this machine's, or User Mode Linux.")
+    ] = UmlKernel.host,
 ) -> None:
     """Report what this machine can do, and how to enable the rest.
 
     Exit status 0: this machine can play runs. 1: with --measure, an engine deviates. 3: a needed feature is missing.
     """
-    if kernel is Kernel.uml:
+    if kernel is UmlKernel.uml:
         asked = {"--json": as_json, "--measure": measure}
         raise typer.Exit(run_inside(["doctor", *(option for option, wanted in asked.items() if wanted)]))
     requirements = examine()

@@ -13,7 +13,7 @@ from harness.archive.packets.capture_files import Captures, capture_files, read_
 from harness.archive.packets.channel_losses import channel_losses
 from harness.archive.packets.exchanges import RequestAnswers, count_losses, loss_matrix
 from harness.archive.packets.packets_document import document
-from harness.archive.packets.packets_text import Paint, TransmissionText
+from harness.archive.packets.packets_text import Paint, TransmissionFormatter
 from harness.archive.packets.selection import MessageFilter, exchanges_about, in_order
 from harness.archive.packets.transmissions import join
 from harness.commands._shared_options import BundleOption, opener_of
@@ -70,7 +70,7 @@ def _output_lines(
         listed = shown if chapters is None else in_order(chapters)
         yield from document(captures, count_losses(selected), listed, exchanges, names, losses)
         return
-    texts = TransmissionText(names, _paint(), losses)
+    texts = TransmissionFormatter(names, _paint(), losses)
     yield packets_text.header(captures)
     if chapters is not None:
         yield from packets_text.exchange_lines(chapters, exchanges, texts)

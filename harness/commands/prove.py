@@ -12,7 +12,7 @@ from harness import proof as prove
 from harness.commands._shared_options import RARE
 from harness.commands.terminal import StatusLine, complain, output, print_json
 from harness.errors import INTERRUPTED
-from harness.proof import Bounds, BoundsError, Limits, Progress, original, specification
+from harness.proof import Bounds, BoundsError, ExplorationProgress, Limits, original, specification
 from harness.run.parallel import cores, sigterm_as_ctrl_c
 
 GIGABYTE = 1e9
@@ -200,7 +200,7 @@ def _pairs(option: str, texts: list[str] | None) -> dict[str, Any]:
     return pairs
 
 
-def _progress_text(progress: Progress) -> str:
+def _progress_text(progress: ExplorationProgress) -> str:
     if progress.asked is not None:
         return f"{progress.states:,} states, all explored; now checking: {progress.asked}"
     frontier = progress.states - progress.looked_at

@@ -37,7 +37,7 @@ from harness.report.live.server_process import require_packages
 from harness.run.provenance import differing_versions, same_judge, versions
 
 if TYPE_CHECKING:
-    from harness.report.live.feed import Feed
+    from harness.report.live.feed import ChangeFeed
 
 
 def report_command(run: Annotated[Path, typer.Argument(help="Run directory.")]) -> None:
@@ -125,9 +125,9 @@ def watch_command(
     The film shows map, links, chains, votes and reconciles. Ctrl-C ends the command.
     """
     require_packages()
-    from harness.report.live.feed import Feed
+    from harness.report.live.feed import ChangeFeed
 
-    feed = Feed(run)
+    feed = ChangeFeed(run)
     with closing(feed):
         try:
             asyncio.run(_show(feed, run, port))
@@ -135,13 +135,13 @@ def watch_command(
             raise typer.Exit(0) from None
 
 
-async def _show(feed: "Feed", run: Path, port: int) -> None:
+async def _show(feed: "ChangeFeed", run: Path, port: int) -> None:
     from harness.report.live.change_log import ChangeLog
     from harness.report.live.feed_to_log import copy_finished_run
-    from harness.report.live.server import Server
+    from harness.report.live.server import LivePageServer
 
     with closing(ChangeLog()) as log:
-        async with Server(log, run, live=False).open(port) as address:
+        async with LivePageServer(log, run, live=False).open(port) as address:
             show_address(output(), address)
             await copy_finished_run(feed, log)
             await asyncio.Event().wait()

@@ -21,7 +21,7 @@ from harness.errors import HarnessError, ScenarioError
 from harness.play import progress
 from harness.play.backends import BACKENDS
 from harness.play.interventions import Interventions
-from harness.play.machine.uml_kernel import OUT, Kernel, run_inside
+from harness.play.machine.uml_kernel import OUT, UmlKernel, run_inside
 from harness.play.trace_space import space_sentence
 from harness.report.facts import gaps
 from harness.report.live.server_process import live_page
@@ -96,8 +96,9 @@ def run_command(
         typer.Option(metavar="FILE", rich_help_panel=RARE, help="Write a docker compose file, and run nothing."),
     ] = None,
     kernel: Annotated[
-        Kernel, typer.Option(rich_help_panel=RARE, help="This machine's kernel, or User Mode Linux, which has netem.")
-    ] = Kernel.host,
+        UmlKernel,
+        typer.Option(rich_help_panel=RARE, help="This machine's kernel, or User Mode Linux, which has netem."),
+    ] = UmlKernel.host,
 ) -> None:
     """Play a scenario, judge it, and write a report.
 
@@ -116,7 +117,7 @@ def run_command(
     if emit_compose is not None:
         _emit_compose(console, request, chosen_seed, emit_compose)
         return
-    if kernel is Kernel.uml:
+    if kernel is UmlKernel.uml:
         if by_hand:
             raise ScenarioError(
                 "--by-hand does not work with --kernel uml, because commands do not reach a run "

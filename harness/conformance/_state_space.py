@@ -141,7 +141,7 @@ def key_of(state: AgentState, given: AgentInput) -> VectorKey:
 
 
 @dataclass(frozen=True)
-class Transition:
+class AgentTransition:
     """A transition between two states: the input in `key` leads from `before` to `after`."""
 
     key: VectorKey
@@ -176,7 +176,7 @@ def advance(model: ReferenceModel, given: AgentInput, now: float) -> tuple[Expec
     return model.feed(action, now, timestamp_us=round(now * 1_000_000)), now
 
 
-def explore(variant: SettingsVariant) -> Iterator[Transition]:
+def explore(variant: SettingsVariant) -> Iterator[AgentTransition]:
     """Yield each generated test once, with a shortest sequence of inputs that leads to it. Each call gives the same
     result.
     """
@@ -205,7 +205,7 @@ def explore(variant: SettingsVariant) -> Iterator[Transition]:
             outcome, then = advanced
             seen.add(key)
             after = state_of(model)
-            yield Transition(key, path, before, after, outcome, expired)
+            yield AgentTransition(key, path, before, after, outcome, expired)
             if after not in reached:
                 reached.add(after)
                 waiting.append((after, (*path, given.name), ModelSnapshot(model), then))

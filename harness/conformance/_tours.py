@@ -16,7 +16,7 @@ from harness.conformance._agent_under_test import AgentUnderTest
 from harness.conformance._alphabet import INPUTS, TIMER
 from harness.conformance._observation import RecordedDatagram, TestedStep
 from harness.conformance._reference_model import ReferenceModel
-from harness.conformance._state_space import AgentState, SettingsVariant, Transition, VectorKey, key_of, state_of
+from harness.conformance._state_space import AgentState, AgentTransition, SettingsVariant, VectorKey, key_of, state_of
 
 TIMER_COSTS = 10.0
 """Cost of the expiry of a timer on a path. A cost is about one mission second."""
@@ -48,7 +48,7 @@ class VectorMap:
     them.
     """
 
-    def __init__(self, variant: SettingsVariant, transitions: list[Transition], wanted: set[VectorKey]) -> None:
+    def __init__(self, variant: SettingsVariant, transitions: list[AgentTransition], wanted: set[VectorKey]) -> None:
         self.variant = variant
         self.start = state_of(ReferenceModel(variant.settings))
         self._unseen: dict[tuple[str, tuple[str | int, ...]], set[VectorKey]] = defaultdict(set)

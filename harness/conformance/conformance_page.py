@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.conformance.results import FURTHER_CHECKS, TITLES, AlgorithmCounts, Results
+from harness.conformance.results import FURTHER_CHECKS, TITLES, AlgorithmCounts, ConformanceResults
 from harness.conformance.results_table import headline
 from harness.errors import HarnessError, ScenarioError
 from harness.report import html
@@ -56,9 +56,9 @@ def read_agents(path: Path) -> dict[str, list[str]]:
     return {name: list(command) for name, command in document.items()}
 
 
-def to_html(results: Mapping[str, Results | str]) -> str:
+def to_html(results: Mapping[str, ConformanceResults | str]) -> str:
     """Return the HTML page. An agent that could not be tested has a sentence in place of results."""
-    tested = {name: result for name, result in results.items() if isinstance(result, Results)}
+    tested = {name: result for name, result in results.items() if isinstance(result, ConformanceResults)}
     rows = {name: {row.algorithm: row for row in result.rows()} for name, result in tested.items()}
     numbers = [number for number in (*sorted(TITLES), FURTHER_CHECKS) if any(number in each for each in rows.values())]
     failed = sum(len(result.failures) for result in tested.values())
@@ -89,7 +89,7 @@ def _table_cell(row: AlgorithmCounts | None, tested: bool) -> TableCell:
     return TableCell("not applicable" if row.not_applicable else "not tried", "")
 
 
-def _notes(result: Results | str) -> Sequence[str]:
+def _notes(result: ConformanceResults | str) -> Sequence[str]:
     if isinstance(result, str):
         return [result]
     failures = [headline(case) for case in result.failures[:FAILURES_SHOWN]]

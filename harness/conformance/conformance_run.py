@@ -22,7 +22,7 @@ from harness.conformance._suite import (
     VectorSuite,
 )
 from harness.conformance._udp_lab import UdpLab
-from harness.conformance.results import FURTHER_CHECKS, AlgorithmCounts, CaseResult, Results
+from harness.conformance.results import FURTHER_CHECKS, AlgorithmCounts, CaseResult, ConformanceResults
 from harness.conformance.vectors import VectorSet, generate
 from harness.errors import MachineError
 
@@ -54,13 +54,13 @@ def conform(
     place: Path,
     show_progress: Callable[[int, int], None],
     vector_sets: Sequence[VectorSet] | None = None,
-) -> Results:
+) -> ConformanceResults:
     """Test an agent, and return the results. Raises MachineError, NoAgentError.
 
     `show_progress` receives the number of passed vectors, and the number of all vectors. `vector_sets` replace the
     vectors that the request selects.
     """
-    results = Results(request.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
+    results = ConformanceResults(request.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
     began = time.monotonic()
     try:
         chosen = generate(request.only) if vector_sets is None else vector_sets
@@ -78,7 +78,7 @@ async def _run(
     place: Path,
     vector_sets: Sequence[VectorSet],
     show_progress: Callable[[int], None],
-    results: Results,
+    results: ConformanceResults,
 ) -> None:
     until = time.monotonic() + request.limit_s
     if request.virtual:
@@ -105,14 +105,16 @@ async def _run(
             results.cases += await handwritten(lab, request.only)
 
 
-async def _play(suite: VectorSuite, until: float, request: ConformanceRequest, results: Results) -> None:
+async def _play(suite: VectorSuite, until: float, request: ConformanceRequest, results: ConformanceResults) -> None:
     try:
         await suite.run(until)
     finally:
         _conclude(suite.variant_results, request, results)
 
 
-def _conclude(variant_results: Sequence[VariantResult], request: ConformanceRequest, results: Results) -> None:
+def _conclude(
+    variant_results: Sequence[VariantResult], request: ConformanceRequest, results: ConformanceResults
+) -> None:
     evidence = BlameEvidence(variant_results)
     for variant_result in variant_results:
         failed = {failure.observation.key for failure in variant_result.failures}
@@ -168,7 +170,7 @@ def _case(failure: ConfirmedFailure, evidence: BlameEvidence) -> CaseResult:
     )
 
 
-def _keep_failures(results: Results, request: ConformanceRequest) -> None:
+def _keep_failures(results: ConformanceResults, request: ConformanceRequest) -> None:
     """Write the files of each failure. If the disk refuses a file, add a note to the results."""
     if request.keep is None:
         return

@@ -92,7 +92,7 @@ class AlgorithmCounts:
 
 
 @dataclass
-class Results:
+class ConformanceResults:
     """The results of a conformance test of one agent."""
 
     command: Sequence[str]

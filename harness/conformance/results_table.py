@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from harness.conformance.results import AlgorithmCounts, CaseResult, Results
+from harness.conformance.results import AlgorithmCounts, CaseResult, ConformanceResults
 from harness.errors import CANNOT_HERE
 from harness.present.junit import JunitCase as JunitCase
 from harness.present.junit import to_xml
@@ -23,7 +23,7 @@ NOT_TRIED = (
 )
 
 
-def render(results: Results) -> RenderableType:
+def render(results: ConformanceResults) -> RenderableType:
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
     table.add_column("Algorithm")
     for head in ("passed", "failed", "not applicable", "not tried"):
@@ -46,7 +46,7 @@ def render(results: Results) -> RenderableType:
     return Group(*parts)
 
 
-def summary(results: Results) -> str:
+def summary(results: ConformanceResults) -> str:
     rows = results.rows()
     passed, failed = sum(row.passed for row in rows), sum(row.failed for row in rows)
     words = f"{passed} passed, {failed} failed"
@@ -93,14 +93,14 @@ def _failure(case: CaseResult) -> list[Text]:
     return [Text(f"✘ {first}", style="bold red"), *(Text(line) for line in others)]
 
 
-def to_junit(results: Results) -> str:
+def to_junit(results: ConformanceResults) -> str:
     """Return JUnit XML with a test case for each failure, for each handwritten test, and for all generated tests of
     each Algorithm.
     """
     return to_xml("conformance", "conformance", results.started_at, results.wall_s, _junit_cases(results))
 
 
-def _junit_cases(results: Results) -> Iterator[JunitCase]:
+def _junit_cases(results: ConformanceResults) -> Iterator[JunitCase]:
     for number, row in sorted(results.counted.items()):
         algorithm = f"Algorithm {row.title}: " if number else ""
         if row.passed:

@@ -21,8 +21,8 @@ from typing import Any
 from harness.conformance._reference_model import ExpectedOutcome
 from harness.conformance._state_space import (
     VARIANTS,
+    AgentTransition,
     SettingsVariant,
-    Transition,
     VectorKey,
     explore,
     handlers_and_messages,
@@ -35,13 +35,13 @@ class VectorSet:
     """The generated tests for one combination of settings."""
 
     variant: SettingsVariant
-    steps: Sequence[Transition]
+    steps: Sequence[AgentTransition]
     """All transitions of the state space."""
-    wanted: Mapping[VectorKey, Transition]
+    wanted: Mapping[VectorKey, AgentTransition]
     """The transitions that are vectors. The others only lead to them."""
 
     @cached_property
-    def by_key(self) -> dict[VectorKey, Transition]:
+    def by_key(self) -> dict[VectorKey, AgentTransition]:
         return {step.key: step for step in self.steps}
 
 

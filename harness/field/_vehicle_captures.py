@@ -14,7 +14,7 @@ from ucp.secure.envelope import CONTROL_NAMES
 from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
 
 NANOSECONDS = 1_000_000_000
 
@@ -41,7 +41,9 @@ class AgentCapture:
     """Number of sealed datagrams that no given key decrypts."""
 
 
-def read_capture(path: Path, agent_id: int, epoch_us: int | None, opener: "Opener | None" = None) -> AgentCapture:
+def read_capture(
+    path: Path, agent_id: int, epoch_us: int | None, opener: "DatagramOpener | None" = None
+) -> AgentCapture:
     """Read the capture of an agent. Raises CaptureError."""
     capture_file = Capture(0, path)
     capture_file.read({}, most_frames=1)

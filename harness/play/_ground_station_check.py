@@ -2,7 +2,7 @@
 
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
-from sitl.address import Address, connected
+from sitl.address import ListenAddress, connected
 from sitl.vehicle import VehicleError
 
 
@@ -16,6 +16,6 @@ def refuse_unreachable_ground_station(scenario: Scenario) -> None:
             "station, or give another kind"
         )
     try:
-        connected(Address.parse(scenario.gcs)).close()
+        connected(ListenAddress.parse(scenario.gcs)).close()
     except VehicleError as error:
         raise ScenarioError(str(error)) from None

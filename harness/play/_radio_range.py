@@ -13,7 +13,7 @@ from harness.scenario.changes import RANGE, NetworkChange
 from netem import radio
 from netem.conditions import NetworkConditions
 from netem.radio import Place
-from sitl.track import Track, track
+from sitl.track import VehicleTrack, track
 from sitl.vehicle import place_in_field
 
 TRACK_S = 1.0
@@ -69,7 +69,7 @@ def groups_text(components: Iterable[Iterable[int]]) -> str:
     return " | ".join(" ".join(map(str, sorted(component))) for component in components)
 
 
-def tracks_of(scenario: Scenario) -> dict[int, Track]:
+def tracks_of(scenario: Scenario) -> dict[int, VehicleTrack]:
     """Return the flight path of each vehicle in virtual time.
 
     Empty if the scenario has no flight, radio, channel or ground station that needs positions.
@@ -79,7 +79,7 @@ def tracks_of(scenario: Scenario) -> dict[int, Track]:
     return {vehicle: track_of(scenario, vehicle) for vehicle in scenario.roster}
 
 
-def track_of(scenario: Scenario, vehicle: int) -> Track:
+def track_of(scenario: Scenario, vehicle: int) -> VehicleTrack:
     """Return the computed flight path of a vehicle that takes off at mission second 0."""
     vehicles, flight = scenario.vehicles, scenario.flight_of(vehicle)
     index = scenario.roster.index(vehicle)

@@ -24,13 +24,13 @@ LOAD_S = 1.0
 _WORD_BITS = 32
 
 
-class _Sent(Protocol):
+class _SentFrame(Protocol):
     @property
     def sequence(self) -> int | None:
         """The sequence number of an agent's message, or None for another sender's datagram."""
 
 
-Message = TypeVar("Message", bound=_Sent)
+Message = TypeVar("Message", bound=_SentFrame)
 
 
 class ChannelTraffic(Generic[Message]):

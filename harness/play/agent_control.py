@@ -102,7 +102,7 @@ def _version_line(version: Any) -> str | None:
     return " ".join("".join(filter(str.isprintable, word)) for word in version.split())[:VERSION_CHARACTERS] or None
 
 
-class Status(BaseModel):
+class AgentStatus(BaseModel):
     """The status of an agent as it reports it (see ucp/contract/CONTRACT.md). Optional fields have a default."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)

@@ -14,7 +14,7 @@ from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
 from harness.play._pace import VirtualTimePace
 from harness.play.mission import Swarm
-from harness.play.progress import Progress
+from harness.play.progress import ProgressDisplay
 from harness.scenario import Scenario
 
 
@@ -44,7 +44,7 @@ class Backend(ABC):
         scenario: Scenario,
         seed: int,
         rundir: RunDirectory,
-        progress: Progress,
+        progress: ProgressDisplay,
         interrupted: asyncio.Event,
         *,
         interactive: bool = False,

@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from harness.play.agent_control import Status
+from harness.play.agent_control import AgentStatus
 
 LINE_EVERY_S = 10.0
 
@@ -27,11 +27,11 @@ class SwarmSnapshot:
     mission_s: float
     duration_s: float
     network: str
-    statuses: Mapping[int, Status | None]
+    statuses: Mapping[int, AgentStatus | None]
     """Agent -> its last status. None before the first one."""
 
 
-class Progress(Protocol):
+class ProgressDisplay(Protocol):
     """A display of the progress of a run."""
 
     def show(self, snapshot: SwarmSnapshot) -> None: ...
@@ -104,7 +104,7 @@ class ProgressTable:
         self._live.stop()
 
 
-def for_console(console: Console) -> Progress:
+def for_console(console: Console) -> ProgressDisplay:
     return ProgressTable(console) if console.is_terminal else ProgressLines(console)
 
 

@@ -12,9 +12,9 @@ the swarm and the behaviour of the network. The sub-packages:
 - `specification`: the same bounds in TLA+, as a second opinion.
 """
 
-from harness.proof._progress_bar import Progress
+from harness.proof._progress_bar import ExplorationProgress
 from harness.proof._proof import Limits, Proof, prove
 from harness.proof._proof_text import in_words
 from harness.proof.bounds import Bounds, BoundsError, Network
 
-__all__ = ["Bounds", "BoundsError", "Limits", "Network", "Progress", "Proof", "in_words", "prove"]
+__all__ = ["Bounds", "BoundsError", "ExplorationProgress", "Limits", "Network", "Proof", "in_words", "prove"]

@@ -16,7 +16,7 @@ Ended = Literal["complete", "flaw", "memory", "time", "interrupted"]
 
 
 @dataclass(frozen=True)
-class Progress:
+class ExplorationProgress:
     """The progress of an exploration: the numbers of known states, explored states and transitions, and the search
     depth.
 

@@ -8,7 +8,13 @@ from typing import Any
 
 from harness.archive.directory import default_path
 from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED, HarnessError
-from harness.proof._progress_bar import Ended, ExplorationBudget, ExplorationFigures, LimitReachedError, Progress
+from harness.proof._progress_bar import (
+    Ended,
+    ExplorationBudget,
+    ExplorationFigures,
+    ExplorationProgress,
+    LimitReachedError,
+)
 from harness.proof.bounds import Bounds, BoundsError
 from harness.proof.examples._example import ViolationExample, keep, play
 from harness.proof.examples._path_script import NO_CLOCKS, PathScript
@@ -205,7 +211,7 @@ def prove(
     limits: Limits = Limits(),
     out: Path | None = None,
     *,
-    watch: Callable[[Progress], None] = lambda progress: None,
+    watch: Callable[[ExplorationProgress], None] = lambda progress: None,
 ) -> Proof:
     """Explore every state that agents can reach within `bounds`, check each one, and return the result.
 
@@ -226,7 +232,7 @@ def prove(
         raise HarnessError(f"{error}") from None
 
 
-def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Progress], None]) -> Proof:
+def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[ExplorationProgress], None]) -> Proof:
     name, path = _claimed(bounds, out)
     began_s = time.process_time()
     found = collect(bounds, most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
@@ -265,7 +271,7 @@ def _claimed(bounds: Bounds, out: Path | None) -> tuple[str, Path]:
     return name, choose_path(out or default_path(name).with_suffix(".yaml"), name)
 
 
-def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Progress], None]) -> Proof:
+def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[ExplorationProgress], None]) -> Proof:
     name, path = _claimed(bounds, out)
     began_s = time.process_time()
     swarm = ModelSwarm(bounds)

@@ -10,7 +10,7 @@ import pytest
 from harness.backend_names import BACKEND_NAMES, BackendName
 from harness.errors import ScenarioError
 from harness.play.progress import SilentProgress
-from harness.pytest_plugin._judged_run import PluginRun, discard, new_directory, one_sentence
+from harness.pytest_plugin._judged_run import RunOfOneTest, discard, new_directory, one_sentence
 from harness.pytest_plugin._options import SessionOptions
 from harness.pytest_plugin._stash import TRIAL
 from harness.pytest_plugin.findings import Findings
@@ -38,7 +38,7 @@ def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
             stack.enter_context(in_force(variant))
             directory = new_directory(node, options)
             swarm = Swarm(scenario, seed, backend, directory)
-        trial = node.stash[TRIAL] = PluginRun(scenario, swarm.finish, variant)
+        trial = node.stash[TRIAL] = RunOfOneTest(scenario, swarm.finish, variant)
         stack.callback(swarm.close)
         yield swarm
     if trial.passed:
@@ -56,7 +56,7 @@ def scenario_for(node: pytest.Item) -> Iterator[Findings]:
         scenario = options.applied_to(load_scenario(path))
         directory = new_directory(node, options)
         finished = play(scenario, seed, backend, directory, variant)
-    trial = node.stash[TRIAL] = PluginRun(scenario, lambda _: finished, variant)
+    trial = node.stash[TRIAL] = RunOfOneTest(scenario, lambda _: finished, variant)
     yield Findings(directory, finished.result)
     if trial.passed:
         discard(directory, options)

@@ -14,7 +14,7 @@ from harness.backend_names import BackendName
 from harness.errors import HarnessError, ScenarioError
 from harness.play.backends import in_virtual_time
 from harness.pytest_plugin._fixtures import play
-from harness.pytest_plugin._judged_run import PluginRun, discard, new_directory, one_sentence
+from harness.pytest_plugin._judged_run import RunOfOneTest, discard, new_directory, one_sentence
 from harness.pytest_plugin._options import SessionOptions
 from harness.pytest_plugin._stash import TRIAL
 from harness.report.stories.narration import StoryWriter
@@ -54,7 +54,7 @@ class ScenarioItem(pytest.Item):
             options.refuse(self._backend)
             self._directory = new_directory(self, options)
             finished = play(self._scenario, self._seed, self._backend, self._directory, options.variant)
-        self.stash[TRIAL] = PluginRun(self._scenario, lambda _: finished, options.variant)
+        self.stash[TRIAL] = RunOfOneTest(self._scenario, lambda _: finished, options.variant)
 
     def teardown(self) -> None:
         if self._directory is not None and TRIAL in self.stash and self.stash[TRIAL].passed:
@@ -99,7 +99,7 @@ class StoryItem(pytest.Item):
             self._directory = new_directory(self, options)
             seed = 1 if options.seed is None else options.seed
             finished = play(scenario, seed, self._backend, self._directory, options.variant, delivers_all=True)
-        self.stash[TRIAL] = PluginRun(scenario, lambda _: finished, options.variant)
+        self.stash[TRIAL] = RunOfOneTest(scenario, lambda _: finished, options.variant)
         if finished.played.outcome != "completed":
             return  # the judgement of the run reports the reason
         archive = RunArchive(finished.directory)

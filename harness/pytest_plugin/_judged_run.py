@@ -22,7 +22,7 @@ from harness.scenario.agent_options import quirks_in_words
 from harness.scenario.expect import Expect
 
 
-class PluginRun:
+class RunOfOneTest:
     """The run of a test. `finish` ends and judges it. If its argument is true, it waits until the agents are idle.
 
     `variant` is the file of the protocol variant of the run, or None.

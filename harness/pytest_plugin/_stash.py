@@ -7,6 +7,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from harness.pytest_plugin._judged_run import PluginRun
+    from harness.pytest_plugin._judged_run import RunOfOneTest
 
-TRIAL: pytest.StashKey[PluginRun] = pytest.StashKey()
+TRIAL: pytest.StashKey[RunOfOneTest] = pytest.StashKey()

@@ -34,7 +34,7 @@ class RunEndedError(Exception):
     """An error: the run ended before the test, because an agent, a vehicle or the machine failed."""
 
 
-class _Block(AbstractContextManager[None]):
+class _ActionContext(AbstractContextManager[None]):
     """The result of an action, for use with `with`. At the end of the block it undoes the action, unless the block
     failed.
     """
@@ -97,12 +97,12 @@ class Swarm:
         """
         __tracebackhide__ = True
         self._change(partition=[list(group) for group in groups], for_s=for_s)
-        return _Block(self.heal)
+        return _ActionContext(self.heal)
 
     def _for_a_block(self, **entry: Any) -> AbstractContextManager[None]:
         __tracebackhide__ = True
         at_s = self._change(**entry)
-        return _Block(partial(self._act, lambda swarm: self._timeline.undo(swarm, at_s)))
+        return _ActionContext(partial(self._act, lambda swarm: self._timeline.undo(swarm, at_s)))
 
     def heal(self) -> None:
         """End the partition."""
@@ -151,7 +151,7 @@ class Swarm:
         __tracebackhide__ = True
         words = _of_message(message, which)
         number = self._act(lambda swarm: self._timeline.hold(swarm, **words))
-        return _Block(partial(self._act, lambda swarm: self._timeline.let_go(swarm, number)))
+        return _ActionContext(partial(self._act, lambda swarm: self._timeline.let_go(swarm, number)))
 
     def release(self, message: str | None = None, **which: Any) -> None:
         """Deliver the messages that `hold` holds back by these criteria, or all such messages."""

@@ -63,7 +63,7 @@ class ChainTreeLayout:
     height: float
 
 
-class _Outline:
+class _SubtreeOutline:
     """The leftmost and rightmost positions of a subtree in each row, relative to its root."""
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class _Outline:
         for row in rows:
             self._rows[row] = (-width / 2 - self.shift, width / 2 - self.shift)
 
-    def distance_to(self, right: "_Outline", gap: float = COLUMN_GAP) -> float:
+    def distance_to(self, right: "_SubtreeOutline", gap: float = COLUMN_GAP) -> float:
         """Return the smallest distance between this root and a root on its right that leaves `gap` between the two
         subtrees.
         """
@@ -84,7 +84,7 @@ class _Outline:
             default=0.0,
         )
 
-    def merged_with(self, other: "_Outline", x: float) -> "_Outline":
+    def merged_with(self, other: "_SubtreeOutline", x: float) -> "_SubtreeOutline":
         """Merge another outline into this one, and return the result. The root of the other is at `x`."""
         other.shift += x
         large, small = (self, other) if len(self._rows) >= len(other._rows) else (other, self)
@@ -153,12 +153,12 @@ def _width(characters: int) -> float:
 def _offsets(placed_marks: list[PlacedMark]) -> dict[int, float]:
     """Return the horizontal distance of each mark from the mark below it, by `id` of the mark."""
     offsets: dict[int, float] = {}
-    outlines: dict[int, _Outline] = {}
+    outlines: dict[int, _SubtreeOutline] = {}
     beside = {id(item.beside) for item in placed_marks}
     for item in reversed(placed_marks):
         if id(item) in beside:
             continue
-        outline = _Outline()
+        outline = _SubtreeOutline()
         positions: list[float] = []
         for child in item.children:
             right = outlines.pop(id(child))
@@ -169,7 +169,7 @@ def _offsets(placed_marks: list[PlacedMark]) -> dict[int, float]:
         outline.shift -= own
         outline.add(item.rows, item.width)
         if item.beside:
-            oval = _Outline()
+            oval = _SubtreeOutline()
             oval.add(item.beside.rows, item.beside.width)
             offsets[id(item.beside)] = outline.distance_to(oval, OVAL_GAP)
             outline = outline.merged_with(oval, offsets[id(item.beside)])

@@ -13,7 +13,7 @@ from harness.report import map_svg
 from harness.report.facts import link_qualities
 from harness.report.map_parts import (
     MAX_SEGMENTS,
-    Flight,
+    FlightPath,
     GroundRectangle,
     NetworkDivision,
     divisions,
@@ -125,7 +125,7 @@ def _moment(
     division: NetworkDivision | None,
     tracks: Tracks,
     network: Connectivity,
-    flown: Sequence[Flight],
+    flown: Sequence[FlightPath],
     area_extent: GroundRectangle,
     ink: Mapping[int, AgentColours],
     types: Mapping[int, VehicleType],
@@ -153,7 +153,7 @@ def _moment(
     return MapMoment(at, what, state, picture)
 
 
-def _legend(flown: Sequence[Flight], *, rebooted: bool) -> list[tuple[Markup, str]]:
+def _legend(flown: Sequence[FlightPath], *, rebooted: bool) -> list[tuple[Markup, str]]:
     """Return a legend of all marks that this map contains."""
     parts: dict[str, set[int]] = {}
     for flight in flown:

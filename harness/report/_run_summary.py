@@ -10,7 +10,7 @@ from harness.present.junit import JunitCase, to_xml
 from harness.present.text import escaped, row
 from harness.report import _network_section, _rogue_section, _survival_section, facts
 from harness.report._report_source import ReportSource
-from harness.report.verdict_section import Verdict, headline, verdicts
+from harness.report.verdict_section import VerdictEntry, headline, verdicts
 from harness.scenario.expect import AS_EXPECTED, Expect
 
 EVIDENCE_SHOWN = 3
@@ -43,7 +43,7 @@ def to_markdown(left: ReportSource) -> str:
     return "\n".join([*lines, f"<sub>{_short(versions)}</sub>"]) + "\n"
 
 
-def _verdict_table(judged: Sequence[Verdict]) -> Iterator[str]:
+def _verdict_table(judged: Sequence[VerdictEntry]) -> Iterator[str]:
     yield row(["", "characteristic", "verdict", "reason"])
     yield row(["--:", "---", "---", "---"])
     for verdict in judged:
@@ -51,7 +51,7 @@ def _verdict_table(judged: Sequence[Verdict]) -> Iterator[str]:
     yield ""
 
 
-def _evidence(judged: Sequence[Verdict]) -> list[str]:
+def _evidence(judged: Sequence[VerdictEntry]) -> list[str]:
     return _listed(
         f"{verdict.topic}, agent {words.value(piece.get('agent'))}: {words.value(piece.get('detail'))}"
         for verdict in judged
@@ -114,7 +114,7 @@ def _wrong_with_run(record: RunRecord) -> Iterator[str]:
         yield f"{fate}, so this run differs from its script"
 
 
-def _characteristic(verdict: Verdict, expect: Expect) -> JunitCase:
+def _characteristic(verdict: VerdictEntry, expect: Expect) -> JunitCase:
     name, expected = verdict.title, expect.verdict(verdict.key)
     message = f"{verdict.verdict}: {verdict.reason}" if verdict.reason else verdict.verdict
     if verdict.remark == AS_EXPECTED:

@@ -22,7 +22,7 @@ Figure = Callable[[Replication], float | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Chart:
+class TimelineChart:
     """A chart. `lines` contains pairs of a line sample and its meaning."""
 
     name: str
@@ -44,7 +44,7 @@ _LINE_CLASSES = ("broken", "whole")
 
 def draw(
     spreads: Sequence[Replication], faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], end_s: float
-) -> list[Chart]:
+) -> list[TimelineChart]:
     """Return a chart for each group of figures. `spreads` contains the numbers of copies over time, with at least one
     entry.
     """
@@ -70,7 +70,7 @@ def thin_states(spreads: Sequence[Replication], end_s: float) -> Sequence[Replic
 
 def _chart(
     name: str, figures: Sequence[tuple[str, Figure]], moments: Sequence[Replication], behind: Markup, end_s: float
-) -> Chart:
+) -> TimelineChart:
     highest = max(
         (value for _, figure in figures for moment in moments if (value := figure(moment)) is not None), default=0
     )
@@ -92,7 +92,7 @@ def _chart(
     scale = Markup('<text class="scale" x="4" y="11">{}</text>').format(text.value(highest))
     at_end = ", ".join(f"{what} {text.value(figure(moments[-1]))}" for what, figure in figures)
     description = f"{name} over mission time: maximum {text.value(highest)}; at the end {at_end}"
-    return Chart(
+    return TimelineChart(
         name,
         [
             (
@@ -135,7 +135,7 @@ _CYCLE_TOP, _CYCLE_BOTTOM = 3, 12
 _TEXT = 28
 
 
-def cycle_chart(cycle: Cycle, end_s: float) -> Chart:
+def cycle_chart(cycle: Cycle, end_s: float) -> TimelineChart:
     """Draw an endless cycle of the agents up to `end_s`, the end of the run in mission seconds."""
     start_s = max(0.0, min(cycle.since_s, end_s))
     period_s = cycle.period_s if cycle.period_s is not None and cycle.period_s > 0 else end_s - start_s
@@ -151,7 +151,7 @@ def cycle_chart(cycle: Cycle, end_s: float) -> Chart:
     )
     anchor = "end" if start_s > end_s / 2 else "start"
     text = Markup('<text class="scale" text-anchor="{}">{}</text>').format(anchor, label)
-    return Chart(
+    return TimelineChart(
         "repeats a cycle" if cycle.period_s else "hangs",
         [],
         plot(

@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from markupsafe import Markup
 
-from harness.archive.history import CUT_SHORT, Commit, History, Phase, Phase2Tie, Reconcile, Vote
+from harness.archive.history import CUT_SHORT, BlockCommit, History, Phase2Tie, Reconcile, ReconcilePhase, Vote
 from harness.archive.run_record import FaultRecord
 from harness.present.svg import n
 from harness.report._timeline_plot import (
@@ -164,7 +164,7 @@ def phases_in_words(reconcile: Reconcile) -> str:
     return ", ".join(f"{name} \u00d7{count}" if count > 1 else name for name, count in rounds.items()) or "no phase"
 
 
-def group_commits(commits: Sequence[Commit], end_s: float) -> list[list[Commit]]:
+def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[BlockCommit]]:
     """Combine neighbouring commits of each agent, so that about `MAX_COMMITS` marks remain.
 
     Commits in one group lie close together.
@@ -222,7 +222,7 @@ def _bar(reconcile: Reconcile, lane_height: int) -> Markup:
     return _reconcile_bar(reconcile, BAR_HEIGHT, lane_height, tip)
 
 
-def _reconcile_bar(span: Phase | Reconcile, height: int, lane_height: int, tip: str) -> Markup:
+def _reconcile_bar(span: ReconcilePhase | Reconcile, height: int, lane_height: int, tip: str) -> Markup:
     return Markup('<rect class="reconcile" x="%s" y="%s" width="%s" height="%s"><title>%s</title></rect>') % (
         format_number(span.start_s),
         lane_height - 3 - height,
@@ -232,11 +232,11 @@ def _reconcile_bar(span: Phase | Reconcile, height: int, lane_height: int, tip: 
     )
 
 
-def _from_to(span: Vote | Reconcile | Phase) -> str:
+def _from_to(span: Vote | Reconcile | ReconcilePhase) -> str:
     return f"{format_seconds(span.start_s)} to {format_seconds(span.end_s)}"
 
 
-def _commit(group: Sequence[Commit], lane_height: int, names: Mapping[str, str]) -> Markup:
+def _commit(group: Sequence[BlockCommit], lane_height: int, names: Mapping[str, str]) -> Markup:
     first, last = group[0], group[-1]
     tip = f"agent {first.agent} commits {block_label(first.block, names)} ({first.how}), {format_seconds(first.at_s)}"
     if len(group) > 1:

@@ -62,7 +62,7 @@ class Timeline:
     lane_height: int
     lanes: Markup
     legend: list[tuple[Markup, str]]
-    charts: list[_timeline_charts.Chart]
+    charts: list[_timeline_charts.TimelineChart]
     axis: Markup
     messages: str
     votes: TimelineTable

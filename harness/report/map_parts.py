@@ -91,7 +91,7 @@ class TrackSegment:
 
 
 @dataclass(frozen=True, slots=True)
-class Flight:
+class FlightPath:
     """The path of a vehicle from its start, or its first known position, to its loss or the end of the run."""
 
     vehicle: int
@@ -160,7 +160,7 @@ def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, mo
 
 def flights(
     vehicle: int, tracks: Tracks, network: Connectivity, all_divisions: Sequence[NetworkDivision], end_s: float
-) -> Iterator[Flight]:
+) -> Iterator[FlightPath]:
     """Yield the paths of a vehicle, and of the vehicles that replaced it after a loss."""
     wreck: PositionFix | None = None
     for begin_s, until_s, lost in network.airborne_intervals(vehicle, end_s):
@@ -169,7 +169,7 @@ def flights(
             del flown[0]
         if flown:
             end = tracks.at(vehicle, until_s)
-            yield Flight(vehicle, list(_segments(vehicle, [*flown, end], all_divisions)), lost)
+            yield FlightPath(vehicle, list(_segments(vehicle, [*flown, end], all_divisions)), lost)
             wreck = end
 
 

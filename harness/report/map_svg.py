@@ -16,7 +16,7 @@ from harness.present import text as words
 from harness.present.colours import AgentColours
 from harness.present.svg import FONT, n
 from harness.report.map_parts import (
-    Flight,
+    FlightPath,
     GroundRectangle,
     MapProjection,
     NetworkDivision,
@@ -131,7 +131,7 @@ def css_class(division: NetworkDivision | None, vehicle: int) -> str:
 
 
 def draw_tracks(
-    flights: Sequence[Flight],
+    flights: Sequence[FlightPath],
     reboots: Sequence[tuple[PositionFix, int]],
     land: GroundRectangle,
     ink: Mapping[int, AgentColours],
@@ -312,7 +312,7 @@ def _connection_text(division: NetworkDivision | None, vehicle: int) -> str:
 
 
 def _marks(
-    flights: Sequence[Flight],
+    flights: Sequence[FlightPath],
     reboots: Iterable[tuple[PositionFix, int]],
     to_px: MapProjection,
     ink: Mapping[int, AgentColours],

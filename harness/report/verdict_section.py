@@ -25,7 +25,7 @@ EVIDENCE_KEPT = 200
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class VerdictEntry:
     key: str
     number: str
     """The number of the characteristic, or "" for a further check."""
@@ -62,7 +62,7 @@ class Verdict:
         return f"{self.number}. {self.name}" if self.number else self.name
 
 
-def verdicts(record: RunRecord) -> list[Verdict]:
+def verdicts(record: RunRecord) -> list[VerdictEntry]:
     """Return all verdicts of a judged run, including characteristics without a recorded verdict.
 
     Return none otherwise.
@@ -75,9 +75,9 @@ def verdicts(record: RunRecord) -> list[Verdict]:
     return [_verdict(key, judged.get(key), record.expect) for key in keys]
 
 
-def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None, expect: Expect) -> Verdict:
+def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None, expect: Expect) -> VerdictEntry:
     kind, evidence = kind_of(judged.verdict) if judged else "unknown", judged.evidence if judged else []
-    return Verdict(
+    return VerdictEntry(
         key=key,
         number="" if key in FURTHER_CHECKS else key,
         name=judged.name if judged else ALL_CHECKS[key],
@@ -92,7 +92,7 @@ def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None, ex
     )
 
 
-def headline(verdicts: list[Verdict], *, completed: bool) -> tuple[str, str]:
+def headline(verdicts: list[VerdictEntry], *, completed: bool) -> tuple[str, str]:
     """Return a summary of the verdicts and its kind.
 
     A run that did not complete is never "holds". A run whose bad verdicts are all expected is "unknown".

@@ -141,7 +141,7 @@ class RepositoryError(HarnessError):
 
 
 @dataclass(frozen=True)
-class Commit:
+class GitCommit:
     """A commit. `files` contains the paths of the changed files."""
 
     hash: str
@@ -215,12 +215,12 @@ class GitBisection:
         self._git(self.tree, "clean", "--quiet", "-xffd")
         return self._git(self.tree, "rev-parse", "HEAD").strip()
 
-    def commit(self, commit: str) -> Commit:
+    def commit(self, commit: str) -> GitCommit:
         form = "--format=%H%x00%as%x00%an%x00%s%x00"
         output = self._git(self.tree, "show", "--no-patch", form, commit)
         parts = output.split("\0")
         names = self._git(self.tree, "diff-tree", "--no-commit-id", "--name-only", "-r", "-m", "--root", commit)
-        return Commit(parts[0].strip(), parts[1], parts[2], parts[3], tuple(dict.fromkeys(names.splitlines())))
+        return GitCommit(parts[0].strip(), parts[1], parts[2], parts[3], tuple(dict.fromkeys(names.splitlines())))
 
     def _git(self, where: Path, *arguments: str, accept: tuple[int, ...] = (0,)) -> str:
         environment = {

@@ -71,7 +71,7 @@ def sweep(
         if jobs == 1:
             yield ((task, raise_error(count(outcome_of(work, task)))) for task in tasks)
             return
-        pool = _Pool(work, jobs, count, in_order)
+        pool = _WorkerPool(work, jobs, count, in_order)
         try:
             yield pool.outcomes(tasks)
         finally:
@@ -125,7 +125,7 @@ def _serve(work: Callable[[T], R], connection: Connection, parent: int) -> None:
         connection.send(outcome_of(work, connection.recv()))
 
 
-class _Pool(Generic[T, R]):
+class _WorkerPool(Generic[T, R]):
     """A pool of workers that execute one task each. If a worker dies, only its task fails, and a new worker replaces
     it.
     """

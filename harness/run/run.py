@@ -28,7 +28,7 @@ from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
-from harness.play.progress import Progress, SilentProgress
+from harness.play.progress import ProgressDisplay, SilentProgress
 from harness.play.request_socket import serve_requests
 from harness.report import facts
 from harness.run.provenance import versions
@@ -83,7 +83,7 @@ def run(
     scenario: Scenario,
     seed: int,
     out: Path | None = None,
-    progress: Progress | None = None,
+    progress: ProgressDisplay | None = None,
     backend: BackendName = "process",
     *,
     delivers_all: bool = False,
@@ -276,7 +276,7 @@ async def _until_interrupted(
     scenario: Scenario,
     seed: int,
     directory: RunDirectory,
-    progress: Progress,
+    progress: ProgressDisplay,
     story: mission.Story,
     **options: Any,
 ) -> RunOutcome:

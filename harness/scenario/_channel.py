@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from harness.scenario.strict_model import Model
+from harness.scenario.strict_model import StrictModel
 
 if TYPE_CHECKING:
     from netem.channel import Radio
@@ -30,7 +30,7 @@ OWN_KEYS = ("preset", "processing_s")
 """Keys that are no figures of the radio."""
 
 
-class ChannelModel(Model):
+class ChannelModel(StrictModel):
     """A radio channel that all vehicles share. Each key replaces a figure of the preset."""
 
     preset: Preset

@@ -12,14 +12,14 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
 from harness.scenario._channel import ChannelModel
-from harness.scenario.strict_model import MAX_AGENTS, Model, Probability, VehicleId, VehicleKey
+from harness.scenario.strict_model import MAX_AGENTS, Probability, StrictModel, VehicleId, VehicleKey
 from netem import radio
 from netem.conditions import Delay, Distribution, GilbertElliott, LinkConditions, NetworkConditions
 from netem.errors import ConditionsError
 from netem.link import MAX_DELAY_S, MAX_LIMIT
 
 
-class HardRange(Model):
+class HardRange(StrictModel):
     """A radio that loses no message within `range_m`, and every message beyond it."""
 
     range_m: float = radio.HardRange.range_m
@@ -31,7 +31,7 @@ class HardRange(Model):
         return self
 
 
-class LogDistance(Model):
+class LogDistance(StrictModel):
     """Log-distance path loss with log-normal shadowing. `netem.radio.LogDistance` has the formula and the sources."""
 
     exponent: float = radio.LogDistance.exponent
@@ -51,7 +51,7 @@ class LogDistance(Model):
         return self
 
 
-class RadioModel(Model):
+class RadioModel(StrictModel):
     """Loss that depends on the distance between two vehicles. Needs exactly one of `hard_range` and `log_distance`."""
 
     hard_range: HardRange | None = None
@@ -74,7 +74,7 @@ class RadioModel(Model):
         return self
 
 
-class BurstLoss(Model):
+class BurstLoss(StrictModel):
     """Loss in bursts by the Gilbert-Elliott model, as `loss gemodel p r 1-h 1-k` of tc-netem(8).
 
     Each link has its own state, good or bad, and starts in the good state. After each message the state may change.
@@ -93,7 +93,7 @@ class BurstLoss(Model):
 DelaySeconds = Annotated[float, Field(ge=0, le=MAX_DELAY_S, allow_inf_nan=False)]
 
 
-class RandomDelay(Model):
+class RandomDelay(StrictModel):
     """A random delay, as `delay` and `distribution` of tc-netem(8). Times are mission seconds."""
 
     mean_s: DelaySeconds
@@ -109,7 +109,7 @@ class RandomDelay(Model):
         return self
 
 
-def _number_or(mapping: type[Model], number: Any) -> BeforeValidator:
+def _number_or(mapping: type[StrictModel], number: Any) -> BeforeValidator:
     """Return a validator for either a mapping or a number, so that an error message concerns only one of them."""
     numbers = TypeAdapter(number)
 
@@ -140,7 +140,7 @@ VehicleIds = Annotated[
 ]
 
 
-class ConditionOverrides(Model):
+class ConditionOverrides(StrictModel):
     """Conditions that replace those of the layer below. A missing key keeps the value of the layer below."""
 
     loss: Loss | None = None
@@ -224,7 +224,7 @@ class NetworkLayer(ConditionOverrides):
         return _named(self.receivers, self.links)
 
 
-class NetworkDisturbance(Model):
+class NetworkDisturbance(StrictModel):
     """A change of the network, as timeline entries and schedules contain it."""
 
     loss: Loss | None = None
@@ -251,7 +251,7 @@ class NetworkDisturbance(Model):
         return tuple(frozenset(group) for group in self.partition or ())
 
 
-class NetworkModel(Model):
+class NetworkModel(StrictModel):
     """Network conditions. Each receiver of a message draws separately. A broadcast may reach some receivers only."""
 
     loss: Loss = 0.0

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
 
-from harness.scenario.strict_model import Data, MissionSecond, Model, Seconds, VehicleId, VehicleKey
+from harness.scenario.strict_model import Data, MissionSecond, Seconds, StrictModel, VehicleId, VehicleKey
 from ucp.block import MAX_AGENT_ID
 from ucp.events import MAX_MEAN_S, LoggableEvent
 from ucp.quirks import QUIRKS, Quirks, check_quirk
@@ -61,7 +61,7 @@ def _is_command(words: Any) -> bool:
 AgentCommand = Annotated[Command | dict[VehicleKey, Command] | None, BeforeValidator(_commands)]
 
 
-class QuirkOfAgents(Model):
+class QuirkOfAgents(StrictModel):
     """A quirk of some agents only."""
 
     agents: Annotated[list[VehicleId], Field(min_length=1)]
@@ -125,7 +125,7 @@ def _agents(ids: list[int]) -> str:
     return f"agents {', '.join(others)} and {last}" if others else f"agent {last}"
 
 
-class SecurityOptions(Model):
+class SecurityOptions(StrictModel):
     """A secured mission. Agents seal each datagram, refuse forged and repeated ones, and sign their blocks."""
 
     keys: Annotated[str, Field(min_length=1, max_length=4000)] = "fresh"
@@ -166,7 +166,7 @@ MAX_DATA_CHARACTERS = 1400
 """Maximum length of event data in base64: 1024 bytes, with a margin."""
 
 
-class ScriptedEvent(Model):
+class ScriptedEvent(StrictModel):
     """One event that an agent logs: zero bytes of a given number, or the data of a recorded event."""
 
     at_s: MissionSecond
@@ -202,7 +202,7 @@ class ScriptedEvent(Model):
         return self
 
 
-class EventOptions(Model):
+class EventOptions(StrictModel):
     """The source of the events that agents log."""
 
     source: Literal["mavlink", "random", "scripted"] = "mavlink"
@@ -228,7 +228,7 @@ MIN_MEMORY_MIB = 6
 """Docker refuses a container with a lower limit."""
 
 
-class DockerOptions(Model):
+class DockerOptions(StrictModel):
     """Image and limits of containers. Each limit applies to one container. Other backends ignore these keys."""
 
     image: Annotated[str, Field(min_length=1, max_length=255)] | None = None

@@ -22,7 +22,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from harness.backend_names import BackendName
 from harness.present.text import did_you_mean
-from harness.scenario.strict_model import Model, VehicleId, VehicleKey
+from harness.scenario.strict_model import StrictModel, VehicleId, VehicleKey
 from harness.scenario.verdict_names import (
     CHARACTERISTICS,
     FURTHER_CHECKS,
@@ -74,7 +74,7 @@ def _known_number(key: Any) -> int:
     return number
 
 
-class NumberRange(Model):
+class NumberRange(StrictModel):
     """A range of numbers. Needs `min`, `max`, or both. A single number is short for a range from it to itself."""
 
     min: Number | None = None
@@ -113,7 +113,7 @@ def _exactly(value: Any) -> Any:
 Count = Annotated[NumberRange, BeforeValidator(_exactly)]
 
 
-class CommonBlocks(Model):
+class CommonBlocks(StrictModel):
     """The expected length of the common part of several chains, or of the chain of one agent."""
 
     agents: Annotated[list[VehicleId], Field(min_length=1)]
@@ -122,7 +122,7 @@ class CommonBlocks(Model):
     """Number of blocks, from the inception block on, that the chains of all these agents share."""
 
 
-class Expect(Model):
+class Expect(StrictModel):
     """Expected results. pytest plays every seed on every backend, one test each.
 
     A check without an expected verdict passes unless its verdict is bad.

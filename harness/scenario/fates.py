@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from harness.scenario.strict_model import Arrivals, MissionSecond, Model, VehicleId
+from harness.scenario.strict_model import Arrivals, MissionSecond, StrictModel, VehicleId
 
 MessageName = Literal[
     "Block Add Request",
@@ -47,7 +47,7 @@ def _quoted(value: Any) -> Any:
     return value
 
 
-class Fate(Model):
+class Fate(StrictModel):
     """The scripted delivery of the messages that match.
 
     A message matches if it agrees with all of the keys `message`, `sender`, `receiver`, `block`, `from_s` and `until_s`

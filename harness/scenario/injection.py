@@ -23,7 +23,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from harness.scenario.fates import MessageName
-from harness.scenario.strict_model import Data, MissionSecond, Model, Seconds, VehicleId, VehicleKey
+from harness.scenario.strict_model import Data, MissionSecond, Seconds, StrictModel, VehicleId, VehicleKey
 
 InjectionName = Literal["replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie"]
 INJECTIONS: tuple[InjectionName, ...] = ("replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie")
@@ -33,7 +33,7 @@ MAX_FLOOD = 100_000
 """Datagrams of one flood."""
 
 
-class _MatchingMessages(Model):
+class _MatchingMessages(StrictModel):
     """The messages of one type and one sender, among those that the rogue node receives."""
 
     message: MessageName | None = None
@@ -110,7 +110,7 @@ class CorruptedCopy(_LastingInjection):
         return f"{super().in_words()}, {self.bits} bit{'s' if self.bits > 1 else ''} flipped"
 
 
-class Forgery(Model):
+class Forgery(StrictModel):
     """The rogue node sends messages in the name of an agent.
 
     A forged Commit Block is sent once. It contains a new block in the name of `sender`, on top of the last chain that
@@ -170,7 +170,7 @@ class Flood(_LastingInjection):
 BlockName = Annotated[str, Field(pattern=r"^(\d{1,5}\.\d{1,6}|made \d{1,9}(\.\d{1,6})?)$")]
 
 
-class Lie(Model):
+class Lie(StrictModel):
     """The rogue node sends one message with the given content in the name of an agent.
 
     The type of the message decides which of `block`, `chain`, `approve` and `timestamp_s` it needs. A missing or
@@ -249,7 +249,7 @@ MAX_CHARACTERS = 4 * (65536 // 3 + 1)
 """Length in base64 of the largest UDP datagram."""
 
 
-class ScriptedDatagram(Model):
+class ScriptedDatagram(StrictModel):
     """A datagram that no agent sent. Network conditions and partitions do not apply to it."""
 
     source: VehicleId

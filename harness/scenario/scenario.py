@@ -27,12 +27,12 @@ from harness.scenario.faults import Fault
 from harness.scenario.faults.fault import KILLED, RUNNING
 from harness.scenario.injection import ScriptedDatagram
 from harness.scenario.network_states import NetworkStep, network_steps, refuse_ambiguous_overlaps
-from harness.scenario.strict_model import MAX_AGENTS, Data, Lateness, Model, Seconds, VehicleKey
+from harness.scenario.strict_model import MAX_AGENTS, Data, Lateness, Seconds, StrictModel, VehicleKey
 from harness.scenario.timeline import MIN_VEHICLES, Schedule, TimelineEntry
 from harness.scenario.vehicles import Flight, Vehicles
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError
-from sitl.address import Address
+from sitl.address import ListenAddress
 from sitl.plan import PlanError
 from sitl.vehicle import VehicleError
 from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
@@ -47,14 +47,14 @@ MAX_DURATION_S = 31 * 86400
 MAX_INITIAL_DATA = 64 * 1024
 
 
-class SettlePhase(Model):
+class SettlePhase(StrictModel):
     """The time after the mission in which agents finish their votes and reconciles."""
 
     limit_s: Seconds = 1800.0
     """Maximum number of mission seconds. The run ends earlier when all agents are idle."""
 
 
-class AgentClock(Model):
+class AgentClock(StrictModel):
     """The clock of one agent. At mission second t it shows `offset_s` + (1 + `drift`) * t seconds."""
 
     offset_s: Annotated[float, Field(ge=-1e10, le=1e10)] = 0.0
@@ -71,7 +71,7 @@ class AgentClock(Model):
         return (shown_s - self.offset_s) / (1 + self.drift)
 
 
-class Scenario(Model):
+class Scenario(StrictModel):
     """One experiment. All times are mission seconds, counted from the start of the mission."""
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
@@ -142,7 +142,7 @@ class Scenario(Model):
     @classmethod
     def _is_an_address(cls, gcs: str | None) -> str | None:
         try:
-            return gcs and str(Address.parse(gcs))
+            return gcs and str(ListenAddress.parse(gcs))
         except VehicleError as error:
             raise ValueError(str(error)) from None
 

@@ -36,7 +36,7 @@ Data = Annotated[str, AfterValidator(_check_base64)]
 """Bytes, in base64."""
 
 
-class Model(BaseModel):
+class StrictModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 

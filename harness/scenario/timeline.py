@@ -41,7 +41,7 @@ from harness.scenario.injection import (
     Lie,
     Replay,
 )
-from harness.scenario.strict_model import MissionSecond, Model, Probability, Seconds, VehicleId
+from harness.scenario.strict_model import MissionSecond, Probability, Seconds, StrictModel, VehicleId
 
 NETWORK_KEYS = ("loss", "partition", "heal", "network")
 """Keys of an entry that change the network."""
@@ -174,7 +174,7 @@ LayerStep = tuple[float, str, TemporaryChange]
 """Mission second, name of the change, and the layer from this second on."""
 
 
-class Ramp(Model):
+class Ramp(StrictModel):
     """A change from a first value to a second, in equal steps. Needs at least one key."""
 
     loss: tuple[Probability, Probability] | None = None
@@ -244,7 +244,7 @@ class RepeatedChange(NetworkDisturbance):
 Nemesis = Literal["halves", "isolate", "majorities ring", "bridge", "flapping"]
 
 
-class Schedule(Model):
+class Schedule(StrictModel):
     """A gradual or repeated change of the network. Needs exactly one of `ramp`, `repeat` and `nemesis`."""
 
     ramp: Ramp | None = None

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 
-from harness.scenario.strict_model import Model, VehicleId, VehicleKey
+from harness.scenario.strict_model import StrictModel, VehicleId, VehicleKey
 from sitl import parameters, start_places
 from sitl.airframes import NOT_FLOWN, airframe
 from sitl.plan import MAX_LEGS, By, GoTo, Land, Loiter, Plan, TakeOff
@@ -102,7 +102,7 @@ Arguments = Annotated[
 ]
 
 
-class Wind(Model):
+class Wind(StrictModel):
     """The wind in ArduPilot's simulation, from the start on."""
 
     speed_ms: Annotated[float, Field(ge=0, le=100)]
@@ -116,7 +116,7 @@ class Wind(Model):
         return {"SIM_WIND_SPD": self.speed_ms, "SIM_WIND_DIR": self.from_deg, "SIM_WIND_TURB": self.turbulence}
 
 
-class EachVehicle(Model):
+class EachVehicle(StrictModel):
     """Settings of one vehicle. They override the settings of all vehicles."""
 
     frame: Frame | None = None
@@ -133,7 +133,7 @@ class EachVehicle(Model):
     """Debugger of this vehicle. Default: the debugger of all vehicles."""
 
 
-class Vehicles(Model):
+class Vehicles(StrictModel):
     """The vehicles that carry the agents."""
 
     kind: VehicleKind | None = None
@@ -225,7 +225,7 @@ class Vehicles(Model):
 LEGS = ("take_off", "go_to", "loiter_s", "land")
 
 
-class Leg(Model):
+class Leg(StrictModel):
     """One leg of a flight plan. Needs exactly one of `take_off`, `go_to`, `loiter_s` and `land`."""
 
     take_off: float | None = None
@@ -257,7 +257,7 @@ class Leg(Model):
         return Loiter(self.loiter_s) if self.loiter_s is not None else Land()
 
 
-class Flight(Model):
+class Flight(StrictModel):
     """A flight plan and the vehicles that fly it."""
 
     vehicles: Annotated[list[VehicleId], Field(min_length=1)]

@@ -32,7 +32,7 @@ from random import Random
 from netem.channel._access import NEVER, ChannelAccess, DutyCycle, TimeSlots
 from netem.channel._contention import CarrierSense
 from netem.channel._frame import Frame, FrameFate, Transmission
-from netem.channel._links import Links, linear
+from netem.channel._links import RadioLinks, linear
 from netem.channel._parameters import NANOSECONDS, LoraRadio, Radio, TimeSlotRadio, WifiRadio, nanoseconds
 from netem.radio import Place
 
@@ -47,7 +47,7 @@ class Channel:
         self._radio = radio
         self._access = _access(radio, vehicles, seed)
         energy_dbm = radio.energy_dbm if isinstance(radio, WifiRadio) else radio.sensitivity_dbm
-        self._links = Links(len(vehicles), radio, energy_dbm, Random(f"{seed}/shadowing"))
+        self._links = RadioLinks(len(vehicles), radio, energy_dbm, Random(f"{seed}/shadowing"))
         self._queues: list[deque[Frame]] = [deque() for _ in vehicles]
         self._active: list[Frame] = []
         self._next_end = NEVER

@@ -82,7 +82,7 @@ class FrameReach:
 
 
 @dataclass(slots=True)
-class _Mean:
+class _MeanReach:
     """The reception of one sender's frames without shadowing."""
 
     levels: list[int]
@@ -94,7 +94,7 @@ class _Mean:
     """Receivers that listen to another channel."""
 
 
-class Links:
+class RadioLinks:
     """The links between `count` vehicles. All vehicles are at the same place until `move` is called."""
 
     def __init__(self, count: int, radio: Radio, energy_dbm: float, draws: Random) -> None:
@@ -111,7 +111,7 @@ class Links:
         self._group = [0] * count
         self._places = [Place(0.0, 0.0, 0.0)] * count
         self._first_metre_db = 20 * math.log10(4 * math.pi * MIN_DISTANCE_M * radio.frequency_hz / _LIGHT_M_PER_S)
-        self._means: list[_Mean | None] = [None] * count
+        self._means: list[_MeanReach | None] = [None] * count
         """Computed when the sender sends."""
         self._moved_m = [0.0] * count
         """Metres since the last change of the shadowing."""
@@ -169,7 +169,7 @@ class Links:
                 energetic |= bit
         return FrameReach(levels, heard, energetic, mean.near & ~heard, mean.far & ~heard, mean.cut)
 
-    def _mean(self, sender: int) -> _Mean:
+    def _mean(self, sender: int) -> _MeanReach:
         levels = [_SILENT] * self._count
         near = far = cut = 0
         for receiver, bit in enumerate(self._bits):
@@ -183,7 +183,7 @@ class Links:
                 near |= bit
             else:
                 far |= bit
-        return _Mean(levels, near, far, cut)
+        return _MeanReach(levels, near, far, cut)
 
     def _path_loss(self, one: Place, other: Place) -> int:
         """Return the path loss between two places: that of the log-distance model or of a flat ground, whichever is

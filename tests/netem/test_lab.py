@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from netem import lab as lab_module
-from netem._lab_channel import Channel
+from netem._lab_channel import LabConnection
 from netem.conditions import NetworkConditions
 from netem.errors import ConditionsError, LabError, SpawnError
 from netem.lab import Lab, LabProcess, UdpCounters, in_words
@@ -355,7 +355,7 @@ def test_invalid_request_gets_an_error_and_the_lab_survives(
     tmp_path: Path, request_: str, arguments: dict[str, object]
 ) -> None:
     async def story(lab: Lab) -> None:
-        channel: Channel = lab._channel
+        channel: LabConnection = lab._channel
         if request_ == "signal" and arguments["pid"] == 1:
             assert await channel.ask(request_, **arguments) == ({"sent": False}, None)
         else:

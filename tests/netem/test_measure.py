@@ -18,7 +18,7 @@ from netem.estimates import Estimate, Lateness, ReceivedStream
 from netem.lab import EngineName, Lab
 from netem.link import Delay, GilbertElliott, LinkConditions
 from netem.measure import EngineMeasurement, MeasuredQuantity, NetworkStudy, measure, studies
-from netem.observers import Arrival, DisturbedError, check, in_lab, in_medium
+from netem.observers import DisturbedError, PacketArrival, check, in_lab, in_medium
 from tests.machine import require
 from tests.netem.conftest import PORT, Air, play
 
@@ -257,7 +257,7 @@ def test_receiver_reports_overflows_of_its_buffer(tmp_path: Path) -> None:
 def test_loss_by_the_machine_is_an_error_unless_corruption_hides_it() -> None:
     study = one_question(0.15)
     one, two = (AppliedConditions("test", {4: ReceiverFigures.of({}, (), passed, 0, 0)}) for passed in (1, 2))
-    received_packets = {(1, 4): [Arrival(0, 0.0, 0.1)]}
+    received_packets = {(1, 4): [PacketArrival(0, 0.0, 0.1)]}
     check(study, {4: {"overflow": 0}}, received_packets, one)
     with pytest.raises(DisturbedError, match="itself lost 1 of the packets to vehicle 4"):
         check(study, {4: {"overflow": 0}}, received_packets, two)

@@ -7,8 +7,8 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl._autopilot import Autopilot
-from sitl._kinematics import Point
-from sitl._mission_upload import Mission
+from sitl._kinematics import LocalPlace
+from sitl._mission_upload import MissionItems
 from sitl._route import route
 from sitl.modes import MODES
 from sitl.plan import Plan
@@ -72,10 +72,10 @@ class Cockpit:
         assert self.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m) == ACCEPTED
         self.fly(40.0)
 
-    def load(self, plan: Plan) -> Mission:
+    def load(self, plan: Plan) -> MissionItems:
         """Upload a plan item by item, as the vehicle requests it."""
         vehicle_type = self.vehicle.vehicle_type
-        mission = Mission(route(plan, vehicle_type, HOME.heading_deg), HOME, 3, vehicle_type)
+        mission = MissionItems(route(plan, vehicle_type, HOME.heading_deg), HOME, 3, vehicle_type)
         answers = self.tell(mavlink.MAVLink_mission_count_message(3, 1, len(mission.items)))
         while answers[0].get_type() == "MISSION_REQUEST_INT":
             answers = self.tell(mission.items[answers[0].seq])
@@ -94,7 +94,7 @@ class Cockpit:
         return self.vehicle.now_s
 
     @property
-    def place(self) -> Point:
+    def place(self) -> LocalPlace:
         return self.vehicle.motion.point
 
     def texts(self) -> list[str]:

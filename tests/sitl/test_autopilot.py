@@ -7,7 +7,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl._kinematics import Point
+from sitl._kinematics import LocalPlace
 from sitl._mission_upload import on_earth
 from sitl._plane import LOITER_RADIUS_M
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
@@ -19,13 +19,13 @@ FORCE = 21196
 OUT_AND_BACK = Plan((TakeOff(30), GoTo(200, 100), Loiter(20), GoTo(0, 0, altitude_m=20), Land()))
 
 
-def position_target(place: Point, mask: int = 0x0DF8) -> mavlink.MAVLink_set_position_target_global_int_message:
+def position_target(place: LocalPlace, mask: int = 0x0DF8) -> mavlink.MAVLink_set_position_target_global_int_message:
     x, y = on_earth(place, HOME)
     frame = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
     return mavlink.MAVLink_set_position_target_global_int_message(0, 3, 1, frame, mask, x, y, place.up_m, *[0.0] * 8)
 
 
-def reposition(place: Point, speed_ms: float = -1.0) -> mavlink.MAVLink_command_int_message:
+def reposition(place: LocalPlace, speed_ms: float = -1.0) -> mavlink.MAVLink_command_int_message:
     x, y = on_earth(place, HOME)
     frame = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
     command = mavlink.MAV_CMD_DO_REPOSITION
@@ -111,7 +111,7 @@ def test_copter_in_guided_mode_flies_to_places_and_stays() -> None:
     cockpit = Cockpit()
     cockpit.take_off()
     assert cockpit.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, 5) == ACCEPTED
-    here, there = cockpit.place, Point(100, -50, 25)
+    here, there = cockpit.place, LocalPlace(100, -50, 25)
     cockpit.tell(position_target(there))
     cockpit.fly(45.0)
     assert 10 < math.dist(cockpit.place, here) < 20
@@ -121,8 +121,8 @@ def test_copter_in_guided_mode_flies_to_places_and_stays() -> None:
     assert math.dist(cockpit.place, here) > 20
     cockpit.fly(100.0)
     assert cockpit.place == pytest.approx(there, abs=0.02)
-    cockpit.tell(position_target(Point(0, 0, 25), mask=0x0DFF))  # a velocity or nothing, but no place
-    assert cockpit.tell(reposition(Point(0, 0, 25)))[0].result == ACCEPTED
+    cockpit.tell(position_target(LocalPlace(0, 0, 25), mask=0x0DFF))  # a velocity or nothing, but no place
+    assert cockpit.tell(reposition(LocalPlace(0, 0, 25)))[0].result == ACCEPTED
     cockpit.fly(200.0)
     assert cockpit.place == pytest.approx((0, 0, 25), abs=0.02)
 
@@ -135,10 +135,10 @@ def test_plane_takes_off_in_its_mode_and_circles_at_its_target() -> None:
     assert (cockpit.mode("TAKEOFF"), cockpit.arm()) == (ACCEPTED, ACCEPTED)
     cockpit.fly(60.0)
     assert cockpit.place.up_m == 60
-    cockpit.tell(position_target(Point(600, 0, 60)))  # not for planes
-    assert cockpit.tell(reposition(Point(600, 0, 80)))[0].result == FAILED  # not in GUIDED yet
+    cockpit.tell(position_target(LocalPlace(600, 0, 60)))  # not for planes
+    assert cockpit.tell(reposition(LocalPlace(600, 0, 80)))[0].result == FAILED  # not in GUIDED yet
     assert cockpit.mode("GUIDED") == ACCEPTED
-    assert cockpit.tell(reposition(Point(600, 0, 80)))[0].result == ACCEPTED
+    assert cockpit.tell(reposition(LocalPlace(600, 0, 80)))[0].result == ACCEPTED
     cockpit.fly(200.0)
     assert math.dist(cockpit.place[:2], (600, 0)) == pytest.approx(LOITER_RADIUS_M, abs=0.1)
     assert cockpit.place.up_m == 80
@@ -149,8 +149,8 @@ def test_plane_takes_off_in_its_mode_and_circles_at_its_target() -> None:
 def test_impossible_places_are_refused(hostile: float) -> None:
     cockpit = Cockpit()
     cockpit.take_off()
-    assert cockpit.tell(reposition(Point(10, 10, 0)._replace(up_m=hostile)))[0].result == FAILED
-    cockpit.tell(position_target(Point(10, 10, hostile)))
+    assert cockpit.tell(reposition(LocalPlace(10, 10, 0)._replace(up_m=hostile)))[0].result == FAILED
+    cockpit.tell(position_target(LocalPlace(10, 10, hostile)))
     assert cockpit.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, hostile) == FAILED
     before = cockpit.place
     cockpit.fly(60.0)
@@ -194,7 +194,7 @@ def test_disarmed_rover_stops() -> None:
 def test_return_to_launch_brings_each_type_home() -> None:
     copter = Cockpit()
     copter.take_off(10)
-    copter.tell(position_target(Point(100, 0, 10)))
+    copter.tell(position_target(LocalPlace(100, 0, 10)))
     copter.fly(80.0)
     assert copter.command(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH) == ACCEPTED
     copter.fly(85.0)

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 import sitl.ground_station
 from sitl._mavlink_frames import FrameSplitter
 from sitl._operator import MOST_COMMANDS, CommandLog
-from sitl.address import Address, connected
+from sitl.address import ListenAddress, connected
 from sitl.ground_station import GroundStation
 from sitl.vehicle import VehicleError
 from tests.sitl.flying import DEADLINE_S
@@ -47,7 +47,7 @@ class Field:
         self.peer: object = None
 
     async def open(self) -> GroundStation:
-        address = Address("127.0.0.1", self.ground.getsockname()[1])
+        address = ListenAddress("127.0.0.1", self.ground.getsockname()[1])
         self.station = await GroundStation.open(address, lambda: 12.5, self.taken_over.extend)
         for sysid in (3, 4):
             ours, self.vehicles[sysid] = socket.socketpair()
@@ -220,8 +220,8 @@ def test_stick_messages_make_one_entry_and_the_log_is_bounded() -> None:
     [("127.0.0.1:14550", "127.0.0.1", 14550), ("[::1]:1", "::1", 1), ("base.local:65535", "base.local", 65535)],
 )
 def test_address_has_host_and_port(text: str, host: str, port: int) -> None:
-    assert Address.parse(text) == Address(host, port)
-    assert str(Address.parse(text)) == text
+    assert ListenAddress.parse(text) == ListenAddress(host, port)
+    assert str(ListenAddress.parse(text)) == text
 
 
 @pytest.mark.parametrize(
@@ -230,12 +230,12 @@ def test_address_has_host_and_port(text: str, host: str, port: int) -> None:
 )
 def test_invalid_address_gives_one_sentence(text: str) -> None:
     with pytest.raises(VehicleError, match=r"ground station|host"):
-        Address.parse(text)
+        ListenAddress.parse(text)
 
 
 def test_unknown_host_gives_one_sentence() -> None:
     with pytest.raises(VehicleError, match=r"the ground station at nobody\.invalid:14550 cannot be sent"):
-        asyncio.run(GroundStation.open(Address("nobody.invalid", 14550), lambda: 0.0, lambda vehicles: None))
+        asyncio.run(GroundStation.open(ListenAddress("nobody.invalid", 14550), lambda: 0.0, lambda vehicles: None))
 
 
 def test_ipv4_address_of_a_name_is_preferred(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -244,5 +244,5 @@ def test_ipv4_address_of_a_name_is_preferred(monkeypatch: pytest.MonkeyPatch) ->
         (socket.AF_INET, socket.SOCK_DGRAM, 17, "", ("127.0.0.1", 14550)),
     ]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: ways)
-    with connected(Address("localhost", 14550)) as sock:
+    with connected(ListenAddress("localhost", 14550)) as sock:
         assert sock.getpeername() == ("127.0.0.1", 14550)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl._vehicle_state import Version
+from sitl._vehicle_state import FirmwareVersion
 from sitl.parameters import ParameterError
 from tests.sitl.puppet import message_id, on_strings
 
@@ -16,14 +16,14 @@ from tests.sitl.puppet import message_id, on_strings
 @pytest.mark.parametrize(
     ("number", "custom", "version"),
     [
-        (0x04_07_00_00, b"78d42fcf", Version("4.7.0-dev", "78d42fcf")),
-        (0x04_06_03_FF, bytes(8), Version("4.6.3")),
-        (0x04_06_00_C1, b"\xff\xfe\0\0\0\0\0\0", Version("4.6.0-rc")),
-        (0x04_06_00_80, b"abc\0\0\0\0\0", Version("4.6.0-beta", "abc")),
+        (0x04_07_00_00, b"78d42fcf", FirmwareVersion("4.7.0-dev", "78d42fcf")),
+        (0x04_06_03_FF, bytes(8), FirmwareVersion("4.6.3")),
+        (0x04_06_00_C1, b"\xff\xfe\0\0\0\0\0\0", FirmwareVersion("4.6.0-rc")),
+        (0x04_06_00_80, b"abc\0\0\0\0\0", FirmwareVersion("4.6.0-beta", "abc")),
     ],
 )
-def test_version_has_its_usual_form(number: int, custom: bytes, version: Version) -> None:
-    assert Version.of(number, custom) == version
+def test_version_has_its_usual_form(number: int, custom: bytes, version: FirmwareVersion) -> None:
+    assert FirmwareVersion.of(number, custom) == version
 
 
 def test_lost_parameters_are_requested_again(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from sitl._kinematics import Point
+from sitl._kinematics import LocalPlace
 from sitl._route import route
 from sitl.plan import MAX_LEGS, GoTo, Land, Leg, Loiter, Plan, PlanError, TakeOff
 from sitl.vehicle import VehicleType
@@ -43,12 +43,12 @@ def test_missing_values_of_legs_are_filled_in() -> None:
     plan = Plan((TakeOff(30), GoTo(100, 0, speed_ms=4), Loiter(5), GoTo(100, 50, altitude_m=40), GoTo(0, 0), Land()))
     waypoints = route(plan, "copter", 0.0)
     assert [(one.place, one.speed_ms) for one in waypoints] == [
-        (Point(0, 0, 30), 10),
-        (Point(100, 0, 30), 4),
-        (Point(100, 0, 30), 4),
-        (Point(100, 50, 40), 10),
-        (Point(0, 0, 40), 10),
-        (Point(0, 0, 0), 10),
+        (LocalPlace(0, 0, 30), 10),
+        (LocalPlace(100, 0, 30), 4),
+        (LocalPlace(100, 0, 30), 4),
+        (LocalPlace(100, 50, 40), 10),
+        (LocalPlace(0, 0, 40), 10),
+        (LocalPlace(0, 0, 0), 10),
     ]
     assert waypoints[2].seconds == 5
     assert waypoints[1].leg == "leg 2 of 6 (go to 100 m north, 0 m east)"

@@ -13,7 +13,7 @@ import pytest
 
 from sitl._plane import LOITER_RADIUS_M
 from sitl.plan import By, GoTo, Land, Loiter, Plan, PlanError, TakeOff
-from sitl.track import Track, track
+from sitl.track import VehicleTrack, track
 from sitl.vehicle import VehicleType
 from tests.sitl.cockpit import Cockpit
 from tests.sitl.flying import HOME
@@ -95,7 +95,7 @@ def arrivals_s(points: list[tuple[float, float, float, float]]) -> list[float]:
     return arrivals
 
 
-def as_points(computed: Track) -> list[tuple[float, float, float, float]]:
+def as_points(computed: VehicleTrack) -> list[tuple[float, float, float, float]]:
     return [(tenth / 10, *computed.at(tenth / 10)) for tenth in range(round(computed.course.end_s * 10))]
 
 

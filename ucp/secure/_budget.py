@@ -12,7 +12,7 @@ BURST = 32
 """Wrong signatures in the name of one sender without a pause."""
 
 
-class Budget:
+class VerificationBudget:
     """Tokens for wrong signatures. `per_s` tokens return in each mission second. An infinite `per_s` sets no limit."""
 
     __slots__ = ("_per_s", "_since_s", "_tokens")

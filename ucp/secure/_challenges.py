@@ -22,7 +22,7 @@ ALL = 0
 """Target of a challenge to all vehicles."""
 
 
-class Challenges:
+class PendingChallenges:
     """The challenges of one incarnation. A target is an agent ID or `ALL`."""
 
     def __init__(self) -> None:

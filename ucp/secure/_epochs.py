@@ -29,7 +29,7 @@ MAX_CACHED_KEYS = 4096
 """Maximum number of cached sender keys. Above it, the cache is emptied."""
 
 
-class Epochs:
+class EpochSecrets:
     """The group secrets of one vehicle.
 
     `save` is called with the vehicle's new bundle after each change of the clock's epoch. The new bundle no longer

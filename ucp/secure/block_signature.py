@@ -5,7 +5,7 @@ signature (RFC 8032) over a domain tag, the mission's ID and BD (eq. 3.5). Becau
 other data or of another mission is not valid for a block.
 """
 
-from ucp.secure.crypto_suite import SignatureClaim
+from ucp.secure.crypto_suite import UnverifiedSignature
 from ucp.secure.sealed_datagrams import Signer
 
 _TAG = b"UCP block\0"
@@ -16,6 +16,6 @@ def sign_block(maker: Signer, mission: bytes, block_data: bytes) -> bytes:
     return maker.sign(_TAG + mission + block_data)
 
 
-def block_claim(public_key: bytes, mission: bytes, block_data: bytes, signature: bytes) -> SignatureClaim:
+def block_claim(public_key: bytes, mission: bytes, block_data: bytes, signature: bytes) -> UnverifiedSignature:
     """Return the claim that the owner of this public key signed the block with this BD in this mission."""
-    return SignatureClaim(public_key, signature, _TAG + mission + block_data)
+    return UnverifiedSignature(public_key, signature, _TAG + mission + block_data)

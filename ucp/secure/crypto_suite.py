@@ -63,7 +63,7 @@ class SenderKeys:
         return (self._iv ^ position).to_bytes(NONCE_BYTES, "big")
 
 
-class SignatureClaim(NamedTuple):
+class UnverifiedSignature(NamedTuple):
     """The claim that the owner of a public key signed some bytes with this signature."""
 
     public_key: bytes
@@ -71,7 +71,7 @@ class SignatureClaim(NamedTuple):
     signed: bytes
 
 
-def verify(claim: SignatureClaim) -> bool:
+def verify(claim: UnverifiedSignature) -> bool:
     """Return whether the claim is true. Malformed keys and signatures give False."""
     try:
         _load_public_key(claim.public_key).verify(claim.signature, claim.signed)

@@ -24,13 +24,13 @@ from ucp.messages import (
     datagram_bytes,
 )
 from ucp.messages import VERSION as PLAIN_VERSION
-from ucp.wire import Kind, struct_of
+from ucp.wire import FieldKind, struct_of
 
 VERSION = 3
 BOOT_BYTES = 16
 TAG_BYTES = 16
 SIGNATURE_BYTES = 64
-CLEAR_FIELDS = {**HEADER_FIELDS, "epoch": Kind.U32, "boot": Kind.BOOT, "revocations": Kind.U16}
+CLEAR_FIELDS = {**HEADER_FIELDS, "epoch": FieldKind.U32, "boot": FieldKind.BOOT, "revocations": FieldKind.U16}
 CLEAR = struct_of(CLEAR_FIELDS)
 SEAL_BYTES = TAG_BYTES + SIGNATURE_BYTES
 """Number of bytes that sealing adds to a body: the tag and the sender's signature."""
@@ -48,7 +48,7 @@ CONTROL_NAMES = {REVOCATION: "Revocation", CHALLENGE: "Challenge", ECHO: "Echo"}
 NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
 """Type of a message -> its name."""
 
-REQUEST_FIELDS = {"request_sender": Kind.U32, "request_boot": Kind.BOOT, "request_sequence": Kind.U32}
+REQUEST_FIELDS = {"request_sender": FieldKind.U32, "request_boot": FieldKind.BOOT, "request_sequence": FieldKind.U32}
 """Fields of the request that a response answers. They are sealed in front of the response's body."""
 REQUEST = struct_of(REQUEST_FIELDS)
 REQUEST_OF = {2: 1, 5: 4, 7: 6, 9: 8}

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ucp.secure.crypto_suite import SignatureClaim
+from ucp.secure.crypto_suite import UnverifiedSignature
 from ucp.secure.sealed_datagrams import Signer
 from ucp.state import AgentState
 
@@ -52,9 +52,9 @@ class ExportHead:
             "signature": base64.b64encode(signer.sign(self._signed_bytes(mission))).decode("ascii"),
         }
 
-    def claim(self, public_key: bytes, mission: bytes, signature: bytes) -> SignatureClaim:
+    def claim(self, public_key: bytes, mission: bytes, signature: bytes) -> UnverifiedSignature:
         """Return the claim that the owner of this public key signed the head in this mission."""
-        return SignatureClaim(public_key, signature, self._signed_bytes(mission))
+        return UnverifiedSignature(public_key, signature, self._signed_bytes(mission))
 
     def _signed_bytes(self, mission: bytes) -> bytes:
         fields = _FIELDS.pack(

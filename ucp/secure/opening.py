@@ -14,7 +14,7 @@ EPOCHS_AHEAD = 4096
 """Maximum number of epochs after the bundle's for which secrets are computed: four weeks with epochs of 600 s."""
 
 
-class Opener:
+class DatagramOpener:
     """Opens datagrams of all vehicles of a mission with the bundle of one vehicle.
 
     It opens datagrams of the bundle's epoch and of later epochs. Secrets of earlier epochs cannot be computed.

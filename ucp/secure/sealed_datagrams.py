@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from ucp.messages import Datagram, MalformedDatagramError, decode_body
-from ucp.secure.crypto_suite import SenderKeys, SignatureClaim, verify
+from ucp.secure.crypto_suite import SenderKeys, UnverifiedSignature, verify
 from ucp.secure.envelope import (
     BOOT_BYTES,
     CLEAR,
@@ -58,14 +58,14 @@ def signing_domain(mission: bytes) -> bytes:
 
 def decrypt(
     keys: SenderKeys, datagram: bytes, clear: ClearHeader, domain: bytes, public_key: bytes
-) -> tuple[bytes, SignatureClaim]:
+) -> tuple[bytes, UnverifiedSignature]:
     """Return the body of a sealed datagram, and the claim of its signature, which the caller must still verify.
 
     Raises MalformedDatagramError if the keys do not decrypt the datagram.
     """
     plain, header = decrypted(keys, datagram, clear), datagram[: CLEAR.size]
     body, signature = plain[:-SIGNATURE_BYTES], plain[-SIGNATURE_BYTES:]
-    return body, SignatureClaim(public_key, signature, domain + header + body)
+    return body, UnverifiedSignature(public_key, signature, domain + header + body)
 
 
 def decrypted(keys: SenderKeys, datagram: bytes, clear: ClearHeader) -> bytes:
@@ -108,10 +108,10 @@ class CryptoFunctions:
 
     read: Callable[[bytes], ClearHeader] = read_clear_header
     sender_keys: Callable[[bytes, bytes, int, int, bytes], SenderKeys] = SenderKeys
-    decrypt: Callable[[SenderKeys, bytes, ClearHeader, bytes, bytes], tuple[bytes, SignatureClaim]] = decrypt
+    decrypt: Callable[[SenderKeys, bytes, ClearHeader, bytes, bytes], tuple[bytes, UnverifiedSignature]] = decrypt
     parse_body: Callable[[ClearHeader, bytes], OpenedDatagram] = parse_body
     signer: Callable[[bytes], Signer] = Ed25519PrivateKey.from_private_bytes
-    verify: Callable[[SignatureClaim], bool] = verify
+    verify: Callable[[UnverifiedSignature], bool] = verify
 
 
 CRYPTO_FUNCTIONS = CryptoFunctions()

@@ -14,12 +14,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from ucp.messages import TYPE_CODES, MalformedDatagramError, Message
-from ucp.secure._budget import Budget
-from ucp.secure._challenges import ALL, ECHO_INTERVAL_S, TRUST_DELAY_S, Challenges
-from ucp.secure._epochs import Epochs
+from ucp.secure._budget import VerificationBudget
+from ucp.secure._challenges import ALL, ECHO_INTERVAL_S, TRUST_DELAY_S, PendingChallenges
+from ucp.secure._epochs import EpochSecrets
 from ucp.secure._window import ReplayWindow
 from ucp.secure.bundle import LAST_START_US, Bundle
-from ucp.secure.crypto_suite import SenderKeys, SignatureClaim
+from ucp.secure.crypto_suite import SenderKeys, UnverifiedSignature
 from ucp.secure.envelope import (
     CHALLENGE,
     ECHO,
@@ -96,8 +96,8 @@ class Session:
         self._is_first = bundle.started_us is None
         started = replace(bundle, started_us=int.from_bytes(boot[:8], "big") % LAST_START_US)
         save_bundle(started)
-        self.epochs = Epochs(started, save_bundle, crypto.sender_keys)
-        self.challenges = Challenges()
+        self.epochs = EpochSecrets(started, save_bundle, crypto.sender_keys)
+        self.challenges = PendingChallenges()
         self._is_complete: bool | None = None
         """True if this vehicle has received all datagrams of the mission that it accepts. None before the start."""
         self._held: dict[int, _Incarnation] = {}
@@ -112,8 +112,8 @@ class Session:
         self._control = 0
         """Sequence of the next control datagram."""
         per_s = wrong_signatures_per_s / len(self.public_keys)
-        self._budgets = {agent_id: Budget(per_s) for agent_id in self.public_keys}
-        self.revocation_budget = Budget(REVOCATIONS_PER_S)
+        self._budgets = {agent_id: VerificationBudget(per_s) for agent_id in self.public_keys}
+        self.revocation_budget = VerificationBudget(REVOCATIONS_PER_S)
         self._own_requests: dict[int, int] = {}
         """Type of a request -> sequence of this vehicle's newest request of this type."""
 
@@ -291,7 +291,7 @@ class Session:
             self._incarnations |= self._held
             self._held.clear()
 
-    def _decrypt(self, datagram: bytes, clear: ClearHeader) -> tuple[SenderKeys, bytes, SignatureClaim]:
+    def _decrypt(self, datagram: bytes, clear: ClearHeader) -> tuple[SenderKeys, bytes, UnverifiedSignature]:
         """Return keys, body and claim of a datagram. Raises MalformedDatagramError if its tag is wrong."""
         keys = self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot)
         return keys, *self.crypto.decrypt(keys, datagram, clear, self._domain, self.public_keys[clear.sender])

@@ -19,7 +19,7 @@ from docs.generate.matrix_thesis import put_between_markers
 from docs.generate.wrong_agents import quirky
 from docs.generate.wrong_agents.trials_page import rows_of
 from harness.conformance.conformance_run import ConformanceRequest, conform
-from harness.conformance.results import Results
+from harness.conformance.results import ConformanceResults
 from harness.conformance.vectors import VectorSet, generate
 from harness.errors import HarnessError
 from ucp.agent_files import write_atomically
@@ -34,7 +34,7 @@ ALIKE = {
 """Quirk -> quirk of another Algorithm with the same effect outside the agent."""
 
 
-def test(quirk: str) -> Results:
+def test(quirk: str) -> ConformanceResults:
     """Run the conformance test for an agent with this error, and return the results. Raises HarnessError."""
     command = (sys.executable, "-P", "-m", quirky.__name__, quirk)
     with TemporaryDirectory(prefix="ucp-conformance-") as place:
@@ -56,7 +56,7 @@ def _vectors() -> list[VectorSet]:
     return generate()[:1]
 
 
-def row(quirk: str, results: Results) -> str:
+def row(quirk: str, results: ConformanceResults) -> str:
     """Return a line of the table: the accused Algorithms with their number of failures."""
     about = QUIRKS[quirk]
     named = Counter(case.algorithm for case in results.failures)

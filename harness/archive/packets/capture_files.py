@@ -8,14 +8,14 @@ from harness.archive.packets.capture_reader import Capture, Datagram
 from harness.errors import CaptureError, RunDirectoryError
 
 if TYPE_CHECKING:
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
 
 DIRECTORY = "capture"
 """Directory of captures in a run directory."""
 SUFFIXES = (".pcapng", ".pcap")
 
 
-class Clock(NamedTuple):
+class CaptureClock(NamedTuple):
     """The conversion of capture times to mission seconds. `epoch_ns` is mission second 0.
 
     `of_run` is false if no capture has a comment with the start of the run. Then `epoch_ns` is the time of the first
@@ -35,7 +35,7 @@ class Captures(NamedTuple):
 
     used: list[Capture]
     datagrams: list[Datagram]
-    clock: Clock
+    clock: CaptureClock
     errors: list[str]
 
     @property
@@ -64,7 +64,7 @@ def capture_files(paths: Iterable[Path]) -> list[Path]:
     return list({file.resolve(): file for file in files}.values())
 
 
-def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Captures:
+def read_captures(paths: Iterable[Path], opener: "DatagramOpener | None" = None) -> Captures:
     """Read all captures of one mission. The first capture with a comment determines which mission that is.
 
     Captures from the field have no comment and are always used. `opener` decrypts the sealed datagrams of a secured
@@ -73,7 +73,7 @@ def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Capt
     used: list[Capture] = []
     errors: list[str] = []
     datagrams: dict[bytes, Datagram] = {}
-    clock: Clock | None = None
+    clock: CaptureClock | None = None
     for number, path in enumerate(paths):
         capture = Capture(number, path)
         try:
@@ -82,7 +82,7 @@ def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Capt
             errors.append(str(error))
             continue
         if capture.comment is not None:
-            own = Clock(capture.comment.epoch_us * 1000, capture.comment.speedup, True)
+            own = CaptureClock(capture.comment.epoch_us * 1000, capture.comment.speedup, True)
             if clock not in (None, own):
                 errors.append(f"{path}: of another run than the captures before it; print each run separately")
                 continue
@@ -93,4 +93,4 @@ def read_captures(paths: Iterable[Path], opener: "Opener | None" = None) -> Capt
         if not capture.comment and capture.vehicle in whose:
             capture.vehicle = None  # Its name or content suggests a vehicle that already has a capture of its own.
     first_ns = min((capture.began_ns for capture in used if capture.began_ns is not None), default=0)
-    return Captures(used, list(datagrams.values()), clock or Clock(first_ns, 1.0, False), errors)
+    return Captures(used, list(datagrams.values()), clock or CaptureClock(first_ns, 1.0, False), errors)

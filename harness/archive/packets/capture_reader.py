@@ -23,7 +23,7 @@ from ucp.messages import TYPE_CODES, MalformedDatagramError, decode
 from ucp.secure.envelope import CHALLENGE, CONTROL_NAMES, ECHO, REVOCATION, VERSION, read_clear_header
 
 if TYPE_CHECKING:
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
 
 SECURED = bytes([VERSION])
 NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
@@ -91,7 +91,7 @@ class Capture:
         return self.began_ns is not None and self.ended_ns is not None and self.began_ns <= time_ns <= self.ended_ns
 
     def read(
-        self, datagrams: dict[bytes, Datagram], most_frames: int | None = None, opener: "Opener | None" = None
+        self, datagrams: dict[bytes, Datagram], most_frames: int | None = None, opener: "DatagramOpener | None" = None
     ) -> None:
         """Add the datagrams of the file, or of its first frames, to `datagrams`. `opener` decrypts secured datagrams.
 
@@ -181,7 +181,7 @@ _CONTROL_REASONS = {
 """Type of a control datagram -> why it has no message."""
 
 
-def _secured(payload: bytes, opener: "Opener | None") -> Datagram:
+def _secured(payload: bytes, opener: "DatagramOpener | None") -> Datagram:
     """Return a datagram of a secured mission. Without `opener`, only its sender, sequence number and type are known."""
     clear = read_clear_header(payload)
     if clear.type in CONTROL_NAMES:
@@ -192,7 +192,7 @@ def _secured(payload: bytes, opener: "Opener | None") -> Datagram:
     return Datagram(clear.sender, clear.sequence, MessageSummary(NAMES[clear.type], None, None))
 
 
-def _datagram(frame: Frame, datagrams: dict[bytes, Datagram], opener: "Opener | None") -> tuple[Datagram, int]:
+def _datagram(frame: Frame, datagrams: dict[bytes, Datagram], opener: "DatagramOpener | None") -> tuple[Datagram, int]:
     payload, direction = unwrap(frame)
     key = hashlib.blake2b(payload, digest_size=16).digest()
     datagram = datagrams.get(key)

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.archive.packets.block_names import BlockNames
-from harness.archive.packets.capture_files import Captures, Clock
+from harness.archive.packets.capture_files import CaptureClock, Captures
 from harness.archive.packets.capture_reader import Capture, ListenerName
 from harness.archive.packets.channel_losses import ChannelLosses, loss_reasons
 from harness.archive.packets.exchanges import LinkLosses, Outcome, RequestAnswers
@@ -141,7 +141,7 @@ def document(
     yield "]}"
 
 
-def _capture(capture: Capture, clock: Clock) -> CaptureRecord:
+def _capture(capture: Capture, clock: CaptureClock) -> CaptureRecord:
     return CaptureRecord(
         file=str(capture.path),
         vehicle=capture.vehicle,

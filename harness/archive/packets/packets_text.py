@@ -30,7 +30,7 @@ _INDENT = " " * 16
 Paint = Callable[[str], str]
 
 
-class TransmissionText:
+class TransmissionFormatter:
     """Formats messages and the results of requests. `paint` highlights losses."""
 
     def __init__(self, names: BlockNames, paint: Paint, losses: ChannelLosses) -> None:
@@ -118,7 +118,10 @@ def header(captures: Captures) -> str:
 
 
 def transmission_lines(
-    transmissions: Iterable[Transmission], exchanges: RequestAnswers, text: TransmissionText, answers_of: int | None
+    transmissions: Iterable[Transmission],
+    exchanges: RequestAnswers,
+    text: TransmissionFormatter,
+    answers_of: int | None,
 ) -> Iterator[str]:
     """Yield a line for each message, and below each request its results at all vehicles or only at `answers_of`."""
     for transmission in transmissions:
@@ -130,7 +133,7 @@ def transmission_lines(
 
 
 def exchange_lines(
-    exchanges_shown: Sequence[AnsweredMessage], exchanges: RequestAnswers, text: TransmissionText
+    exchanges_shown: Sequence[AnsweredMessage], exchanges: RequestAnswers, text: TransmissionFormatter
 ) -> Iterator[str]:
     """Yield lines about a block's messages, each with its answers and its missing answers.
 

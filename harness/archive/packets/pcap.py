@@ -56,7 +56,7 @@ class _Interface(NamedTuple):
         return units * 1_000_000_000 // self.units_per_second + self.offset_ns
 
 
-class _BrokenError(Exception):
+class _BrokenCaptureError(Exception):
     """An error: the rest of the file cannot be read."""
 
 
@@ -96,7 +96,7 @@ class CaptureFile:
                 broken = ""
                 try:
                     yield from self._pcapng(file) if magic == _SECTION else self._pcap(file, *_PCAP[magic])
-                except _BrokenError as error:
+                except _BrokenCaptureError as error:
                     broken = str(error)
                 if file.problem or broken:
                     self.problem = f"{file.problem or broken}; the part before is read"
@@ -220,9 +220,9 @@ def _read(file: BinaryIO, count: int, offset: int) -> bytes:
     return data
 
 
-def _breaks_off(offset: int) -> _BrokenError:
-    return _BrokenError(f"ends within the block that starts at byte {offset}")
+def _breaks_off(offset: int) -> _BrokenCaptureError:
+    return _BrokenCaptureError(f"ends within the block that starts at byte {offset}")
 
 
-def _damaged(offset: int) -> _BrokenError:
-    return _BrokenError(f"is damaged at byte {offset}")
+def _damaged(offset: int) -> _BrokenCaptureError:
+    return _BrokenCaptureError(f"is damaged at byte {offset}")

@@ -9,7 +9,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal, NamedTuple
 
-from harness.archive.packets.capture_files import Captures, Clock
+from harness.archive.packets.capture_files import CaptureClock, Captures
 from harness.archive.packets.capture_reader import Capture, Datagram, ListenerName
 from harness.archive.packets.datagram import MessageSummary
 from harness.archive.packets.pcap import OUTBOUND
@@ -97,7 +97,7 @@ def join(captures: Captures) -> list[Transmission]:
 
 
 def _transmissions(
-    datagram: Datagram, captures: Mapping[int, Capture], listeners: _Listeners, clock: Clock
+    datagram: Datagram, captures: Mapping[int, Capture], listeners: _Listeners, clock: CaptureClock
 ) -> Iterator[Transmission]:
     """Yield each sending of one datagram."""
     left: list[tuple[int, ListenerName]] = []

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 from harness.archive.run_record import FaultRecord, NetworkState
-from harness.checker.evidence import Condition, Evidence
+from harness.checker.evidence import Evidence, NetworkLogEntry
 from harness.checker.records.contradiction import Contradiction, of_agent
 from harness.scenario.changes import NO_MORE_FATES, RANGE
 
@@ -49,7 +49,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                 yield of_agent(of_all, f"{name} goes from {earlier:g} s back to {later:g} s")
 
 
-def _change(entry: NetworkState | FaultRecord | Condition, fated_until: float) -> Change:
+def _change(entry: NetworkState | FaultRecord | NetworkLogEntry, fated_until: float) -> Change:
     connected = None if entry.at_s < fated_until else entry.fully_connected
     if isinstance(entry, NetworkState):
         return entry.at_s, entry.what, entry.detail, connected, (), None, entry.planned_s

@@ -13,12 +13,12 @@ from harness.archive.traces import Trace
 from harness.archive.vocabulary import IGNORED_KINDS, first_unknown, unknown_names
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
-from harness.checker.recorded_inputs import Blocks, decoded
+from harness.checker.recorded_inputs import BlockIndex, decoded
 from harness.checker.records import cross_examine
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
 from harness.checker.steps._late_timers import JudgedTimers
-from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.end_of_record import crash, failure
 from harness.checker.steps.follower import OptionalTraceFields, StepComparer
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
@@ -34,8 +34,8 @@ def check(evidence: Evidence) -> Judgement:
     """
     if evidence.steps is not None:
         return evidence.steps
-    blocks = Blocks(block for export in evidence.exports.values() for block in export.blocks())
-    deviations: list[Deviation] = []
+    blocks = BlockIndex(block for export in evidence.exports.values() for block in export.blocks())
+    deviations: list[StepDeviation] = []
     timers = JudgedTimers()
     steps, unjudged, lost = 0, dict[int, str](), list[str]()
     for number, (agent_id, trace) in enumerate(evidence.traces.items(), 1):
@@ -49,7 +49,7 @@ def check(evidence: Evidence) -> Judgement:
             unjudged[agent_id] = str(error)
             continue
         except ImpossibleHeaderError as error:
-            deviations.append(Deviation(agent_id, 1, 0.0, None, str(error)))
+            deviations.append(StepDeviation(agent_id, 1, 0.0, None, str(error)))
             continue
         followers = _followers(evidence, trace, header, blocks)
         _follow(evidence, agent_id, trace, followers)
@@ -88,7 +88,7 @@ def _why(unjudged: dict[int, str]) -> str:
     return "; ".join(f"of {agents(ids)} {why}" for why, ids in by_reason.items())
 
 
-def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: Blocks) -> list[StepComparer]:
+def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: BlockIndex) -> list[StepComparer]:
     """Return an object for each incarnation of the agent (the time between two restarts) that compares it with the
     reference.
     """
@@ -116,7 +116,7 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Ste
         followers[-1].end(evidence.end_of(agent_id))
 
 
-def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | CommandEntry) -> Deviation | None:
+def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | CommandEntry) -> StepDeviation | None:
     """Return a deviation if the agent dropped a datagram that it had to handle, else None."""
     if not isinstance(aside, DroppedDatagram) or header.secured:
         return None  # a secured agent drops datagrams before it decrypts them
@@ -127,13 +127,13 @@ def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | C
     if why_not_handled(header.agent_id, header.roster, sender, message) is not None:
         return None
     what = f"it dropped a {message.NAME} of agent {sender} as {aside.dropped[:60]!r} and did not handle it"
-    return Deviation(header.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, what)
+    return StepDeviation(header.agent_id, line, aside.t, ON_MESSAGE[type(message)].name, what)
 
 
-def deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: list[str]) -> Judgement:
+def deviates(evidence: Evidence, deviations: list[StepDeviation], steps: int, lost: list[str]) -> Judgement:
     """Return the judgement for these deviations. `lost` contains reasons why some steps could not be judged."""
     deviations.sort(key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
-    first_unknown: dict[tuple[int, str | None], Deviation] = {}
+    first_unknown: dict[tuple[int, str | None], StepDeviation] = {}
     for deviation in deviations:
         first_unknown.setdefault((deviation.agent_id, _known(deviation)), deviation)
     counts = Counter((deviation.agent_id, _known(deviation)) for deviation in deviations)
@@ -150,7 +150,7 @@ def deviates(evidence: Evidence, deviations: list[Deviation], steps: int, lost: 
     return Judgement(NAME, "deviates", "; ".join([reason, *lost[:MAX_EVIDENCE]]), findings)
 
 
-def _known(deviation: Deviation) -> str | None:
+def _known(deviation: StepDeviation) -> str | None:
     """Return the handler of the deviation if it is one of the 20 handlers of the protocol, else None."""
     return deviation.handler if deviation.handler in HANDLERS else None
 

@@ -9,7 +9,7 @@ debugger and for `bisect` (`harness.checker.steps.core_in_use`).
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from harness.checker.recorded_inputs import Blocks, NotOnRecordError, decoded
+from harness.checker.recorded_inputs import BlockIndex, NotOnRecordError, decoded
 from harness.checker.reference.state import State, Timer
 from ucp.block import HASH_BYTES, Block
 from ucp.messages import (
@@ -163,7 +163,7 @@ class AdoptingCore(_Core):
         self.sequence -= len(self.outbox)
         self.step_is_over()
 
-    def adopt(self, run: HandlerRun, blocks: Blocks) -> None:
+    def adopt(self, run: HandlerRun, blocks: BlockIndex) -> None:
         """Set the state to the one that the agent recorded after `run`. Raises NotOnRecordError if the records are
         insufficient.
         """

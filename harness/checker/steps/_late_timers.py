@@ -13,8 +13,8 @@ from statistics import mean
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import in_virtual_time
-from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.follower import Expiry
+from harness.checker.steps.deviation import StepDeviation
+from harness.checker.steps.follower import RecordedTimerExpiry
 
 SINGLE_WALL_S = 0.03
 """Wall time that a single timer may be late without an explanation."""
@@ -43,13 +43,15 @@ class JudgedTimers:
         which = "timers" if self.unmeasured == self.expiries else f"{self.unmeasured} of {self.expiries} timers"
         return f"; the lag of the machine is not recorded for {which}, so they may be up to 1 s of wall time late"
 
-    def judge(self, evidence: Evidence, trace: Trace, expiries: Sequence[Expiry]) -> Iterator[Deviation]:
+    def judge(
+        self, evidence: Evidence, trace: Trace, expiries: Sequence[RecordedTimerExpiry]
+    ) -> Iterator[StepDeviation]:
         """Yield the timers of an agent that expired later than the machine's measured delays explain."""
         speedup = trace.header.clock.get("speedup")
         if in_virtual_time(trace) or not isinstance(speedup, int | float) or speedup <= 0:
             return
         agent_id = trace.header.agent_id
-        explained: dict[str, list[tuple[Expiry, float]]] = defaultdict(list)
+        explained: dict[str, list[tuple[RecordedTimerExpiry, float]]] = defaultdict(list)
         for expiry in expiries:
             due_s = expiry.t - max(0.0, expiry.late_s)
             lag_s = evidence.lag.explains(agent_id, due_s, expiry.t) if evidence.lag else None
@@ -62,7 +64,9 @@ class JudgedTimers:
             yield from _of_kind(agent_id, timer, of_kind, speedup)
 
 
-def _of_kind(agent_id: int, timer: str, expiries: list[tuple[Expiry, float]], speedup: float) -> Iterator[Deviation]:
+def _of_kind(
+    agent_id: int, timer: str, expiries: list[tuple[RecordedTimerExpiry, float]], speedup: float
+) -> Iterator[StepDeviation]:
     """Yield each timer that expired too late. If only the mean of all timers is too late, yield the last one."""
     late = [(expiry, lag_s) for expiry, lag_s in expiries if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
     for expiry, lag_s in late:
@@ -70,7 +74,7 @@ def _of_kind(agent_id: int, timer: str, expiries: list[tuple[Expiry, float]], sp
             f"it ran {expiry.late_s:.3g} s after the {timer} timer expired, but the measured lag explains only "
             f"{lag_s:.2g} s"
         )
-        yield Deviation(agent_id, expiry.line, expiry.t, expiry.handler, what)
+        yield StepDeviation(agent_id, expiry.line, expiry.t, expiry.handler, what)
     if late or len(expiries) < ENOUGH:
         return
     late_s, lag_s = mean(expiry.late_s for expiry, _ in expiries), mean(lag_s for _, lag_s in expiries)
@@ -80,4 +84,4 @@ def _of_kind(agent_id: int, timer: str, expiries: list[tuple[Expiry, float]], sp
             f"{len(expiries)} {timer} timers ran {late_s:.3g} s after they expired on average, but the measured lag "
             f"explains only {lag_s:.2g} s"
         )
-        yield Deviation(agent_id, last.line, last.t, last.handler, what)
+        yield StepDeviation(agent_id, last.line, last.t, last.handler, what)

@@ -5,7 +5,7 @@ debugger, which stops in the handlers of `ucp`, and in `bisect`, which compares 
 """
 
 from harness.checker.steps._adopting_core import AdoptingCore
-from harness.checker.steps.implementation import Implementation
+from harness.checker.steps.implementation import CoreImplementation
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
 from ucp.block import Block
@@ -37,5 +37,5 @@ def _core(header: CheckedHeader) -> AdoptingCore:
     return _CoreInUse(header.agent_id, header.initial_data, header.settings)
 
 
-IN_USE = Implementation(_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)
+IN_USE = CoreImplementation(_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)
 """The core of this installation."""

@@ -18,7 +18,7 @@ SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Deviation:
+class StepDeviation:
     """A difference between a step of an agent and the same step of the reference implementation.
 
     `run` and `expected` are the recorded and the expected handler run. If no run can be compared, `what` has the text.

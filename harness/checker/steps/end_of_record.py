@@ -13,7 +13,7 @@ from typing import NamedTuple
 from harness.archive.run_record import AgentRecord
 from harness.archive.traces import Trace
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
-from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import StepComparer
 
 FAILED = ("crashed", "hung", "broken")
@@ -22,7 +22,7 @@ _NAMED = re.compile(r"Algorithm \d+, (\w+)")
 _OF_MESSAGE = {message.NAME: handler for message, handler in ON_MESSAGE.items()}
 
 
-class Arrival(NamedTuple):
+class MessageArrival(NamedTuple):
     """A message to the agent: mission seconds, type, sender and sequence number.
 
     `arrived` is true if a capture shows it at the vehicle of the agent. Otherwise its sender sent it at this time, and
@@ -36,7 +36,7 @@ class Arrival(NamedTuple):
     arrived: bool
 
 
-def crash(trace: Trace, recorded: AgentRecord | None) -> Deviation | None:
+def crash(trace: Trace, recorded: AgentRecord | None) -> StepDeviation | None:
     """Return a deviation if the record of the run says that the agent crashed in a handler. None otherwise."""
     if recorded is None or recorded.outcome != "crashed":
         return None
@@ -46,7 +46,7 @@ def crash(trace: Trace, recorded: AgentRecord | None) -> Deviation | None:
     ended = next((count.until_s for count in reversed(recorded.handler_runs) if count is not None), None)
     line, t = last_line(trace)
     what = f"its record ends here, because the handler did not finish: it {recorded.detail}"
-    return Deviation(trace.header.agent_id, line, t if ended is None else ended, named[1], what)
+    return StepDeviation(trace.header.agent_id, line, t if ended is None else ended, named[1], what)
 
 
 def failure(recorded: AgentRecord | None) -> str | None:
@@ -65,7 +65,7 @@ def last_line(trace: Trace) -> tuple[int, float]:
 
 
 def unfinished(
-    follower: StepComparer, trace: Trace, others_until_s: float, arrivals: Iterator[Arrival] | None
+    follower: StepComparer, trace: Trace, others_until_s: float, arrivals: Iterator[MessageArrival] | None
 ) -> str | None:
     """Return a sentence about the end of a trace without an export, if the mission went on after it. None otherwise.
 
@@ -99,13 +99,13 @@ def unfinished(
     )
 
 
-def sent_to(agent_id: int, traces: Mapping[int, Trace]) -> Iterator[Arrival]:
+def sent_to(agent_id: int, traces: Mapping[int, Trace]) -> Iterator[MessageArrival]:
     """Yield the messages that other agents sent, by their traces."""
     for sender, trace in traces.items():
         if sender != agent_id:
             for run in trace.runs:
                 for sent in run.sent:
-                    yield Arrival(run.t, sent.message, sender, sent.seq, arrived=False)
+                    yield MessageArrival(run.t, sent.message, sender, sent.seq, arrived=False)
 
 
 def _title(handler: str) -> str:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import branch_is_known, tally_is_known, timer_that_ended, timers_are_known
 from harness.checker.recorded_inputs import (
-    Blocks,
+    BlockIndex,
     NotOnRecordError,
     decoded,
     event_of,
@@ -24,8 +24,8 @@ from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_TIMER
 from harness.checker.reference.state import Handler, State, Timer
 from harness.checker.steps._adopting_core import StateBeforeStep
-from harness.checker.steps.deviation import Deviation
-from harness.checker.steps.implementation import REFERENCE, Implementation
+from harness.checker.steps.deviation import StepDeviation
+from harness.checker.steps.implementation import REFERENCE, CoreImplementation
 from harness.checker.steps.trace_header import CheckedHeader
 from ucp.block import Block
 from ucp.events import MalformedEventsError
@@ -54,7 +54,7 @@ class NotHandledError(Exception):
     """An error: the protocol does not run this handler now. The message completes a sentence that begins with "it"."""
 
 
-class Expiry(NamedTuple):
+class RecordedTimerExpiry(NamedTuple):
     """The expiry of a timer. Its handler ran at mission second `t`, which was `late_s` mission seconds late."""
 
     line: int
@@ -93,13 +93,13 @@ class StepComparer:
         self,
         header: CheckedHeader,
         parts: OptionalTraceFields,
-        blocks: Blocks,
+        blocks: BlockIndex,
         was_paused: Paused,
-        implementation: Implementation = REFERENCE,
+        implementation: CoreImplementation = REFERENCE,
     ) -> None:
-        self.deviations: list[Deviation] = []
+        self.deviations: list[StepDeviation] = []
         """The differences, in order."""
-        self.expiries: list[Expiry] = []
+        self.expiries: list[RecordedTimerExpiry] = []
         """Each expiry of a timer of the reference that the agent handled, in order."""
         self.lost: str | None = None
         """The reason, with a trace line, why the agent cannot be followed any further. None while it can."""
@@ -175,7 +175,7 @@ class StepComparer:
                     core.step_is_over()
                 return
             expected = self._expected(run, handler, branch)
-            deviation = Deviation(self._header.agent_id, line, run.t, run.handler, run=run, expected=expected)
+            deviation = StepDeviation(self._header.agent_id, line, run.t, run.handler, run=run, expected=expected)
             if not self._callback_is_lost(line, run, due) or not _differ_only_in_idle(run, expected):
                 self.deviations.append(deviation)
         self._began = True
@@ -266,7 +266,7 @@ class StepComparer:
         memo[id(self.expiries)] = []
         return deepcopy(self, memo)
 
-    def foresee(self, line: int, run: HandlerRun) -> list[Deviation]:
+    def foresee(self, line: int, run: HandlerRun) -> list[StepDeviation]:
         """Return the differences in triggered handlers that the next handler run shows. This runs no handler."""
         foreseeing = self.copy()
         if foreseeing.lost is None:
@@ -439,7 +439,7 @@ class StepComparer:
         timer.stop()
         if early > self._header.early_s:
             raise NotHandledError(f"ran {early:.3g} s before the {name} timer expired")
-        self.expiries.append(Expiry(line, run.t, run.handler, name, -early / self._header.rate))
+        self.expiries.append(RecordedTimerExpiry(line, run.t, run.handler, name, -early / self._header.rate))
         handler: Handler = self._implementation.on_timer[name]
         return handler
 
@@ -542,7 +542,7 @@ class StepComparer:
         self._none_ends_before = self._soonest_end()
 
     def _differ(self, line: int, at_s: float, handler: str, what: str) -> None:
-        self.deviations.append(Deviation(self._header.agent_id, line, at_s, handler, what))
+        self.deviations.append(StepDeviation(self._header.agent_id, line, at_s, handler, what))
 
 
 def _differ_only_in_idle(run: HandlerRun, expected: HandlerRun) -> bool:

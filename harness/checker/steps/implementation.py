@@ -13,7 +13,7 @@ class ReferenceCore(AdoptingCore, State):
     """The reference implementation, extended so that it can take over the recorded state of an agent."""
 
 
-class Implementation(NamedTuple):
+class CoreImplementation(NamedTuple):
     """An agent core with its handlers by message type, by timer, by local event and by name."""
 
     core: Callable[[CheckedHeader], AdoptingCore]
@@ -28,5 +28,5 @@ def _reference_core(header: CheckedHeader) -> AdoptingCore:
     return ReferenceCore(header.agent_id, header.initial_data, Settings.of(header.settings))
 
 
-REFERENCE = Implementation(_reference_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)
+REFERENCE = CoreImplementation(_reference_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)
 """The independent reference, by which agents are judged."""

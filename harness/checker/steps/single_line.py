@@ -19,7 +19,7 @@ from typing import Protocol
 
 from harness.checker.recorded_inputs import NotOnRecordError, decoded, event_of
 from harness.checker.reference.state import State
-from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import LOGS, StepComparer
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import (
@@ -54,7 +54,7 @@ MAX_LOCAL = 4
 
 
 def damage_that_explains(
-    before: StepComparer, deviation: Deviation, line: Line, following: Sequence[Line], others: OtherRecords
+    before: StepComparer, deviation: StepDeviation, line: Line, following: Sequence[Line], others: OtherRecords
 ) -> str | None:
     """Return the damage to a trace that explains the difference, such as "a line is missing", or None.
 
@@ -89,7 +89,7 @@ def _agrees(follower: StepComparer, lines: Sequence[Line]) -> bool:
 
 
 def _is_one_character_off(
-    before: StepComparer, deviation: Deviation, line: Line, following: Sequence[Line], others: OtherRecords
+    before: StepComparer, deviation: StepDeviation, line: Line, following: Sequence[Line], others: OtherRecords
 ) -> bool:
     number, run = line
     text = run.to_line()
@@ -100,7 +100,7 @@ def _is_one_character_off(
 
 
 def _as_it_may_have_been(
-    before: StepComparer, deviation: Deviation, run: HandlerRun, others: OtherRecords
+    before: StepComparer, deviation: StepDeviation, run: HandlerRun, others: OtherRecords
 ) -> Iterator[HandlerRun]:
     expected = deviation.expected
     if expected is not None and deviation.run is run and not _was_received(before, expected, run, others):
@@ -152,7 +152,7 @@ def _differ_in_one_character(text: str, other: str) -> bool:
     return len(text) == len(other) and sum(ours != theirs for ours, theirs in zip(text, other, strict=True)) == 1
 
 
-def _has_impossible_top(before: StepComparer, deviation: Deviation, line: Line, following: Sequence[Line]) -> bool:
+def _has_impossible_top(before: StepComparer, deviation: StepDeviation, line: Line, following: Sequence[Line]) -> bool:
     """Return whether the state differs in the top chain hash only, and the next lines agree with the expected one.
 
     A cut joins the beginning of a line with the end of another, so such a line may also be the last before lost ones.

@@ -46,7 +46,7 @@ MOMENT_S = 1.0
 
 
 @dataclass(frozen=True)
-class _Records:
+class _CaseRecords:
     trace: Trace
     export: Export
     status: dict[str, Any]
@@ -66,7 +66,7 @@ class _Records:
         return Evidence({agent_id: self.export}, {agent_id: self.trace})
 
 
-async def _play_recorded_mission(bench: CaseBench) -> _Records:
+async def _play_recorded_mission(bench: CaseBench) -> _CaseRecords:
     """Play a mission with every kind of step, kill the agent, and return its records."""
     async with bench.agent({"settings": SETTINGS, "roster": [*ROSTER, *PEERS]}) as agent:
         first, second, *_ = PEERS
@@ -108,7 +108,7 @@ async def _play_recorded_mission(bench: CaseBench) -> _Records:
         raise WrongBehaviourError("a chain export that can be read", str(error)) from None
     to_agent = [((at_s - epoch_s) * SPEEDUP, data) for at_s, by_agent, data in record if not by_agent]
     sent = [data for _, by_agent, data in record if by_agent]
-    return _Records(trace, export, status, to_agent, sent, export_s, round(epoch_s * MICROSECONDS))
+    return _CaseRecords(trace, export, status, to_agent, sent, export_s, round(epoch_s * MICROSECONDS))
 
 
 def _bytes(recorded: RecordedBytes | None) -> bytes:

@@ -43,14 +43,14 @@ class SecuredPeers:
     """The other agents of a secured mission, with their keys."""
 
     def __init__(self, agent: BenchAgent, keys: "KeySet") -> None:
-        from ucp.secure.opening import Opener
+        from ucp.secure.opening import DatagramOpener
         from ucp.secure.secured_agent import make_boot
         from ucp.secure.session import Session
 
         boot = make_boot(round(time.time() * MICROSECONDS), os.urandom(8))
         self.sessions = {peer: Session(keys.bundle(peer), boot) for peer in (ASKING_PEER, LOST_PEER)}
         self.agent = agent
-        self._opener = Opener(keys.bundle(ASKING_PEER))
+        self._opener = DatagramOpener(keys.bundle(ASKING_PEER))
         self._sequence = 0
 
     def sealed(self, sender: int, message: Message) -> bytes:

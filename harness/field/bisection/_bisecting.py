@@ -10,7 +10,7 @@ from harness.errors import RunDirectoryError
 from harness.field.bisection._playing import SubjectPlayer, UntestableError
 from harness.field.bisection.outcome import Outcome, differences
 from harness.report.difference import RunDifference, compare
-from harness.run.code_state import Commit, GitBisection, RepositoryError, SuspectCommits
+from harness.run.code_state import GitBisection, GitCommit, RepositoryError, SuspectCommits
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class BisectionResult:
 
     good: Outcome
     bad: Outcome
-    first: list[Commit] = field(default_factory=list)
+    first: list[GitCommit] = field(default_factory=list)
     tried: list[CommitTrial] = field(default_factory=list)
     changes: list[str] = field(default_factory=list)
     """Differences between the outcome after the change and that of the good commit."""

@@ -15,7 +15,7 @@ from harness.field.flight_logs import Position
 from harness.field.flight_logs._matching import MatchedLog, match_logs
 from harness.field.flight_logs._summary import in_words as flight_log_in_words
 from harness.report.chain_tree import ranges
-from harness.report.logbook.positions import LAST_TIMESTAMP_US, RoundedPosition, Track, track_of, utc
+from harness.report.logbook.positions import LAST_TIMESTAMP_US, EventTrack, RoundedPosition, track_of, utc
 from ucp.events import LoggableEvent
 from ucp.telemetry import describe, position_of
 
@@ -90,10 +90,10 @@ def flight_logs(record: Consolidation) -> list[MatchedLog]:
     return match_logs(record.collected.flight_logs, {agent: logged.get(agent, []) for agent in record.header.roster})
 
 
-def flown_tracks(matches: Iterable[MatchedLog]) -> list[Track]:
+def flown_tracks(matches: Iterable[MatchedLog]) -> list[EventTrack]:
     """Return the path in each flight log that belongs to an agent, by the clock of the log."""
     return [
-        Track(match.agent_id, [], [_fix(position) for position in match.vehicle.positions])
+        EventTrack(match.agent_id, [], [_fix(position) for position in match.vehicle.positions])
         for match in matches
         if match.agent_id is not None and match.vehicle.positions
     ]
@@ -105,7 +105,7 @@ def _fix(position: Position) -> tuple[int, RoundedPosition]:
     return at_us, RoundedPosition(*place)
 
 
-def tracks(record: Consolidation) -> list[Track]:
+def tracks(record: Consolidation) -> list[EventTrack]:
     """Return the path of each agent that logged positions, by agent ID. There is none if the events are not
     telemetry.
     """

@@ -13,7 +13,7 @@ from ucp.block import Block
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
 
 MAX_FRAMES_READ = 5000
 
@@ -33,7 +33,9 @@ class CaptureSummary:
     """The original file. It differs from `path` if an import made the capture."""
 
 
-def summarise_capture(path: Path, left_out: list[UnusedPart], opener: "Opener | None" = None) -> CaptureSummary | None:
+def summarise_capture(
+    path: Path, left_out: list[UnusedPart], opener: "DatagramOpener | None" = None
+) -> CaptureSummary | None:
     """Read the beginning of a capture. Return None if it contains no UCP datagram. `opener` decrypts secured datagrams.
 
     Raises CaptureError if the file cannot be read.

@@ -29,7 +29,7 @@ from ucp.plain_file import parse_json_at
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
 
 MAX_DOCUMENTS = 1000
 """Maximum number of exports in one file."""
@@ -41,7 +41,7 @@ _BLANK = " \t\r\n\0\ufeff"
 
 
 @gc_paused()
-def ingest_files(paths: Iterable[Path], opener: "Opener | None" = None) -> IngestResult:
+def ingest_files(paths: Iterable[Path], opener: "DatagramOpener | None" = None) -> IngestResult:
     """Return the records in files and directories, grouped by flight. File names and damage do not matter.
 
     `opener` decrypts captures of a secured mission. Raises FieldError if a path does not exist. Every other problem is
@@ -60,7 +60,7 @@ class RecordSorter:
     It reads files of the harness, and accepts the records that adapters read from other files.
     """
 
-    def __init__(self, left_out: list[UnusedPart], opener: "Opener | None" = None) -> None:
+    def __init__(self, left_out: list[UnusedPart], opener: "DatagramOpener | None" = None) -> None:
         self._opener = opener
         self.incarnations: list[TraceIncarnation] = []
         self.exports: list[tuple[Path, Export]] = []

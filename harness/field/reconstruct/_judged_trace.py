@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from harness.checker.recorded_inputs import stored_blocks
-from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.deviation import StepDeviation
 from harness.field.ingest import Flight
 from harness.field.reconstruct._agent_inputs import BootedFromDisk, Input
 from harness.field.reconstruct._bridging import KnownState
@@ -44,7 +44,7 @@ class JudgedTrace:
             elif player.lost is None:
                 self._played.add(id(entry.content))
         result = player.to_end()
-        self.deviations: list[Deviation] = result.deviations
+        self.deviations: list[StepDeviation] = result.deviations
         self.lost: list[str] = result.lost
 
     @property

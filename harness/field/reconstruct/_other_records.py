@@ -22,14 +22,14 @@ from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError, dec
 from ucp.sealed import SEAL_BYTES, sealed_to
 
 if TYPE_CHECKING:
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
     from ucp.secure.sealing import Depot
 
 
 class OtherRecords:
     """All datagrams and blocks in the files of a flight."""
 
-    def __init__(self, flight: Flight, opener: "Opener | None" = None, depot: "Depot | None" = None) -> None:
+    def __init__(self, flight: Flight, opener: "DatagramOpener | None" = None, depot: "Depot | None" = None) -> None:
         """Read the files. In a secured mission, `opener` decrypts datagrams, and `depot` decrypts event data."""
         self.sealed: dict[int, dict[bytes, bytes]] = defaultdict(dict)
         """The sealed data of each agent's blocks. The key is the encoded event that filled the block."""

@@ -25,7 +25,7 @@ from ucp.clock import MICROSECONDS
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.opening import Opener
+    from ucp.secure.opening import DatagramOpener
     from ucp.secure.sealing import Depot
 
 SEED = 1
@@ -123,7 +123,7 @@ def reconstruct(
     name: str,
     report_progress: ReportProgress = lambda sentence: None,
     *,
-    opener: "Opener | None" = None,
+    opener: "DatagramOpener | None" = None,
     depot: "Depot | None" = None,
     keys: "PublicKeys | None" = None,
 ) -> Reconstruction:

@@ -17,7 +17,7 @@ from harness.checker.evidence import Evidence
 from harness.checker.lost_lines import lost_lines
 from harness.checker.missing_incarnations import lacking_traces
 from harness.checker.recorded_inputs import decoded
-from harness.checker.steps.end_of_record import Arrival, sent_to, unfinished
+from harness.checker.steps.end_of_record import MessageArrival, sent_to, unfinished
 from harness.checker.steps.follower import StepComparer
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError
@@ -210,12 +210,14 @@ class Record:
         others_until_s = max(others, default=0.0) - self.header.late_s
         return unfinished(follower, trace, others_until_s, self._coming() if flight.exports else None)
 
-    def _coming(self) -> Iterator[Arrival]:
+    def _coming(self) -> Iterator[MessageArrival]:
         """Yield the messages that reached the vehicle of the agent, or were sent to it if it has no capture."""
         if self.arrivals is None:
             yield from sent_to(self.agent_id, self.flight.traces)
         for seen in self.arrivals or ():
-            yield Arrival(seen.at_s, decode(seen.datagram).message.NAME, seen.sender, seen.sequence, arrived=True)
+            yield MessageArrival(
+                seen.at_s, decode(seen.datagram).message.NAME, seen.sender, seen.sequence, arrived=True
+            )
 
     def was_paused(self, since: float, until: float) -> bool:
         """Return true if the agent was paused, or may have been paused, between two mission seconds.

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Protocol
 
 from harness.checker.recorded_inputs import decoded
-from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.deviation import StepDeviation
 from harness.field._vehicle_captures import CapturedDatagram
 from harness.field.replay._agent_record import Record, RecordEntry
 from ucp.messages import MalformedDatagramError, Message, decode
@@ -36,7 +36,7 @@ class PlayedAgent(Protocol):
     def handler_of(self, message: Message) -> str: ...
 
 
-def ignored_messages(record: Record, play_to: Callable[[int], PlayedAgent]) -> tuple[int, Deviation] | None:
+def ignored_messages(record: Record, play_to: Callable[[int], PlayedAgent]) -> tuple[int, StepDeviation] | None:
     """Return the first message that the agent ignored, with its position. None if it ignored at most a few.
 
     `play_to` plays the entries up to a position.
@@ -61,7 +61,7 @@ def ignored_messages(record: Record, play_to: Callable[[int], PlayedAgent]) -> t
         f"vehicle at t={sighting.at_s:g} s; messages that reached the vehicle are missing at {len(places)} places, so "
         "the agent ignored them, or its socket discarded them"
     )
-    return position, Deviation(record.agent_id, entry.line, sighting.at_s, handler, what)
+    return position, StepDeviation(record.agent_id, entry.line, sighting.at_s, handler, what)
 
 
 def _without_line(record: Record) -> Iterator[tuple[int, CapturedDatagram]]:

@@ -14,9 +14,9 @@ from harness.archive.vocabulary import IGNORED_KINDS, first_unknown, unknown_nam
 from harness.checker.reference.algorithms import ON_TIMER
 from harness.checker.reference.state import State
 from harness.checker.steps import end_of_record, wrongly_dropped
-from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import OptionalTraceFields, StepComparer
-from harness.checker.steps.implementation import REFERENCE, Implementation
+from harness.checker.steps.implementation import REFERENCE, CoreImplementation
 from harness.checker.steps.single_line import LINES_AFTER, damage_that_explains
 from harness.field.replay._agent_record import Record, RecordEntry
 from harness.field.replay._ignored_messages import ignored_messages
@@ -49,26 +49,26 @@ class ReplayResult:
     """Number of handler runs that could not be compared."""
     lost: list[str] = field(default_factory=list)
     """Reasons why they could not be compared, as sentences."""
-    deviations: list[Deviation] = field(default_factory=list)
+    deviations: list[StepDeviation] = field(default_factory=list)
     positions: list[int] = field(default_factory=list)
     """The position at which each deviation was found. A missing step is found at the next entry."""
 
     def copy(self) -> "ReplayResult":
         return ReplayResult(self.steps, self.unjudged, list(self.lost), list(self.deviations), list(self.positions))
 
-    def add(self, position: int, deviations: Iterable[Deviation]) -> None:
+    def add(self, position: int, deviations: Iterable[StepDeviation]) -> None:
         for deviation in deviations:
             self.deviations.append(deviation)
             self.positions.append(position)
 
-    def insert(self, position: int, deviation: Deviation) -> None:
+    def insert(self, position: int, deviation: StepDeviation) -> None:
         """Add a deviation that was found after later ones."""
         number = bisect_left(self.positions, position)
         self.deviations.insert(number, deviation)
         self.positions.insert(number, position)
 
     @property
-    def first(self) -> Deviation | None:
+    def first(self) -> StepDeviation | None:
         return self.deviations[0] if self.deviations else None
 
 
@@ -87,7 +87,7 @@ class RecordPlayer:
     """
 
     def __init__(
-        self, record: Record, until_s: float | None = None, implementation: Implementation = REFERENCE
+        self, record: Record, until_s: float | None = None, implementation: CoreImplementation = REFERENCE
     ) -> None:
         self.record = record
         self._implementation = implementation
@@ -124,7 +124,7 @@ class RecordPlayer:
     def at_end(self) -> bool:
         return self.position == len(self.entries)
 
-    def deviations_here(self) -> list[Deviation]:
+    def deviations_here(self) -> list[StepDeviation]:
         """Return the deviations of the last entry, including those that only the next entry shows."""
         result = self.result
         here = result.deviations[bisect_left(result.positions, self.position) :]
@@ -258,7 +258,7 @@ class RecordPlayer:
         if follower.lost is not None:
             result.lost.append(follower.lost)
 
-    def _excuse(self, deviations: list[Deviation]) -> str | None:
+    def _excuse(self, deviations: list[StepDeviation]) -> str | None:
         """Return a reason for the deviations that is not an error of the agent, such as missing lines. Return None if
         there is no such reason.
         """
@@ -268,7 +268,7 @@ class RecordPlayer:
         shift = self._clock_set.shift_near(self.position) if of_timers else None
         return shift or self._doubt(deviations)
 
-    def _doubt(self, deviations: list[Deviation]) -> str | None:
+    def _doubt(self, deviations: list[StepDeviation]) -> str | None:
         """Return damage to a single line that would also explain the deviations, or None.
 
         It is a coincidence at most a few times in a record. If it explains more places, the deviations count.
@@ -294,7 +294,7 @@ class _DoubtingPlayer(RecordPlayer):
         self.found: dict[int, str | None] = {}
         """The positions of deviations, each with the damage that explains it, or None."""
 
-    def _doubt(self, deviations: list[Deviation]) -> str | None:
+    def _doubt(self, deviations: list[StepDeviation]) -> str | None:
         if self.position not in self.found:
             if len(self.found) > MAX_TRIED or sum(why is not None for why in self.found.values()) > MAX_DOUBTS:
                 return None

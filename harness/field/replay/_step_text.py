@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from harness.checker.recorded_inputs import decoded
-from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.deviation import StepDeviation
 from harness.field.replay._agent_record import RecordEntry
 from harness.field.replay._player import RecordPlayer
 from harness.field.replay.breakpoints import source_of
@@ -91,14 +91,14 @@ class StepText:
         if run.tally:
             yield _row("counted", ", ".join(self._counted(key, count) for key, count in run.tally.items()))
 
-    def deviation(self, deviation: Deviation) -> Text:
+    def deviation(self, deviation: StepDeviation) -> Text:
         """Return the line about a deviation. It names the step if that is not the last one."""
         entry = self._player.entry
         own = entry is not None and entry.line == deviation.line and isinstance(entry.content, HandlerRun)
         whose = "" if own else f"of line {deviation.line}, {deviation.handler}: "
         return shown(f"  ✘ {whose}{deviation.difference(self._names.of)}", style="bold red")
 
-    def side_by_side(self, deviation: Deviation) -> Table | Text:
+    def side_by_side(self, deviation: StepDeviation) -> Table | Text:
         """Return a table of the recorded step and the step of the reference. Differences are marked."""
         if deviation.run is None or deviation.expected is None:
             return self.deviation(deviation)

@@ -13,7 +13,7 @@ from harness.checker import Evidence, steps
 from harness.checker.judgement import Judgement
 from harness.checker.lost_lines import lost_lines
 from harness.checker.missing_incarnations import lacking_traces
-from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.deviation import StepDeviation
 from harness.errors import FieldError
 from harness.field.ingest import Flight
 from harness.field.replay._agent_record import Record
@@ -65,7 +65,7 @@ def _up_to_loss(trace: Trace, doubtful: Mapping[int, str]) -> Trace:
 
 def _judge_steps(evidence: Evidence, results: Mapping[int, ReplayResult | str]) -> Judgement:
     """Judge the results of the replays. A result in words is the reason why a trace cannot be judged."""
-    deviations: list[Deviation] = []
+    deviations: list[StepDeviation] = []
     judged, unjudged, lost = 0, 0, list[str]()
     for agent_id, result in results.items():
         if isinstance(result, str):

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.text import Text
 
 from harness.checker.judgement import times
-from harness.checker.steps.deviation import Deviation
+from harness.checker.steps.deviation import StepDeviation
 from harness.field.replay._agent_record import Record
 from harness.field.replay._player import ReplayResult
 from harness.field.replay.breakpoints import source_of
@@ -88,7 +88,7 @@ def replayed(record: Record, result: ReplayResult, names: ReplayNames) -> Replay
     )
 
 
-def _difference(deviation: Deviation, names: ReplayNames) -> DifferenceRecord:
+def _difference(deviation: StepDeviation, names: ReplayNames) -> DifferenceRecord:
     handler = HANDLERS.get(deviation.handler or "")
     return DifferenceRecord(
         line=deviation.line,
@@ -142,7 +142,7 @@ def _differences(record: Record, result: ReplayResult, steps: str, names: Replay
     yield shown(f"  line {first.line}, t={first.t:g} s: {title(first)}")
     yield shown(f"  {first.difference(names.of)}", style="red")
     yield shown(f"  ucp-harness replay {record.argument} --break {first.line}", style="dim")
-    of_handler: dict[str, list[Deviation]] = {}
+    of_handler: dict[str, list[StepDeviation]] = {}
     for deviation in result.deviations:
         of_handler.setdefault(title(deviation), []).append(deviation)
     if len(of_handler) > 1:
@@ -151,7 +151,7 @@ def _differences(record: Record, result: ReplayResult, steps: str, names: Replay
             yield shown(f"  {name}: {times(len(deviations))}, line {deviations[0].line}, t={deviations[0].t:g} s")
 
 
-def title(deviation: Deviation) -> str:
+def title(deviation: StepDeviation) -> str:
     """Return the title of a deviation, such as "Algorithm 13, receive_request_next_in_sequence
     (ucp/reconcile.py:130)".
     """

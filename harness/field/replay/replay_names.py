@@ -6,7 +6,7 @@ from functools import cached_property
 
 from harness.archive.exports import name_blocks
 from harness.archive.traces import Trace
-from harness.checker.recorded_inputs import Blocks, NotOnRecordError, decoded
+from harness.checker.recorded_inputs import BlockIndex, NotOnRecordError, decoded
 from harness.field.replay._agent_record import Record
 from ucp.block import Block
 from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError
@@ -53,7 +53,7 @@ class ReplayNames:
         return {name: block_hash for block_hash, name in self._names.items()}
 
 
-class RecordedBlocks(Blocks):
+class RecordedBlocks(BlockIndex):
     """All blocks in the records of the flight, including those that the replay has not reached yet."""
 
     def __init__(self, record: Record) -> None:

@@ -15,7 +15,7 @@ OUT = "--out="
 """Option that passes the run directory to the command inside."""
 
 
-class Kernel(StrEnum):
+class UmlKernel(StrEnum):
     host = "host"
     uml = "uml"
 

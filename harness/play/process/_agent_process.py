@@ -28,8 +28,8 @@ from harness.play.agent_control import (
     AgentControl,
     AgentRefusedError,
     AgentSilentError,
+    AgentStatus,
     AgentUnsupportedError,
-    Status,
     is_shell_error,
     last_line,
     last_line_in,
@@ -75,7 +75,7 @@ class _Incarnation:
     store: Path
     """File in which the agent stores its state, if it has a disk."""
     processes: ChildProcesses = field(default_factory=ChildProcesses)
-    status: Status | None = None
+    status: AgentStatus | None = None
     """The last status that the agent reported."""
     status_between_s: tuple[float, float] = (0.0, 0.0)
     """Earliest and latest mission second at which the agent can have read its counters for `status`."""
@@ -132,7 +132,7 @@ class AgentProcess:
         return self.outcome == "running"
 
     @property
-    def status(self) -> Status | None:
+    def status(self) -> AgentStatus | None:
         """The newest status report since the last start, or None if the agent is neither running nor paused."""
         return self._incarnations[-1].status if self.outcome in ("running", "paused") else None
 
@@ -296,18 +296,18 @@ class AgentProcess:
             await asyncio.wait_for(process.wait(), END_LIMIT_S)
         return process.returncode is not None
 
-    async def poll(self) -> Status | None:
+    async def poll(self) -> AgentStatus | None:
         """Request the status of the agent. Return None if the agent is dead or paused. Raises the errors of `ask`."""
         async with self._control_lock:
             return await self._ask_status() if self.awake else None
 
-    async def _ask_status(self) -> Status:
+    async def _ask_status(self) -> AgentStatus:
         requested_s = self._now()
         return self._accept_status(await self.ask("status"), requested_s)
 
-    def _accept_status(self, answer: dict[str, Any], requested_s: float) -> Status:
+    def _accept_status(self, answer: dict[str, Any], requested_s: float) -> AgentStatus:
         try:
-            status = Status.model_validate(answer)
+            status = AgentStatus.model_validate(answer)
         except ValidationError as error:
             wrong = ", ".join(dict.fromkeys(str(problem["loc"][0]) for problem in error.errors()))
             detail = f"does not follow the agent contract: in its status {wrong} is missing or wrong"

@@ -13,7 +13,7 @@ from harness.play.process._vehicle_process import VehicleProcess
 from harness.play.process._watchers import MissionTasks
 from harness.scenario import Scenario
 from netem.radio import Place
-from sitl.address import Address
+from sitl.address import ListenAddress
 from sitl.circumstances import SimulatedFailure
 from sitl.ground_station import GroundStation
 from sitl.system_ids import system_ids
@@ -65,7 +65,7 @@ class Fleet:
         show("starting vehicles")
         await asyncio.gather(*(self._boot(vehicle, lab) for vehicle in self._vehicles.values()))
         if self._scenario.gcs:
-            self._station = await self._open_station(Address.parse(self._scenario.gcs))
+            self._station = await self._open_station(ListenAddress.parse(self._scenario.gcs))
         for vehicle in self._vehicles.values():
             await self._supervise(vehicle, lab)
         readied = [self._watchers.create_task(vehicle.get_ready()) for vehicle in self._vehicles.values()]
@@ -79,7 +79,7 @@ class Fleet:
     def _home_of(self, vehicle_id: int) -> Home:
         return self._scenario.vehicles.home_of(vehicle_id, self._scenario.roster.index(vehicle_id))
 
-    async def _open_station(self, address: Address) -> GroundStation:
+    async def _open_station(self, address: ListenAddress) -> GroundStation:
         try:
             return await GroundStation.open(address, self._clock.now, self._hand_over)
         except VehicleError as error:

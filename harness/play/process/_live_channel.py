@@ -22,7 +22,7 @@ from netem.radio import Place
 
 
 @dataclass(slots=True, eq=False)
-class _Message:
+class _ChannelMessage:
     frame: bytes
     sequence: int | None
     """The number of the message, if it is one of an agent."""
@@ -46,7 +46,9 @@ class LiveChannel:
     def __init__(self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int, journal: Journal) -> None:
         self._roster = tuple(roster)
         self._number = {vehicle: number for number, vehicle in enumerate(roster)}
-        self._traffic: ChannelTraffic[_Message] = ChannelTraffic(self._roster, radio, processing_s, seed, journal)
+        self._traffic: ChannelTraffic[_ChannelMessage] = ChannelTraffic(
+            self._roster, radio, processing_s, seed, journal
+        )
         self._medium = Medium(self._roster, seed, AT_ONCE)
         self._due: list[FrameDelivery] = []
         self._order = count()
@@ -64,7 +66,7 @@ class LiveChannel:
     def send(self, at_s: float, vehicle: int, frame: bytes, data_bytes: int, sequence: int | None) -> None:
         """Let a vehicle send this frame on the channel. `data_bytes` is the length of the message in it."""
         at_s = max(at_s, self._played_s)
-        self._traffic.send(at_s, self._number[vehicle], _Message(frame, sequence), data_bytes)
+        self._traffic.send(at_s, self._number[vehicle], _ChannelMessage(frame, sequence), data_bytes)
 
     def pass_by(self, at_s: float, vehicle: int, frame: bytes) -> None:
         """Let a vehicle broadcast this frame without use of the channel."""

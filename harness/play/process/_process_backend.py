@@ -15,7 +15,7 @@ from harness.backend_names import BackendName
 from harness.play._pace import VirtualTimePace
 from harness.play.backend import Backend
 from harness.play.mission import Swarm
-from harness.play.progress import Progress
+from harness.play.progress import ProgressDisplay
 from harness.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class ProcessBackend(Backend):
         scenario: Scenario,
         seed: int,
         rundir: RunDirectory,
-        progress: Progress,
+        progress: ProgressDisplay,
         interrupted: asyncio.Event,
         *,
         interactive: bool = False,

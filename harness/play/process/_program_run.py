@@ -17,7 +17,7 @@ from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
 from harness.play._radio_range import TRACK_S, RadioRange
 from harness.play._vehicle_keys import KeyDirectories, key_directories
-from harness.play.agent_control import AgentRefusedError, Status
+from harness.play.agent_control import AgentRefusedError, AgentStatus
 from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.process._agent_process import AgentProcess, reboots_with_disk
 from harness.play.process._channel_process import ChannelProcess
@@ -27,7 +27,7 @@ from harness.play.process._rogue_process import RogueProcess
 from harness.play.process._run_lab import MissionLab, OpenLab
 from harness.play.process._watchers import MissionTasks, open_unless_interrupted
 from harness.play.process.process_preflight import add_rogue_listener
-from harness.play.progress import Progress, SwarmSnapshot
+from harness.play.progress import ProgressDisplay, SwarmSnapshot
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, NetworkChange, TimedInjection, describe, silent_injections
 from harness.scenario.fates import Fate
@@ -60,7 +60,7 @@ class ProgramRun:
         kinds: Mapping[int, VehicleKind],
         initial_data: bytes,
         rundir: RunDirectory,
-        progress: Progress,
+        progress: ProgressDisplay,
         interrupted: asyncio.Event,
         *,
         agent_commands: Mapping[int, Sequence[str]],
@@ -428,7 +428,7 @@ class ProgramRun:
         """Return the agents that are neither dead nor paused."""
         return [agent for agent in self.agents if agent.awake]
 
-    async def _statuses(self) -> dict[int, Status]:
+    async def _statuses(self) -> dict[int, AgentStatus]:
         """Return the status of each agent that is neither dead nor paused."""
         polled = await asyncio.gather(*(agent.poll() for agent in self.agents))
         return {agent.agent_id: status for agent, status in zip(self.agents, polled, strict=True) if status}

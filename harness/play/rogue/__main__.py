@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from harness.archive.directory import ROGUE_CONTROL, ROGUE_FILE
-from harness.play.rogue._journal import Journal
+from harness.play.rogue._journal import RogueJournal
 from harness.play.rogue._rogue import RogueLogic
 from harness.scenario.injection import MODELS, Lie
 from netem.frames import udp_broadcast
@@ -48,7 +48,7 @@ class RogueNode:
         self._sender = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)  # protocol 0 receives nothing
         self._sender.bind((LINK, 0))
         self._file = (directory / ROGUE_FILE).open("a", encoding="utf-8", buffering=1)
-        self._journal = Journal(self._write)
+        self._journal = RogueJournal(self._write)
         self._control = ControlServer(
             directory / ROGUE_CONTROL,
             {"start": self._start, "inject": self._inject, "status": self._status},

@@ -11,7 +11,7 @@ from dataclasses import replace
 from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import Bundle
-from ucp.secure.opening import Opener
+from ucp.secure.opening import DatagramOpener
 from ucp.secure.sealed_datagrams import Request
 from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
@@ -27,7 +27,7 @@ class CapturedKeys:
         self.agent_id = bundle.agent_id
         self._bundle = bundle
         self._random_bytes = random_bytes
-        self._opener = Opener(bundle)
+        self._opener = DatagramOpener(bundle)
         self._sessions: dict[int, Session] = {}
         """Forged sender -> its session."""
         self._signatures: dict[bytes, bytes] = {}

@@ -10,7 +10,7 @@ from ucp.block import HASH_BYTES
 from ucp.events import MAX_EVENT_BYTES
 from ucp.messages import Message
 from ucp.scapy import LAYERS, UCP, Block, CommitBlock, LoggableEvent, to_layer
-from ucp.wire import Kind
+from ucp.wire import FieldKind
 
 FORGED_EVENT_ID = 1
 FORGED_DATA = b"forged by a rogue node"
@@ -43,12 +43,12 @@ def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, r
         event = LoggableEvent(timestamp_us=timestamp_us, event_id=rng.randint(1, 254), data=data)
         return Block(agent_id=rng.choice(roster), events=[event])
 
-    content: dict[Kind, Callable[[], Any]] = {
-        Kind.U64: lambda: timestamp_us,
-        Kind.FLAG: lambda: rng.getrandbits(1),
-        Kind.HASH: lambda: rng.randbytes(HASH_BYTES),
-        Kind.OPTIONAL_HASH: lambda: rng.choice([None, rng.randbytes(HASH_BYTES)]),
-        Kind.BLOCK: block,
+    content: dict[FieldKind, Callable[[], Any]] = {
+        FieldKind.U64: lambda: timestamp_us,
+        FieldKind.FLAG: lambda: rng.getrandbits(1),
+        FieldKind.HASH: lambda: rng.randbytes(HASH_BYTES),
+        FieldKind.OPTIONAL_HASH: lambda: rng.choice([None, rng.randbytes(HASH_BYTES)]),
+        FieldKind.BLOCK: block,
     }
     message, layer = rng.choice([(message, layer) for message, layer in LAYERS.items() if name in (None, message.NAME)])
     return layer(**{field: content[kind]() for field, kind in message.WIRE.items()})

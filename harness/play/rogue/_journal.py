@@ -13,7 +13,7 @@ from harness.play.rogue._rogue import RogueDatagram
 LINES = 2000
 
 
-class Journal:
+class RogueJournal:
     def __init__(self, write: Callable[[dict[str, Any]], None]) -> None:
         self._write = write
         self._lines: Counter[int] = Counter()

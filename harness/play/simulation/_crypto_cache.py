@@ -15,7 +15,7 @@ from itertools import count
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from ucp.secure.crypto_suite import SenderKeys, SignatureClaim, verify
+from ucp.secure.crypto_suite import SenderKeys, UnverifiedSignature, verify
 from ucp.secure.envelope import read_clear_header
 from ucp.secure.sealed_datagrams import CryptoFunctions, decrypt, parse_body
 
@@ -49,7 +49,7 @@ class RecordedSignatures:
     def signer(self, private_key: bytes) -> "RecordingSigner":
         return RecordingSigner(private_key, self._made)
 
-    def verified(self, claim: SignatureClaim) -> bool:
+    def verified(self, claim: UnverifiedSignature) -> bool:
         """Return true if the signature is valid, with the same result as `ucp.secure.crypto_suite.verify`."""
         made_here = self._made.get(claim.signature) == (claim.public_key, claim.signed)
         return (made_here and next(self._number) % VERIFIED_EVERY != 0) or verify(claim)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from harness.play.simulation.foreign._foreign_swarm import ForeignSwarm
     from harness.play.simulation.foreign._virtual_program import ProgramPool
     from ucp.secure.bundle import PublicKeys
-    from ucp.secure.crypto_suite import SignatureClaim
+    from ucp.secure.crypto_suite import UnverifiedSignature
 
 ANY_INCARNATION = 0
 KEPT_MESSAGES = 10_000
@@ -140,7 +140,7 @@ class EventLoop:
         return self._keys.mission.public if self._keys else None
 
     @property
-    def verified(self) -> "Callable[[SignatureClaim], bool] | None":
+    def verified(self) -> "Callable[[UnverifiedSignature], bool] | None":
         """A function that verifies signatures, with a cache of those made in this run. None if the mission is not
         secured.
         """

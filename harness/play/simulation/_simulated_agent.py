@@ -6,7 +6,7 @@
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from harness.play.agent_control import Status
+from harness.play.agent_control import AgentStatus
 from ucp.agent import Agent
 from ucp.events import LoggableEvent
 from ucp.export import export_chain
@@ -72,9 +72,9 @@ class VirtualAgent(Protocol):
 
     # Queries about the agent, which are not part of the mission
 
-    def status(self) -> Status: ...
+    def status(self) -> AgentStatus: ...
 
-    def known_status(self) -> Status | None:
+    def known_status(self) -> AgentStatus | None:
         """Return the status of the agent, or None if the agent has failed."""
 
     def completed(self) -> list[bytes]:
@@ -111,9 +111,9 @@ class OwnAgent(Agent):
     def outgoing(self) -> Sequence[AgentOutput]:
         return self._due_to_send()
 
-    def status(self) -> Status:
+    def status(self) -> AgentStatus:
         state = self.state
-        return Status.model_construct(
+        return AgentStatus.model_construct(
             started=True,
             idle=state.idle,
             reconcile_in_progress=state.reconcile_in_progress,
@@ -126,7 +126,7 @@ class OwnAgent(Agent):
             dropped=dict(self.dropped),
         )
 
-    def known_status(self) -> Status:
+    def known_status(self) -> AgentStatus:
         return self.status()
 
     def completed(self) -> list[bytes]:

@@ -7,7 +7,7 @@ living agent, except the agent that it imitates. That agent would drop them as a
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from harness.play.rogue._journal import Journal
+from harness.play.rogue._journal import RogueJournal
 from harness.play.rogue._rogue import RogueLogic
 from harness.play.simulation.air import StrayDatagram, VirtualAir
 from harness.scenario.changes import TimedInjection
@@ -38,7 +38,7 @@ class VirtualRogue:
         self._air = air
         self._number = number
         self._wakes_at: float | None = None
-        self._journal = Journal(write)
+        self._journal = RogueJournal(write)
 
     @property
     def sent(self) -> dict[int, int]:

@@ -13,13 +13,13 @@ from typing import Any, Self
 
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
-from sitl.address import Address
+from sitl.address import ListenAddress
 from sitl.ground_station import GroundStation
 from sitl.serial_channel import ClientChannel
 from sitl.shown_vehicle import ShownVehicle
 from sitl.streams import heartbeat
 from sitl.system_ids import system_ids
-from sitl.track import Track
+from sitl.track import VehicleTrack
 from sitl.vehicle import VehicleError
 
 SHOW_S = 0.25
@@ -49,11 +49,11 @@ class StationTracks:
         self._shown_at = 0.0
 
     @classmethod
-    async def open(cls, scenario: Scenario, tracks: Mapping[int, Track], now: Callable[[], float]) -> Self:
+    async def open(cls, scenario: Scenario, tracks: Mapping[int, VehicleTrack], now: Callable[[], float]) -> Self:
         """Connect all vehicles to the ground station. Raises ScenarioError if it cannot be reached."""
         assert scenario.gcs is not None
         try:
-            station = await GroundStation.open(Address.parse(scenario.gcs), now, lambda vehicles: None)
+            station = await GroundStation.open(ListenAddress.parse(scenario.gcs), now, lambda vehicles: None)
         except VehicleError as error:
             raise ScenarioError(str(error)) from None
         shown, epoch_us, numbers = cls(station), time.time_ns() // 1000, system_ids(scenario.roster)

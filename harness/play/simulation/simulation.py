@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from harness.archive.run_record import Cycle
 from harness.errors import AgentFailedError, ScenarioError
 from harness.play._radio_range import TRACK_S, RadioRange, tracks_of
-from harness.play.agent_control import Status
+from harness.play.agent_control import AgentStatus
 from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.rogue.rogue_line import OF_NO_INJECTION, line_of
 from harness.play.simulation._event_loop import ANY_INCARNATION, EventLoop
@@ -31,7 +31,7 @@ from harness.scenario.fates import Fate
 from harness.scenario.faults import VehicleFault
 from netem.radio import Place
 from sitl.circumstances import SimulatedFailure
-from sitl.track import Track
+from sitl.track import VehicleTrack
 from ucp.trace import HandlerRun
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class Simulation(EventLoop):
         """The injections that the rogue node was ordered to make."""
 
     @property
-    def tracks(self) -> Mapping[int, Track]:
+    def tracks(self) -> Mapping[int, VehicleTrack]:
         """The flight paths of the vehicles. The table is empty if the scenario needs no positions."""
         return self._tracks
 
@@ -439,7 +439,7 @@ class Simulation(EventLoop):
             ),
         }
 
-    def _program_to_json(self, number: int, known: Sequence[Status | None]) -> dict[str, Any]:
+    def _program_to_json(self, number: int, known: Sequence[AgentStatus | None]) -> dict[str, Any]:
         """Return the command and version of a foreign agent. The result is empty for an agent of the harness."""
         agent_id = self.roster[number]
         if self._foreign_swarm is None or agent_id not in self._foreign_swarm:
@@ -447,7 +447,7 @@ class Simulation(EventLoop):
         version = next((status.version for status in reversed(known) if status), None)
         return {"command": self._foreign_swarm.command_of(agent_id), "version": version}
 
-    def _handler_runs(self, incarnation: Incarnation, status: Status | None) -> dict[str, int | float] | None:
+    def _handler_runs(self, incarnation: Incarnation, status: AgentStatus | None) -> dict[str, int | float] | None:
         """Return the number of handler runs of the agent. A foreign agent reports this number itself."""
         if status is None:
             return None

@@ -11,7 +11,7 @@ from harness.play._ground_station_check import refuse_unreachable_ground_station
 from harness.play._pace import VirtualTimePace
 from harness.play._vehicle_keys import require_key_packages
 from harness.play.backend import Backend
-from harness.play.progress import Progress, SwarmSnapshot
+from harness.play.progress import ProgressDisplay, SwarmSnapshot
 from harness.play.simulation.air import VirtualAir
 from harness.play.simulation.foreign._answer import AgentLacksError
 from harness.play.simulation.run_files import DiskRecorder
@@ -63,7 +63,7 @@ class SimulationBackend(Backend):
         scenario: Scenario,
         seed: int,
         rundir: RunDirectory,
-        progress: Progress,
+        progress: ProgressDisplay,
         interrupted: asyncio.Event,
         *,
         interactive: bool = False,

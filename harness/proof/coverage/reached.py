@@ -134,10 +134,10 @@ def reached_in(evidence: Evidence) -> ReachedStates:
 
 def simulate_watched(scenario: Scenario, seed: int, watch: Watch, **options: Any) -> Simulated:
     """Simulate a run with traces. Messages without effect are delivered too, so that traces show their branches."""
-    return simulate_in_memory(_Watched(watch), scenario, seed, deliver_all=True, **options)
+    return simulate_in_memory(_WatchedRunRecorder(watch), scenario, seed, deliver_all=True, **options)
 
 
-class _Watched(MemoryRecorder):
+class _WatchedRunRecorder(MemoryRecorder):
     def __init__(self, watch: Watch) -> None:
         super().__init__(tracing=True)
         self._watch = watch

@@ -39,7 +39,7 @@ Document = dict[str, Any]
 
 
 @dataclass(eq=False)
-class _Broadcast:
+class _BroadcastOnPath:
     """A broadcast message on the path. `count` numbers the messages of this sender with the same name."""
 
     sender: int
@@ -51,7 +51,7 @@ class _Broadcast:
 
 
 @dataclass
-class _Agent:
+class _AgentOnPath:
     """An agent on the path. `timers` maps each running timer to its number among all started timers and to its
     expiry.
     """
@@ -83,7 +83,7 @@ class PathScript:
         )
         """Number of pairs of instants on the path that must be equal by chance."""
         begin = graph.states[path[0]]
-        self._agents = [_Agent(place + 1, local) for place, local in enumerate(begin[AGENTS:])]
+        self._agents = [_AgentOnPath(place + 1, local) for place, local in enumerate(begin[AGENTS:])]
         self._sent: Counter[tuple[int, str]] = Counter()
         self._events: list[Document] = []
         self._ages = BlockAges()
@@ -188,7 +188,7 @@ class PathScript:
         if any(action.what == "lie" for action in move.actions):
             earliest += ROGUE_LATENCY_S
         other_s = round(max([at_s, earliest, *ends]), 3)
-        air: list[_Broadcast] = []
+        air: list[_BroadcastOnPath] = []
         acted_s = other_s if not ends else max(ends)
         for action in move.actions:
             agent = self._agents[action.place]
@@ -214,7 +214,7 @@ class PathScript:
         for agent, local in zip(self._agents, move.state[AGENTS:], strict=True):
             agent.local = local
 
-    def _act(self, agent: _Agent, action: AgentAction, now: float) -> AgentStep:
+    def _act(self, agent: _AgentOnPath, action: AgentAction, now: float) -> AgentStep:
         if action.what == "complete":
             self._events.append({"at_s": now, "agent": agent.agent_id})
             self._ages.completed(action.number)
@@ -232,7 +232,7 @@ class PathScript:
         self._timeline.append({"at_s": now, "kill": [agent.agent_id]})
         return AgentStep(DEAD, (), ())
 
-    def _apply(self, agent: _Agent, step: AgentStep, now: float) -> list[_Broadcast]:
+    def _apply(self, agent: _AgentOnPath, step: AgentStep, now: float) -> list[_BroadcastOnPath]:
         """Apply a step to an agent, and return the messages that it broadcasts."""
         agent.local = step.local
         if self._attack_entries is not None and step.local != DEAD:
@@ -249,10 +249,10 @@ class PathScript:
         for message in step.sent:
             name = self._swarm.local.messages[message].NAME
             self._sent[agent.agent_id, name] += 1
-            flights.append(_Broadcast(agent.agent_id, message, name, self._sent[agent.agent_id, name], now))
+            flights.append(_BroadcastOnPath(agent.agent_id, message, name, self._sent[agent.agent_id, name], now))
         return flights
 
-    def _in_wave_order(self, wave: MessageRound, flights: Sequence[_Broadcast]) -> list[_Broadcast]:
+    def _in_wave_order(self, wave: MessageRound, flights: Sequence[_BroadcastOnPath]) -> list[_BroadcastOnPath]:
         """Return the broadcasts in the order in which the round of messages lists them."""
         left, ordered = list(flights), []
         for place, message in wave.air:
@@ -262,9 +262,9 @@ class PathScript:
             ordered.append(flight)
         return ordered
 
-    def _hear(self, wave: MessageRound, air: Sequence[_Broadcast], acted_s: float) -> list[_Broadcast]:
+    def _hear(self, wave: MessageRound, air: Sequence[_BroadcastOnPath], acted_s: float) -> list[_BroadcastOnPath]:
         """Let each agent receive its messages of one round, and return their answers."""
-        answers: dict[int, list[_Broadcast]] = {}
+        answers: dict[int, list[_BroadcastOnPath]] = {}
         received: set[int] = set()
         for place, heard in enumerate(wave.heard):
             agent = self._agents[place]
@@ -301,7 +301,7 @@ class PathScript:
                     self._fate(flight, agent_id, drop=True)
         return [flight for place in range(len(wave.heard)) for flight in answers[place]]
 
-    def _fate(self, flight: _Broadcast, receiver: int | None, **what: Any) -> None:
+    def _fate(self, flight: _BroadcastOnPath, receiver: int | None, **what: Any) -> None:
         whom = {} if receiver is None else {"receiver": receiver}
         self._fates.append({"message": flight.name, "sender": flight.sender, **whom, "count": flight.count, **what})
 

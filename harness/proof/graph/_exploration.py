@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
-from harness.proof._progress_bar import LOOK_EVERY, Ended, ExplorationBudget, LimitReachedError, Progress
+from harness.proof._progress_bar import LOOK_EVERY, Ended, ExplorationBudget, ExplorationProgress, LimitReachedError
 from harness.proof.graph._expansion import StateExpansion, StateStore, SuccessorStore, cycles_left_alone, expanded
 from harness.proof.graph._workers import Workers
 from harness.proof.model._flaws import PropertyViolation
@@ -71,8 +71,8 @@ class StateGraph:
         if expansion.crossing:
             self.crossing[number] = expansion.crossing
 
-    def progress(self, seconds: float, asked: str | None = None) -> Progress:
-        return Progress(len(self.states), self.looked_at, self.transitions, self.depth, seconds, asked)
+    def progress(self, seconds: float, asked: str | None = None) -> ExplorationProgress:
+        return ExplorationProgress(len(self.states), self.looked_at, self.transitions, self.depth, seconds, asked)
 
     def path(self, number: int) -> list[int]:
         """Return the states on the path from the initial state to this one."""
@@ -89,7 +89,7 @@ def explore(
     most_bytes: float,
     most_s: float,
     workers: Workers | None = None,
-    watch: Callable[[Progress], None] = lambda progress: None,
+    watch: Callable[[ExplorationProgress], None] = lambda progress: None,
 ) -> StateGraph:
     """Explore all states, until a limit of memory or time is reached or a state shows a violation.
 
@@ -111,7 +111,7 @@ def explore(
     return graph
 
 
-def _all(graph: StateGraph, budget: ExplorationBudget, workers: Workers | None) -> Iterator[Progress]:
+def _all(graph: StateGraph, budget: ExplorationBudget, workers: Workers | None) -> Iterator[ExplorationProgress]:
     graph.reach(graph.swarm.initial, NO_PARENT)
     layer_ends = 1
     for looked_at, expansion in enumerate(_expansions(graph, budget, workers), 1):

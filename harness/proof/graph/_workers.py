@@ -57,7 +57,7 @@ class ForkedStates(NamedTuple):
     batch: StateBatch
 
 
-class Successors(NamedTuple):
+class SuccessorBatch(NamedTuple):
     """A worker's answer: the successors of some states. `batch` contains the successors that this worker has not sent
     before.
 
@@ -80,7 +80,7 @@ class NeededVotes(NamedTuple):
 class WorkerAnswer(NamedTuple):
     """An answer of a worker process, with the time and memory that it has used so far."""
 
-    answer: Successors | NeededVotes
+    answer: SuccessorBatch | NeededVotes
     memory_bytes: float
     processor_s: float
     steps: int
@@ -170,7 +170,7 @@ class _WorkerFunction:
         answer = self._needed(task) if isinstance(task, ForkedStates) else self._following(task)
         return WorkerAnswer(answer, memory_bytes(), time.process_time(), self._swarm.local.steps)
 
-    def _following(self, task: StateBatch) -> Successors:
+    def _following(self, task: StateBatch) -> SuccessorBatch:
         fresh: list[State] = []
         if len(self._reported) >= MAX_REPORTED:
             self._reported.clear()
@@ -187,7 +187,7 @@ class _WorkerFunction:
             known = len(fresh)
             expansion = expanded(self._swarm, state, number_of)
             expansions.append((len(fresh) - known, expansion))
-        return Successors(self._translator.encode(fresh), expansions)
+        return SuccessorBatch(self._translator.encode(fresh), expansions)
 
     def _needed(self, task: ForkedStates) -> NeededVotes:
         self._reported.clear()  # there are no further tasks for successors
@@ -220,7 +220,7 @@ class _WorkerHandle:
     def give_forks(self, states: Sequence[State]) -> None:
         self._worker.connection.send(ForkedStates(self._translator.encode(states)))
 
-    def receive(self) -> Successors | NeededVotes:
+    def receive(self) -> SuccessorBatch | NeededVotes:
         try:
             answer = self._worker.connection.recv()
         except EOFError:
@@ -238,7 +238,7 @@ class _WorkerHandle:
         return answer.answer
 
     def expansions_of(
-        self, answer: Successors, first: int, add: Callable[[State, int], int]
+        self, answer: SuccessorBatch, first: int, add: Callable[[State, int], int]
     ) -> Iterator[StateExpansion]:
         """Yield the successors of each state in the answer, beginning with state number `first`. `add` stores new
         states in the graph.
@@ -300,7 +300,7 @@ class Workers:
         loop.
         """
         for other, number, answer in self._answers(_WorkerHandle.give, states, check, first):
-            assert isinstance(answer, Successors)
+            assert isinstance(answer, SuccessorBatch)
             yield from other.expansions_of(answer, number, add)
 
     def needed(self, forks: Sequence[State], check: Check) -> Iterator[int | None]:
@@ -313,7 +313,7 @@ class Workers:
 
     def _answers(
         self, give: Give, states: Sequence[State], check: Check, first: int = 0
-    ) -> Iterator[tuple[_WorkerHandle, int, Successors | NeededVotes]]:
+    ) -> Iterator[tuple[_WorkerHandle, int, SuccessorBatch | NeededVotes]]:
         """Yield each answer in the order of the tasks, with its worker and the number of its first state.
 
         `states` may grow meanwhile.
@@ -323,7 +323,7 @@ class Workers:
                 self._handles = [_WorkerHandle(self._swarm) for _ in range(self._size)]
         idle = deque(self._handles)
         busy: dict[int, _WorkerHandle] = {}
-        answers: dict[int, tuple[_WorkerHandle, Successors | NeededVotes]] = {}
+        answers: dict[int, tuple[_WorkerHandle, SuccessorBatch | NeededVotes]] = {}
         due: deque[int] = deque()
         given = first
         while True:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from harness.proof._progress_bar import Ended, Progress, memory_bytes
+from harness.proof._progress_bar import Ended, ExplorationProgress, memory_bytes
 from harness.proof.attacker._attacker import AttackerKnowledge
 from harness.proof.attacker._forgeries import ForgeryMaterial
 from harness.proof.bounds import Bounds
@@ -32,7 +32,7 @@ Said = tuple[int, int]
 
 
 @dataclass
-class CollectedFigures:
+class SingleAgentFigures:
     """The figures of an exploration of single agents. `said` counts the different messages of all senders."""
 
     bounds: Bounds
@@ -58,14 +58,14 @@ def collect(
     *,
     most_bytes: float,
     most_s: float,
-    watch: Callable[[Progress], None] = lambda progress: None,
+    watch: Callable[[ExplorationProgress], None] = lambda progress: None,
     keep: Callable[[LocalStates], None] = lambda local: None,
-) -> CollectedFigures:
+) -> SingleAgentFigures:
     """Collect all agent states and messages, until a limit of memory or time is reached or a violation is found.
 
     `keep` is called with the local states of each division of the blocks.
     """
-    collected, began = CollectedFigures(bounds), time.monotonic()
+    collected, began = SingleAgentFigures(bounds), time.monotonic()
     try:
         for makers in divisions(bounds.agents, bounds.blocks, bounds.captured):
             collected.divisions += 1
@@ -111,7 +111,7 @@ def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator
 class _BlockDistribution:
     """The exploration of one distribution of the blocks among the agents."""
 
-    def __init__(self, collected: CollectedFigures, makers: tuple[int, ...]) -> None:
+    def __init__(self, collected: SingleAgentFigures, makers: tuple[int, ...]) -> None:
         self._collected = collected
         self._bounds = bounds = collected.bounds
         self._own = {
@@ -134,7 +134,7 @@ class _BlockDistribution:
         self._looked_at = 0
         """Number of states whose own actions have been explored."""
 
-    def collect(self, began: float) -> Iterator[Progress]:
+    def collect(self, began: float) -> Iterator[ExplorationProgress]:
         """Explore until no new states or messages appear. Yield the progress."""
         collected = self._collected
         earlier = collected.states
@@ -161,7 +161,7 @@ class _BlockDistribution:
                         self._hear(states[position], said)
                     heard[key] = len(states)
                     self._captor_hears(said)
-                    yield Progress(
+                    yield ExplorationProgress(
                         earlier + len(self._came_from),
                         collected.looked_at + self._looked_at,
                         collected.transitions,

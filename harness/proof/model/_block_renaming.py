@@ -18,7 +18,7 @@ Completed = tuple[bytes, int, int]
 """A completed block: its hash, the number of its agent, and its ordinal."""
 
 
-class Blocks:
+class NumberedBlocks:
     """An index of all known blocks and chains by number and by hash."""
 
     def __init__(self, inception: InceptionBlock, make: Callable[[int], Block]) -> None:

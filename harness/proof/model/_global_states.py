@@ -15,7 +15,14 @@ from harness.proof.bounds import FAULTS, MAX_COINCIDENCES, MAX_LIES, Bounds
 from harness.proof.model._block_renaming import Ordinals
 from harness.proof.model._canonical_order import CanonicalOrder, OrderedAgents, Places
 from harness.proof.model._flaws import PropertyViolation
-from harness.proof.model._instant import Actions, AgentAction, AgentStates, FinalRound, InstantOutcomes, MessageRound
+from harness.proof.model._instant import (
+    Actions,
+    AgentAction,
+    AgentStates,
+    FinalMessageRound,
+    InstantOutcomes,
+    MessageRound,
+)
 from harness.proof.model._known_states import DEAD
 from harness.proof.model._local_steps import LocalStates
 from harness.proof.model._snapshot import Started
@@ -61,7 +68,7 @@ class SwarmTransition(NamedTuple):
     """The previous ordinals of the blocks 1, 2, ... of `state`. Empty if they are unchanged."""
 
 
-class _Outcome(NamedTuple):
+class _InstantResult(NamedTuple):
     """The states of all agents after one instant of simultaneous actions and all messages that they cause.
 
     `running` has the previous number of each running timer. The other fields describe how the outcome came about.
@@ -70,10 +77,10 @@ class _Outcome(NamedTuple):
     agents: tuple[int, ...]
     running: tuple[int, ...]
     started: tuple[Started, ...]
-    way: FinalRound
+    way: FinalMessageRound
 
 
-class _Instant(NamedTuple):
+class _InstantResults(NamedTuple):
     """The results of one instant, independent of the exact timer values: expired timers, new blocks, remaining faults,
     and agents.
     """
@@ -82,7 +89,7 @@ class _Instant(NamedTuple):
     completed: int
     left: int
     lies: int
-    outcomes: tuple[_Outcome, ...]
+    outcomes: tuple[_InstantResult, ...]
 
 
 class ModelSwarm:
@@ -100,7 +107,7 @@ class ModelSwarm:
         self._order = (
             CanonicalOrder(self.local, self.zones, self.name_of) if bounds.alike or bounds.blocks_alike else None
         )
-        self._known: dict[tuple[tuple[int, ...], Actions, int], _Instant] = {}
+        self._known: dict[tuple[tuple[int, ...], Actions, int], _InstantResults] = {}
         self._running = lru_cache(MOST_KNOWN)(self._running_of)
         self._as_they_are = tuple(range(bounds.agents))
         own = [1] * bounds.agents if bounds.alike else range(1, bounds.agents + 1)
@@ -269,7 +276,7 @@ class ModelSwarm:
             return 0
         return ANY_NUMBER if self.bounds.losses is None else state[LEFT] // LOSSES
 
-    def _can_be(self, state: State, instant: _Instant) -> bool:
+    def _can_be(self, state: State, instant: _InstantResults) -> bool:
         """Return true if these timers can expire together and before all others. Each must already be able to expire
         first alone.
         """
@@ -277,7 +284,7 @@ class ModelSwarm:
             return True
         return self.zones.after(state[ZONE], instant.ended, ()) is not None
 
-    def _ordered(self, state: State, instant: _Instant, left: int) -> Iterator[OrderedAgents]:
+    def _ordered(self, state: State, instant: _InstantResults, left: int) -> Iterator[OrderedAgents]:
         completed = state[BLOCKS] + instant.completed
         only_timers = self.bounds.reduced and completed >= self.bounds.blocks and not left % COINCIDENCES
         for outcome in instant.outcomes:
@@ -291,26 +298,26 @@ class ModelSwarm:
             else:
                 yield self._order.of(outcome.agents, zone)
 
-    def _left(self, state: State, actions: Sequence[AgentAction], instant: _Instant) -> int:
+    def _left(self, state: State, actions: Sequence[AgentAction], instant: _InstantResults) -> int:
         """Return the number of faults that may still occur after these actions."""
         left = (state[LEFT] & instant.left) - instant.lies * LIES
         if self.bounds.coincidences:
             left -= self.coincidences(state, actions) * COINCIDENCES
         return left
 
-    def _instant(self, locals_: tuple[int, ...], actions: Actions, most_lost: int, *, tell: bool) -> _Instant:
+    def _instant(self, locals_: tuple[int, ...], actions: Actions, most_lost: int, *, tell: bool) -> _InstantResults:
         at = {timer: index + 1 for index, timer in enumerate(self._running(locals_))}
         left = ALL_LEFT
         for action in actions:
             if action.what in ONCE:
                 left &= ~(1 << ONCE.index(action.what))
-        return _Instant(
+        return _InstantResults(
             self._ended(locals_, actions),
             sum(action.what == "complete" for action in actions),
             left,
             int(any(action.what == "lie" for action in actions)),
             tuple(
-                _Outcome(there.locals, self._running_after(at, there), there.started if tell else (), way)
+                _InstantResult(there.locals, self._running_after(at, there), there.started if tell else (), way)
                 for there, way in self._instants.outcomes(locals_, actions, most_lost, tell=tell).items()
             ),
         )

@@ -69,7 +69,7 @@ class MessageRound(NamedTuple):
     heard: tuple[tuple[int, ...], ...]
 
 
-class FinalRound(NamedTuple):
+class FinalMessageRound(NamedTuple):
     """The last round of messages that leads to a result.
 
     `lost` is the number of lost messages, counted for each receiver. It is 0 if losses are not counted.
@@ -125,7 +125,7 @@ class InstantOutcomes:
 
     def outcomes(
         self, locals_: tuple[int, ...], actions: Sequence[AgentAction], most_lost: int, *, tell: bool
-    ) -> dict[AgentStates, FinalRound]:
+    ) -> dict[AgentStates, FinalMessageRound]:
         """Return the possible results of these actions. For each result, keep the rounds of messages with the fewest
         losses.
 
@@ -141,14 +141,14 @@ class InstantOutcomes:
                 started[place] = ()
             started[place] = self._still(started[place], step)
             air += [(place, message) for message in step.sent]
-        waiting: dict[tuple[AgentStates, _Said], FinalRound]
-        waiting = {(AgentStates(tuple(agents), tuple(started)), tuple(air)): FinalRound(0, None)}
-        silent: dict[AgentStates, FinalRound] = {}
+        waiting: dict[tuple[AgentStates, _Said], FinalMessageRound]
+        waiting = {(AgentStates(tuple(agents), tuple(started)), tuple(air)): FinalMessageRound(0, None)}
+        silent: dict[AgentStates, FinalMessageRound] = {}
         flawed = self._local.flawed
         rounds = 0
         while waiting:
             rounds += 1
-            after: dict[tuple[AgentStates, _Said], FinalRound] = {}
+            after: dict[tuple[AgentStates, _Said], FinalMessageRound] = {}
             for (there, said), way in waiting.items():
                 if not said or not flawed.isdisjoint(there.locals):
                     _keep(silent, there, way)
@@ -157,11 +157,11 @@ class InstantOutcomes:
                     known = after.get((heard, answers))
                     if known is None or way.lost + lost < known.lost:
                         wave = MessageRound(way.wave, said, orders) if tell else None
-                        after[heard, answers] = FinalRound(way.lost + lost, wave)
+                        after[heard, answers] = FinalMessageRound(way.lost + lost, wave)
             waiting = after
         if not self._bounds.settles:
             return silent
-        settled: dict[AgentStates, FinalRound] = {}
+        settled: dict[AgentStates, FinalMessageRound] = {}
         for there, way in silent.items():
             _keep(settled, AgentStates(tuple(map(self._local.settled, there.locals)), there.started), way)
         return settled
@@ -351,7 +351,7 @@ class InstantOutcomes:
         return sorted(matter)
 
 
-def _keep(ways: dict[AgentStates, FinalRound], there: AgentStates, way: FinalRound) -> None:
+def _keep(ways: dict[AgentStates, FinalMessageRound], there: AgentStates, way: FinalMessageRound) -> None:
     """Store this way to a result if it is the first one, or loses fewer messages than the stored one."""
     known = ways.get(there)
     if known is None or way.lost < known.lost:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from harness.proof.bounds import Bounds
-from harness.proof.model._block_renaming import Blocks
+from harness.proof.model._block_renaming import NumberedBlocks
 from harness.proof.model._flaws import PropertyViolation, flaw_of, is_deceived
 from harness.proof.model._snapshot import NAMES_OF_OTHERS, Snapshot, SnapshotParts, dead
 from ucp.state import AgentState
@@ -57,7 +57,7 @@ class KnownStates:
     docs/explanation/proof.md explains why this is sound.
     """
 
-    def __init__(self, bounds: Bounds, blocks: Blocks) -> None:
+    def __init__(self, bounds: Bounds, blocks: NumberedBlocks) -> None:
         self.bounds = bounds
         self.blocks = blocks
         self.others = tuple(range(FIRST_OTHER, bounds.agents + 1))

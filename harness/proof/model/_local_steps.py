@@ -9,7 +9,7 @@ from contextlib import suppress
 from functools import partial
 
 from harness.proof.bounds import Bounds
-from harness.proof.model._block_renaming import Blocks, Ordinals
+from harness.proof.model._block_renaming import NumberedBlocks, Ordinals
 from harness.proof.model._flaws import FLAWS_OF_STEPS, PropertyViolation
 from harness.proof.model._known_states import DEAD, FIRST, FIRST_OTHER, KnownStates
 from harness.proof.model._real_agents import RealAgents, end_at_once, end_timer, is_heard, log
@@ -52,7 +52,7 @@ class LocalStates(KnownStates):
     def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
         self.agents = RealAgents(bounds)
         first = self.agents.by_id[FIRST].state
-        super().__init__(bounds, Blocks(first.chain.inception, self.agents.made))
+        super().__init__(bounds, NumberedBlocks(first.chain.inception, self.agents.made))
         self.steps = 0
         """Number of steps that the real agent has computed."""
         self._counting = {agent_id: self.agents.new(agent_id) for agent_id in self.agents.by_id}

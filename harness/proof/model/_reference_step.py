@@ -26,7 +26,7 @@ Make = Callable[[int, Callable[[], None]], Agent]
 """Makes a new agent with this ID, which traces its handler runs and calls a function after each."""
 
 
-class _Run(NamedTuple):
+class _ReferenceRun(NamedTuple):
     """A handler run, and the state of the agent after it."""
 
     run: HandlerRun
@@ -69,11 +69,11 @@ class ReferenceComparison:
             put_back(traced, before)
         _error_of(traced, give)
         runs = [entry for entry in traced.trace() if isinstance(entry, HandlerRun)]
-        did = [_Run(run, after) for run, after in zip(runs, left, strict=False)]  # a crash leaves no state
+        did = [_ReferenceRun(run, after) for run, after in zip(runs, left, strict=False)]  # a crash leaves no state
         should_leave: list[tuple[Any, ...]] = []
         reference = self._reference(agent_id, before, lambda: should_leave.append(_state(reference.state)))
         _error_of(reference, to_reference)
-        should = [_Run(run, after) for run, after in zip(reference.trace(), should_leave, strict=False)]
+        should = [_ReferenceRun(run, after) for run, after in zip(reference.trace(), should_leave, strict=False)]
         return _first_difference(did, should, name_of)
 
     def _reference(
@@ -167,7 +167,9 @@ def _state(state: State | AgentState) -> tuple[Any, ...]:
     )
 
 
-def _first_difference(did: Sequence[_Run], should: Sequence[_Run], name_of: Callable[[str], str]) -> tuple[str, str]:
+def _first_difference(
+    did: Sequence[_ReferenceRun], should: Sequence[_ReferenceRun], name_of: Callable[[str], str]
+) -> tuple[str, str]:
     alike = 0
     for (run, left), (expected, should_leave) in zip(did, should, strict=False):
         if run.handler != expected.handler:
@@ -183,7 +185,7 @@ def _first_difference(did: Sequence[_Run], should: Sequence[_Run], name_of: Call
     return whose.handler, f"{_title(whose)}: it triggers {follows}; it should trigger {should_follow}"
 
 
-def _handler(runs: Sequence[_Run], number: int) -> str:
+def _handler(runs: Sequence[_ReferenceRun], number: int) -> str:
     return runs[number].run.handler if number < len(runs) else "nothing"
 
 

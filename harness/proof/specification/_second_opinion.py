@@ -6,7 +6,7 @@ from math import gcd
 from typing import Any
 
 from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED
-from harness.proof._progress_bar import Ended, Progress
+from harness.proof._progress_bar import Ended, ExplorationProgress
 from harness.proof._proof import Limits
 from harness.proof.bounds import Bounds, BoundsError
 from harness.proof.graph._exploration import explore
@@ -124,7 +124,10 @@ def _word(kind: str | None) -> str:
 
 
 def second_opinion(
-    bounds: Bounds, limits: Limits | None = None, *, watch: Callable[[Progress], None] = lambda progress: None
+    bounds: Bounds,
+    limits: Limits | None = None,
+    *,
+    watch: Callable[[ExplorationProgress], None] = lambda progress: None,
 ) -> SecondOpinion:
     """Explore the bounds in both ways, and return the results. Raises BoundsError for bounds that the specification
     does not support, and NoCheckerError without TLC.

@@ -99,12 +99,12 @@ def _of_record(agent: dict[str, Any]) -> Plain:
 
 def real(graph: StateGraph) -> Iterator[Plain]:
     """Yield all states that `harness.proof` found, without the remaining times of their timers."""
-    translator = _Translator(graph.swarm.local)
+    translator = _HashTranslator(graph.swarm.local)
     for state in graph.states:
         yield tuple(map(translator.plain, state[AGENTS:]))
 
 
-class _Translator:
+class _HashTranslator:
     """Translates the hashes of real agents to the names that the specification uses."""
 
     def __init__(self, local: LocalStates) -> None:

@@ -95,7 +95,7 @@ class TraceValidation:
 
 
 @dataclass
-class _Batch:
+class _EncodedStepBatch:
     """Encoded steps of several agents that TLC checks at once, with the name of the run of each."""
 
     chains: ChainNumbers = field(default_factory=ChainNumbers)
@@ -155,8 +155,8 @@ def validate(
     return validation
 
 
-def _batches(runs: Iterable[RunTraces], validation: TraceValidation) -> Iterator[tuple[Constants, _Batch]]:
-    batches: dict[Constants, _Batch] = {}
+def _batches(runs: Iterable[RunTraces], validation: TraceValidation) -> Iterator[tuple[Constants, _EncodedStepBatch]]:
+    batches: dict[Constants, _EncodedStepBatch] = {}
     for run in runs:
         validation.runs += 1
         validation.unread += [f"{run.name}: {problem}" for problem in run.problems]
@@ -166,7 +166,7 @@ def _batches(runs: Iterable[RunTraces], validation: TraceValidation) -> Iterator
             except _OutsideError as error:
                 validation.unread.append(f"{run.name}: agent {trace.header.agent_id}: {error}")
                 continue
-            batch = batches.setdefault(constants, _Batch())
+            batch = batches.setdefault(constants, _EncodedStepBatch())
             for life in lives(trace, header, batch.chains, ended=header.agent_id in run.ended):
                 batch.lives.append(life)
                 batch.names.append(run.name)
@@ -203,7 +203,7 @@ def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
     )
 
 
-def _look(constants: Constants, batch: _Batch, validation: TraceValidation) -> None:
+def _look(constants: Constants, batch: _EncodedStepBatch, validation: TraceValidation) -> None:
     """Let TLC check a batch. If TLC fails, divide the batch until only the agents that TLC cannot check are left
     out.
     """
@@ -215,7 +215,7 @@ def _look(constants: Constants, batch: _Batch, validation: TraceValidation) -> N
             return
         middle = len(batch.lives) // 2
         for half in (slice(middle), slice(middle, None)):
-            _look(constants, _Batch(batch.chains, batch.lives[half], batch.names[half]), validation)
+            _look(constants, _EncodedStepBatch(batch.chains, batch.lives[half], batch.names[half]), validation)
         return
     for number, (life, name) in enumerate(zip(batch.lives, batch.names, strict=True), 1):
         validation.lives += 1
@@ -234,7 +234,7 @@ def _config(constants: Constants) -> str:
     return "\n".join(["SPECIFICATION Spec", "VIEW Position", "CONSTANTS", *assigned, ""])
 
 
-def _rejected(constants: Constants, batch: _Batch) -> dict[int, tuple[int, tuple[str, ...]]]:
+def _rejected(constants: Constants, batch: _EncodedStepBatch) -> dict[int, tuple[int, tuple[str, ...]]]:
     """Return the rejected agents of a batch by number (from 1), each with the first rejected step and its differing
     parts. Raises CheckerError.
     """

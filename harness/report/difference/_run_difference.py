@@ -177,7 +177,7 @@ def compare(a: Path, b: Path) -> RunDifference:
 
     Raises RunDirectoryError if a directory is no run, or if the rosters or backends differ.
     """
-    run_a, run_b = _Run(a), _Run(b)
+    run_a, run_b = _ComparedRun(a), _ComparedRun(b)
     _check_comparable(run_a, run_b)
     agents: dict[int, AgentDifference] = {}
     handler_runs, exact = 0, True
@@ -191,7 +191,7 @@ def compare(a: Path, b: Path) -> RunDifference:
     return RunDifference(keys, ran, agents, handler_runs, exact, [*run_a.problems(), *run_b.problems()])
 
 
-class _Run:
+class _ComparedRun:
     """A run directory to compare."""
 
     def __init__(self, path: Path) -> None:
@@ -225,7 +225,7 @@ class _Run:
         return {"seed": self.record.seed, **(scenario.model_dump(mode="json", by_alias=True) if scenario else {})}
 
 
-def _check_comparable(a: _Run, b: _Run) -> None:
+def _check_comparable(a: _ComparedRun, b: _ComparedRun) -> None:
     for run in (a, b):
         if not run.roster:
             raise RunDirectoryError(f"{run.path / RUN_FILE}: it names no agents; play the run again")
@@ -239,7 +239,7 @@ def _check_comparable(a: _Run, b: _Run) -> None:
         )
 
 
-def _compare_traces(a: _Run, b: _Run, agent_id: int) -> tuple[int, bool, FirstDifference | None]:
+def _compare_traces(a: _ComparedRun, b: _ComparedRun, agent_id: int) -> tuple[int, bool, FirstDifference | None]:
     """Return the number of equal handler runs, true if the traces are equal to the last byte, and the first
     difference.
     """

@@ -33,7 +33,7 @@ class LinkLine(NamedTuple):
         return {"r": self.loss, "g": 1.0 - self.loss, "b": 0.1, "a": 1.0 - 0.7 * self.loss}
 
 
-class Links:
+class CurrentLinks:
     """The current positions of the vehicles, and the current loss rates of their links."""
 
     def __init__(self) -> None:

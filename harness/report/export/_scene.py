@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from harness.archive.run_record import RunRecord
 from harness.present.colours import inks
-from harness.report.export._links import FIELD, LinkLine, Links, vehicle_frame
+from harness.report.export._links import FIELD, CurrentLinks, LinkLine, vehicle_frame
 from harness.report.export._samples import FieldPosition
 
 _SIZE_M = 2.0
@@ -35,7 +35,7 @@ class FieldScene:
     """The 3D view over time. `links` contains the current loss rates."""
 
     def __init__(self, record: RunRecord, colours: Mapping[int, Any]) -> None:
-        self.links = Links()
+        self.links = CurrentLinks()
         self._record, self._colours = record, colours
         self._drawn: set[int] = set()
 

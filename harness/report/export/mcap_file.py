@@ -41,10 +41,10 @@ def write_mcap(recording: ExportedRun, path: Path, progress: Callable[[float], N
     Raises OSError.
     """
     with path.open("xb") as file:
-        return _write(recording, _Writer(file), progress)
+        return _write(recording, _McapWriter(file), progress)
 
 
-def _write(recording: ExportedRun, writer: "_Writer", progress: Callable[[float], None]) -> int:
+def _write(recording: ExportedRun, writer: "_McapWriter", progress: Callable[[float], None]) -> int:
     colours = colours_of(recording.agents)
     topics, scene = TopicConverter(recording), FieldScene(recording.archive.record, colours)
     for sample in recording.samples():
@@ -73,7 +73,7 @@ def _write(recording: ExportedRun, writer: "_Writer", progress: Callable[[float]
     return writer.messages
 
 
-class _Writer:
+class _McapWriter:
     """An MCAP file that is being written. A channel is added with its first message."""
 
     def __init__(self, file: IO[bytes]) -> None:

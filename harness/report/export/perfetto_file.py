@@ -61,7 +61,7 @@ def write_perfetto(recording: ExportedRun, path: Path, progress: Callable[[float
 
 
 def _write(recording: ExportedRun, file: IO[bytes], progress: Callable[[float], None]) -> int:
-    trace = _Trace(recording)
+    trace = _PerfettoTrace(recording)
     builder = StreamingTraceProtoBuilder(file)
     if recording.time.epoch_ns:
         builder.write_packet(trace.clocks())
@@ -78,7 +78,7 @@ def _write(recording: ExportedRun, file: IO[bytes], progress: Callable[[float], 
     return events
 
 
-class _Arrows:
+class _MessageArrows:
     """The numbers of all arrows. Each pair of a message and a receiver has its own arrow."""
 
     def __init__(self, messages: Iterable[Message]) -> None:
@@ -106,12 +106,12 @@ class _Arrows:
         return self._to.pop((trigger.sender, trigger.sequence, agent, run.t), None)
 
 
-class _Trace:
+class _PerfettoTrace:
     """Converts recorded values to packets, and describes each track when it is first used."""
 
     def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
-        self._arrows = _Arrows(recording.history.messages or ())
+        self._arrows = _MessageArrows(recording.history.messages or ())
         if self._arrows.backwards:
             recording.add_problem(
                 f"{self._arrows.backwards} messages were received before they were sent, according to the clocks of "

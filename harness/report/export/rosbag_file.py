@@ -16,7 +16,7 @@ from harness.archive.history import LATEST_S
 from harness.archive.traces import Gap, Header
 from harness.errors import MachineError, extra
 from harness.report.export._exported_run import ExportedRun
-from harness.report.export._links import FIELD, LinkLine, Links, vehicle_frame
+from harness.report.export._links import FIELD, CurrentLinks, LinkLine, vehicle_frame
 from harness.report.export._samples import (
     FieldPosition,
     HandlerRunSample,
@@ -58,7 +58,7 @@ def write_rosbag(recording: ExportedRun, path: Path, progress: Callable[[float],
 
 
 def _write(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    bag = _Messages(recording)
+    bag = _RosMessages(recording)
     written = 0
     with Writer(path, version=METADATA_VERSION, storage_plugin=StoragePlugin.SQLITE3) as writer:
         channels: dict[str, Any] = {}
@@ -73,12 +73,12 @@ def _write(recording: ExportedRun, path: Path, progress: Callable[[float], None]
     return written
 
 
-class _Messages:
+class _RosMessages:
     """The recorded values of a run as ROS messages."""
 
     def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
-        self._links = Links()
+        self._links = CurrentLinks()
         self._counts: dict[str, float] = {}
 
     def all(self) -> Iterator[Timed]:

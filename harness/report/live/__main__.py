@@ -16,9 +16,9 @@ from typing import Any
 from harness.archive.exports import RUN_FILE
 from harness.errors import HarnessError
 from harness.report.live.change_log import ChangeLog
-from harness.report.live.feed import Feed
+from harness.report.live.feed import ChangeFeed
 from harness.report.live.feed_to_log import copy_live_run
-from harness.report.live.server import UPDATE_S, Server
+from harness.report.live.server import UPDATE_S, LivePageServer
 
 MAX_UNWATCHED_S = 3.0
 """Seconds without a page after which the server ends. A page that is reloaded reconnects within this time."""
@@ -28,7 +28,7 @@ async def main(directory: Path, port: int) -> None:
     reader = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
     log, ended = ChangeLog(), asyncio.Event()
-    server = Server(log, directory, live=True, on_request=_send_request)
+    server = LivePageServer(log, directory, live=True, on_request=_send_request)
     async with server.open(port) as address:
         _print(address)
         following = asyncio.create_task(_follow_run(directory, log, ended))
@@ -53,7 +53,7 @@ def _send_request(page: int, request: Any) -> None:
         _print(json.dumps([page, request.get("number"), request]))
 
 
-async def _read_until_over(reader: asyncio.StreamReader, server: Server, log: ChangeLog) -> bool:
+async def _read_until_over(reader: asyncio.StreamReader, server: LivePageServer, log: ChangeLog) -> bool:
     """Read messages until the run is over. Return False if the process of the run ended early."""
     while line := await reader.readline():
         kind, *rest = json.loads(line)
@@ -73,13 +73,13 @@ async def _follow_run(directory: Path, log: ChangeLog, ended: asyncio.Event) -> 
             return
         await asyncio.sleep(UPDATE_S)
     try:
-        with contextlib.closing(Feed(directory)) as feed:
+        with contextlib.closing(ChangeFeed(directory)) as feed:
             await copy_live_run(feed, log, ended)
     except HarnessError as error:
         log.append([["note", str(error)]])  # the run goes on without the page
 
 
-async def _wait_until_unwatched(server: Server) -> None:
+async def _wait_until_unwatched(server: LivePageServer) -> None:
     unwatched_s = MAX_UNWATCHED_S if server.readers == 0 else 0.0
     while unwatched_s < MAX_UNWATCHED_S:
         await asyncio.sleep(UPDATE_S)

@@ -28,7 +28,7 @@ _NO_EFFECT = b'"branch":"no vote running"'
 _NO_CHANGES = b'"changes":[],"sent":[]'
 
 
-class Receipt(NamedTuple):
+class MessageReceipt(NamedTuple):
     """The reception of message `seq` of `sender` by an agent."""
 
     t: float
@@ -45,14 +45,14 @@ class SentMessage(NamedTuple):
     block: str | None
 
 
-class AgentCourse:
+class AgentActions:
     """The actions of one agent so far. Callers take the lists `changes`, `sent` and `receipts`, and empty them."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self.agent_id = agent_id
         self.changes: list[Change] = []
         self.sent: list[SentMessage] = []
-        self.receipts: list[Receipt] = []
+        self.receipts: list[MessageReceipt] = []
         self.at_s = 0.0
         """Mission second of the last entry that was read."""
         self.problem: str | None = None
@@ -60,7 +60,7 @@ class AgentCourse:
         self.has_messages_without_effect = False
         """True if the trace contains a message without effect. Traces of virtual time omit these by default."""
         self._trace = AgentTrace(agents, agent_id)
-        self._ahead: Receipt | HandlerRun | DroppedDatagram | None = None
+        self._ahead: MessageReceipt | HandlerRun | DroppedDatagram | None = None
         """An entry that was read, but is later than the requested mission second."""
         self._has_started = False
         self._held = HeldBlocks()
@@ -82,7 +82,7 @@ class AgentCourse:
                 return False
             self._ahead = None
             self.at_s = max(self.at_s, entry.t)
-            if isinstance(entry, Receipt):
+            if isinstance(entry, MessageReceipt):
                 self.receipts.append(entry)
             elif isinstance(entry, HandlerRun):
                 self._handler_run(entry)
@@ -98,7 +98,7 @@ class AgentCourse:
     def close(self) -> None:
         self._trace.close()
 
-    def _next(self) -> Receipt | HandlerRun | DroppedDatagram | None:
+    def _next(self) -> MessageReceipt | HandlerRun | DroppedDatagram | None:
         """Return the next entry that has a valid time, or None."""
         while self.problem is None:
             line = self._trace.next()
@@ -108,7 +108,7 @@ class AgentCourse:
             self.has_messages_without_effect = self.has_messages_without_effect or _NO_EFFECT in line
             if _NO_CHANGES in line and (match := _RECEIPT_LINE.match(line)) and not self._may_be_idle_too_early(line):
                 t, sender, seq = match.groups()
-                entry: Receipt | Header | Entry = Receipt(float(t), int(sender), int(seq))
+                entry: MessageReceipt | Header | Entry = MessageReceipt(float(t), int(sender), int(seq))
             else:
                 try:
                     entry = parse_line(line)
@@ -135,7 +135,7 @@ class AgentCourse:
     def _handler_run(self, run: HandlerRun) -> None:
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger):
-            self.receipts.append(Receipt(run.t, trigger.sender, trigger.sequence))
+            self.receipts.append(MessageReceipt(run.t, trigger.sender, trigger.sequence))
         for sent in run.sent:
             self.sent.append(SentMessage(run.t, sent.seq, sent.message[:80], sent.block and sent.block[:KEY_LENGTH]))
         if run.changes:

@@ -76,7 +76,7 @@ class _TimedFile(Generic[TimedLine]):
         self._file.close()
 
 
-class Surroundings:
+class NetworkAndVehicles:
     """The network and the vehicles of a run so far. Callers take the list `changes` and empty it."""
 
     def __init__(self, directory: Path, vehicles: Collection[int]) -> None:

@@ -39,8 +39,8 @@ from harness.errors import RunDirectoryError
 from harness.play.backends import in_virtual_time
 from harness.present.colours import inks
 from harness.report.facts import link_qualities
-from harness.report.live._agent_course import AgentCourse, Change, Receipt, SentMessage
-from harness.report.live._surroundings import Surroundings
+from harness.report.live._agent_course import AgentActions, Change, MessageReceipt, SentMessage
+from harness.report.live._surroundings import NetworkAndVehicles
 from harness.scenario.faults import TIMELINE_FAULTS, VehicleFault
 from harness.scenario.verdict_names import kind_of
 
@@ -72,7 +72,7 @@ class _Broadcast:
         return self.mask != before
 
 
-class Feed:
+class ChangeFeed:
     """The stream of changes in a run directory.
 
     Raises RunDirectoryError if the directory is no run, has nothing to show, or has more than `MAX_VEHICLES` vehicles.
@@ -91,8 +91,8 @@ class Feed:
             )
         agents = agents_directory(directory)
         self._bit = {agent_id: 1 << number for number, agent_id in enumerate(self._roster)}
-        self._courses = [AgentCourse(agents, agent_id) for agent_id in self._roster]
-        self._surroundings = Surroundings(directory, self._roster)
+        self._courses = [AgentActions(agents, agent_id) for agent_id in self._roster]
+        self._surroundings = NetworkAndVehicles(directory, self._roster)
         self._broadcasts: dict[tuple[int, int], _Broadcast] = {}
         self._reported: dict[tuple[int, int], _Broadcast] = {}
         """The last reported messages: sender and sequence number -> message."""
@@ -188,7 +188,7 @@ class Feed:
 
     def _messages(self, *, report_all: bool) -> Iterator[Change]:
         """Yield the messages whose receivers have had time to record them. With `report_all`, yield all messages."""
-        happened: list[tuple[float, int, int, SentMessage | Receipt]] = []
+        happened: list[tuple[float, int, int, SentMessage | MessageReceipt]] = []
         for course in self._courses:
             happened += [(sent.t, 0, course.agent_id, sent) for sent in course.sent]
             happened += [(receipts.t, 1, course.agent_id, receipts) for receipts in course.receipts]
@@ -197,7 +197,7 @@ class Feed:
         happened.sort(key=itemgetter(0, 1))
         late: dict[tuple[int, int], _Broadcast] = {}
         for _, _, agent_id, what in happened:
-            if isinstance(what, Receipt):
+            if isinstance(what, MessageReceipt):
                 key = what.sender, what.seq
                 if key in self._reported and key not in self._broadcasts:
                     if (reported := self._reported[key]).add_receiver(self._bit[agent_id]):

@@ -3,14 +3,14 @@
 import asyncio
 
 from harness.report.live.change_log import ChangeLog
-from harness.report.live.feed import Feed
+from harness.report.live.feed import ChangeFeed
 from harness.report.live.server import UPDATE_S
 
 STRIDE_S = 20.0
 """Mission seconds that are read from all files in one step of a finished run."""
 
 
-async def copy_finished_run(feed: Feed, log: ChangeLog) -> None:
+async def copy_finished_run(feed: ChangeFeed, log: ChangeLog) -> None:
     """Write all changes of a finished run in order of time."""
     until_s = 0.0
     log.append([feed.run_change(live=False)])
@@ -26,7 +26,7 @@ async def copy_finished_run(feed: Feed, log: ChangeLog) -> None:
     log.append(feed.final_changes())
 
 
-async def copy_live_run(feed: Feed, log: ChangeLog, ended: asyncio.Event) -> None:
+async def copy_live_run(feed: ChangeFeed, log: ChangeLog, ended: asyncio.Event) -> None:
     """Write the changes of an active run until it has a result, or until `ended` is set because its process ended."""
     log.append([feed.run_change(live=True)])
     while True:

@@ -37,27 +37,27 @@ GONE_S = 20.0
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 RequestHandler = Callable[[int, Any], None]
-"""Receives the number of a page and its request. `Server.answer` sends the answer."""
+"""Receives the number of a page and its request. `LivePageServer.answer` sends the answer."""
 MOST_ANSWERS = 32
 """Maximum number of waiting answers of one page. Further answers replace the oldest."""
 
 
 @dataclass(frozen=True)
-class _File:
+class _PageFile:
     content: bytes
     content_type: str
 
 
-def _files() -> Mapping[str, _File]:
+def _files() -> Mapping[str, _PageFile]:
     files = {
-        str(path.relative_to(_PAGE)): _File(path.read_bytes(), _TYPES[path.suffix])
+        str(path.relative_to(_PAGE)): _PageFile(path.read_bytes(), _TYPES[path.suffix])
         for path in sorted(_PAGE.rglob("*"))
         if path.suffix in _TYPES
     }
-    return {"palette.css": _File(PALETTE.encode(), _TYPES[".css"]), **files}
+    return {"palette.css": _PageFile(PALETTE.encode(), _TYPES[".css"]), **files}
 
 
-class _Page:
+class _OpenPage:
     """A page that is open in a browser."""
 
     def __init__(self, socket: web.WebSocketResponse) -> None:
@@ -65,7 +65,7 @@ class _Page:
         self.answers: deque[str] = deque(maxlen=MOST_ANSWERS)
 
 
-class Server:
+class LivePageServer:
     """A web server for the log of one run. `live` is true if the run is still active."""
 
     def __init__(
@@ -76,7 +76,7 @@ class Server:
         self._token = secrets.token_urlsafe(24)
         self._files = _files()
         self._hosts: tuple[str, ...] = ()
-        self._pages: dict[int, _Page] = {}
+        self._pages: dict[int, _OpenPage] = {}
         self._opened = 0
 
     @contextlib.asynccontextmanager
@@ -159,7 +159,7 @@ class Server:
         socket = web.WebSocketResponse(heartbeat=GONE_S, max_msg_size=MAX_MESSAGE_BYTES, compress=False)
         await socket.prepare(request)
         self._opened += 1
-        number, page = self._opened, _Page(socket)
+        number, page = self._opened, _OpenPage(socket)
         self._pages[number] = page
         listening = asyncio.create_task(self._listen(number, socket))
         try:
@@ -181,7 +181,7 @@ class Server:
         if page in self._pages:
             self._pages[page].answers.append(json.dumps(answer) + "\n")
 
-    async def _send_changes(self, page: _Page) -> None:
+    async def _send_changes(self, page: _OpenPage) -> None:
         """Send answers and changes, no faster than the browser reads them."""
         start, caught_up = 0, False
         while not page.socket.closed:

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from harness.errors import HarnessError, MachineError, extra
 from harness.play.interventions import Interventions
-from harness.play.progress import Progress, SwarmSnapshot
+from harness.play.progress import ProgressDisplay, SwarmSnapshot
 
 STATE_EVERY_S = 0.1
 LAST_LOOK_S = 60.0
@@ -66,7 +66,7 @@ class LivePage:
         self.problem: str | None = None
         """After the run: a sentence about an early end of the server, or None."""
 
-    def tee(self, progress: Progress) -> Progress:
+    def tee(self, progress: ProgressDisplay) -> ProgressDisplay:
         """Return a progress display that forwards everything to `progress` and also updates the page."""
         return _ProgressTee(progress, self)
 
@@ -180,7 +180,7 @@ class LivePage:
 class _ProgressTee:
     """A progress display that also updates the live page."""
 
-    def __init__(self, progress: Progress, live_page: LivePage) -> None:
+    def __init__(self, progress: ProgressDisplay, live_page: LivePage) -> None:
         self._progress, self._page = progress, live_page
 
     def show(self, snapshot: SwarmSnapshot) -> None:

@@ -4,11 +4,11 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 from xml.etree import ElementTree
 
-from harness.report.logbook.positions import GlobalPosition, LogEntry, Track, coordinates, utc
+from harness.report.logbook.positions import EventTrack, GlobalPosition, LogEntry, coordinates, utc
 from ucp.telemetry import describe
 
 
-def geojson(tracks: Iterable[Track]) -> dict[str, Any]:
+def geojson(tracks: Iterable[EventTrack]) -> dict[str, Any]:
     """Return a GeoJSON FeatureCollection. Altitudes are metres above mean sea level.
 
     The property `times` of a LineString holds the time of each position. A vehicle with a single position has no
@@ -18,7 +18,7 @@ def geojson(tracks: Iterable[Track]) -> dict[str, Any]:
     return {"type": "FeatureCollection", "features": [feature for track in tracks for feature in _features(track)]}
 
 
-def _features(track: Track) -> Iterator[dict[str, Any]]:
+def _features(track: EventTrack) -> Iterator[dict[str, Any]]:
     fixes = track.fixes
     if len(fixes) >= 2:
         line = {"type": "LineString", "coordinates": [coordinates(position) for _, position in fixes]}
@@ -32,7 +32,7 @@ def _point(entry: LogEntry) -> dict[str, Any] | None:
     return {"type": "Point", "coordinates": coordinates(entry.position)} if entry.position else None
 
 
-def _properties(track: Track, entry: LogEntry) -> dict[str, Any]:
+def _properties(track: EventTrack, entry: LogEntry) -> dict[str, Any]:
     return {
         "agent": track.agent_id,
         "block": entry.block,
@@ -48,7 +48,7 @@ ElementTree.register_namespace("", _KML)
 ElementTree.register_namespace("gx", _GX)
 
 
-def kml(tracks: Iterable[Track]) -> str:
+def kml(tracks: Iterable[EventTrack]) -> str:
     """Return a KML document. The folder of each vehicle contains its flight path and its other events with their times.
 
     Altitudes are above mean sea level. An event is at the last position of the vehicle. Events before the first
@@ -68,7 +68,7 @@ def kml(tracks: Iterable[Track]) -> str:
     return xml.decode() + "\n"
 
 
-def _track(folder: ElementTree.Element, track: Track) -> None:
+def _track(folder: ElementTree.Element, track: EventTrack) -> None:
     placemark = _add(folder, "Placemark")
     _add(placemark, "name", f"track of vehicle {track.agent_id}")
     line = ElementTree.SubElement(placemark, f"{{{_GX}}}Track")

@@ -47,7 +47,7 @@ class LogEntry:
 
 
 @dataclass(frozen=True)
-class Track:
+class EventTrack:
     """All events of one agent. The oldest is first. `fixes` contains its positions with timestamps in microseconds."""
 
     agent_id: int
@@ -55,7 +55,7 @@ class Track:
     fixes: list[tuple[int, GlobalPosition]]
 
 
-def tracks(logbook: Logbook) -> list[Track]:
+def tracks(logbook: Logbook) -> list[EventTrack]:
     """Return the track of each agent that logged positions, by agent ID. There are none if the events are not
     telemetry.
     """
@@ -93,9 +93,9 @@ def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[Log
     return logged
 
 
-def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Track:
+def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> EventTrack:
     """Return a track of these events in order of time. Events with an impossible time are left out."""
-    track = Track(agent_id, [], [])
+    track = EventTrack(agent_id, [], [])
     possible = [pair for pair in logged if pair[0].timestamp_us <= LAST_TIMESTAMP_US]
     for event, block in sorted(possible, key=lambda pair: pair[0].timestamp_us):
         own = position_of(event.event_id, event.data)
@@ -115,7 +115,7 @@ class RoundedPosition(NamedTuple):
     alt_mm: int
 
 
-def recorded_tracks(record: RunRecord, recorded: Tracks) -> list[Track]:
+def recorded_tracks(record: RunRecord, recorded: Tracks) -> list[EventTrack]:
     """Return a track without events for each recorded vehicle, relative to the home position in the scenario."""
     if record.scenario is None:
         return []
@@ -123,8 +123,8 @@ def recorded_tracks(record: RunRecord, recorded: Tracks) -> list[Track]:
     return [_track(vehicle, fixes, home) for vehicle, fixes in recorded.by_vehicle.items()]
 
 
-def _track(vehicle: int, fixes: Sequence[PositionFix], home: Home) -> Track:
-    return Track(vehicle, [], [(round(fix.at_s * 1e6), _rounded_position(fix, home)) for fix in fixes])
+def _track(vehicle: int, fixes: Sequence[PositionFix], home: Home) -> EventTrack:
+    return EventTrack(vehicle, [], [(round(fix.at_s * 1e6), _rounded_position(fix, home)) for fix in fixes])
 
 
 def _rounded_position(fix: PositionFix, home: Home) -> RoundedPosition:

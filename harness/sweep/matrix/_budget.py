@@ -12,21 +12,21 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._estimate import BY_NAME, Estimate
-from harness.sweep.matrix._matrix_file import Point, Task
+from harness.sweep.matrix._matrix_file import MatrixPoint, MatrixTask
 
 _FIRST_RUNS = 2
 
 
 def informative(
-    tasks: Sequence[Task],
-    runs: Mapping[Task, Run],
+    tasks: Sequence[MatrixTask],
+    runs: Mapping[MatrixTask, Run],
     budget_s: float,
     clock: Callable[[], float] = time.monotonic,
-) -> Iterator[Task]:
+) -> Iterator[MatrixTask]:
     """Yield tasks until the budget is used up. `runs` has the results so far, and grows while this function yields."""
     until = clock() + budget_s
     begun = Counter(task.point for task in runs)
-    left: dict[Point, list[Task]] = {}
+    left: dict[MatrixPoint, list[MatrixTask]] = {}
     for task in tasks:
         left.setdefault(task.point, []).append(task)
     while left and clock() < until:
@@ -37,7 +37,7 @@ def informative(
             del left[point]
 
 
-def _information(point: Point, runs: Mapping[Task, Run], begun: int) -> float:
+def _information(point: MatrixPoint, runs: Mapping[MatrixTask, Run], begun: int) -> float:
     """Return the width of the widest interval of the cell, as the runs that have begun will probably leave it."""
     if begun < _FIRST_RUNS:
         return float(2 * _FIRST_RUNS - begun)

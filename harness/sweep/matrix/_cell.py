@@ -10,7 +10,7 @@ from harness.backend_names import BackendName
 from harness.scenario.verdict_names import ALL_CHECKS, UNFINISHED, Verdict, kind_of
 from harness.sweep.matrix import _growth_metrics
 from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, estimate_share
-from harness.sweep.matrix._matrix_file import Point, Task
+from harness.sweep.matrix._matrix_file import MatrixPoint, MatrixTask
 
 
 class CellRecord(BaseModel):
@@ -24,8 +24,8 @@ class CellRecord(BaseModel):
     duration_s: float | None = None
 
     @property
-    def point(self) -> Point:
-        return Point(self.loss, self.agents, self.backend, self.duration_s)
+    def point(self) -> MatrixPoint:
+        return MatrixPoint(self.loss, self.agents, self.backend, self.duration_s)
 
 
 class Run(CellRecord):
@@ -49,8 +49,8 @@ class Run(CellRecord):
         return self.failed is None and self.unsupported is None
 
     @property
-    def task(self) -> Task:
-        return Task(self.point, self.seed)
+    def task(self) -> MatrixTask:
+        return MatrixTask(self.point, self.seed)
 
 
 class Cell(CellRecord):
@@ -81,7 +81,7 @@ def is_wrong(verdict: Verdict) -> bool:
     return kind_of(verdict) == "bad" and verdict != UNFINISHED
 
 
-def sum_up(point: Point, runs: Sequence[Run], *, grows: bool = False) -> Cell:
+def sum_up(point: MatrixPoint, runs: Sequence[Run], *, grows: bool = False) -> Cell:
     """Return the summary of these runs. With `grows`, also estimate the figures for laws of growth."""
     failed = sum(run.failed is not None for run in runs)
     unsupported = sum(run.unsupported is not None for run in runs)

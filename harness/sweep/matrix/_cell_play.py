@@ -19,7 +19,7 @@ from harness.run.run import run
 from harness.scenario import Scenario
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._growth_metrics import growth_figures
-from harness.sweep.matrix._matrix_file import Matrix, Point, Task
+from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint, MatrixTask
 from harness.sweep.matrix._run_steps import fingerprint
 
 
@@ -77,7 +77,7 @@ class RunPlayer:
     covers: bool = False
     """True to measure the coverage of each run. In virtual time, `judge` is not used then."""
 
-    def __call__(self, task: Task) -> Run:
+    def __call__(self, task: MatrixTask) -> Run:
         scenario = self.matrix.scenario_at(task.point)
         in_memory = BACKENDS[task.point.backend].plays_in_memory
         try:
@@ -105,7 +105,7 @@ class RunPlayer:
             reached=reached,
         )
 
-    def refuse(self, points: Iterable[Point]) -> None:
+    def refuse(self, points: Iterable[MatrixPoint]) -> None:
         """Check before the first run that all combinations of values can be played.
 
         Raises HarnessError if a backend or this machine cannot play one of them.
@@ -113,7 +113,7 @@ class RunPlayer:
         for point in points:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
-    def _play_with_processes(self, scenario: Scenario, task: Task, reached: ReachedStates | None) -> JudgedRun:
+    def _play_with_processes(self, scenario: Scenario, task: MatrixTask, reached: ReachedStates | None) -> JudgedRun:
         """Play a run with real programs. Raises UnsupportedError, or RunFailedError that names the run directory."""
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # remains of an interrupted run
@@ -134,5 +134,5 @@ class RunPlayer:
         return JudgedRun(finished.played, finished.result)
 
 
-def directory_name(task: Task) -> str:
+def directory_name(task: MatrixTask) -> str:
     return f"{task.point.file_name}-{task.point.backend}-seed-{task.seed}"

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import yaml
 
-from harness.sweep.matrix._matrix_file import Matrix, Point
+from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 from ucp.agent_files import write_atomically
 
 DIRECTORY = "cells"
 
 
-def scenario_file(point: Point) -> str:
+def scenario_file(point: MatrixPoint) -> str:
     """Return the path of the scenario file, relative to the matrix's directory."""
     return f"{DIRECTORY}/{point.file_name}.yaml"
 

@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field
 from harness.play.backends import BACKENDS
 from harness.sweep.matrix._cell import Cell, CellRecord, Run
 from harness.sweep.matrix._estimate import BY_NAME, CONFIDENCE, Estimate, Metric, estimate_mean
-from harness.sweep.matrix._matrix_file import Point
+from harness.sweep.matrix._matrix_file import MatrixPoint
 from harness.sweep.matrix._run_steps import FirstChange
 
 
@@ -113,7 +113,7 @@ def compare_pairs(
     """Compare the runs of equal seeds, for all combinations of values that both matrices have."""
     earlier = {cell.point: cell for cell in before}
     runs = {run.task: run for run in runs_before}
-    pairs: dict[Point, list[tuple[Run, Run]]] = {}
+    pairs: dict[MatrixPoint, list[tuple[Run, Run]]] = {}
     for run in runs_now:
         if run.task in runs and run.point in earlier:
             pairs.setdefault(run.point, []).append((runs[run.task], run))
@@ -151,7 +151,7 @@ def _differ(was: Run, run: Run) -> bool:
     return steps_differ or (was.figures, was.verdicts) != (run.figures, run.verdicts)
 
 
-def is_paired(point: Point) -> bool:
+def is_paired(point: MatrixPoint) -> bool:
     """Return true if equal code always gives equal runs here, so that single runs can be compared."""
     return BACKENDS[point.backend].plays_in_memory
 

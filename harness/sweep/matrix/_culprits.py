@@ -41,7 +41,7 @@ def find_culprits(
         culprit = Culprit(**change.point._asdict(), metric=change.metric, seed=_worst_seed(tonight, baseline, change))
         try:
             with TemporaryDirectory(prefix="ucp-harness-culprits-") as directory:
-                search = _Search(tonight, baseline, culprit, Path(directory), deadline, report_progress)
+                search = _CulpritSearch(tonight, baseline, culprit, Path(directory), deadline, report_progress)
                 search.run()
         except _TimeIsUpError:
             culprit = culprit.model_copy(update={"problem": "the time for the search was used up"})
@@ -67,7 +67,7 @@ def _worst_seed(tonight: MatrixRecord, baseline: MatrixRecord, change: Change) -
     return max(by_seed, key=lambda seed: sign * ((by_seed[seed] or 0.0) - (before.get(seed) or 0.0)))
 
 
-class _Search:
+class _CulpritSearch:
     """The search for one run. Appends to the commits of `culprit`."""
 
     def __init__(

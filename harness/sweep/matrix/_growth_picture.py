@@ -31,7 +31,7 @@ TICK_WIDTH = 24.0
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class GrowthPanel:
     title: str
     metric: str
     over: Variable = "agents"
@@ -42,20 +42,20 @@ class Panel:
 
 
 PANELS = (
-    Panel("Messages per block", "messages_per_block"),
-    Panel("Messages", "messages"),
-    Panel("Bytes", "bytes"),
-    Panel("Messages per minute", "messages_per_minute"),
-    Panel("Reconciles per block", "reconciles_per_block"),
-    Panel("Blocks per minute, longest chain", "committed_per_minute"),
-    Panel("Runs with one uniform chain", "uniform"),
+    GrowthPanel("Messages per block", "messages_per_block"),
+    GrowthPanel("Messages", "messages"),
+    GrowthPanel("Bytes", "bytes"),
+    GrowthPanel("Messages per minute", "messages_per_minute"),
+    GrowthPanel("Reconciles per block", "reconciles_per_block"),
+    GrowthPanel("Blocks per minute, longest chain", "committed_per_minute"),
+    GrowthPanel("Runs with one uniform chain", "uniform"),
 )
 ALSO_OVER_BLOCKS = ("messages", "bytes")
 """Metrics that are also drawn over blocks if the matrix has three numbers of agents and three mission lengths."""
 
 
 @dataclass(frozen=True, slots=True)
-class LineKey:
+class ChartLineKey:
     """The values that are the same along a line of a chart. The value that varies along the line is None."""
 
     backend: BackendName
@@ -90,7 +90,7 @@ def draw_growth(record: MatrixRecord) -> str:
     )
 
 
-def panels_of(matrix: Matrix) -> list[Panel]:
+def panels_of(matrix: Matrix) -> list[GrowthPanel]:
     over_agents = [*PANELS] if matrix.grows_with_agents else []
     also = [panel for panel in PANELS if not over_agents or panel.metric in ALSO_OVER_BLOCKS]
     return over_agents + ([replace(panel, over="blocks") for panel in also] if matrix.grows_with_length else [])
@@ -130,7 +130,7 @@ def _foot(record: MatrixRecord) -> str:
     return f"Over N agents or B blocks. Dots: {dots}; lines: fitted power laws with their exponents."
 
 
-def _title(record: MatrixRecord, panel: Panel) -> str:
+def _title(record: MatrixRecord, panel: GrowthPanel) -> str:
     if panel.over == "agents":
         return panel.title
     one_loss = record.matrix.grows_with_agents and len(record.matrix.loss) > 1
@@ -154,7 +154,7 @@ def _legend(record: MatrixRecord) -> Markup:
     return Markup("").join(parts)
 
 
-def _lines(record: MatrixRecord, panel: Panel) -> list[PanelLine]:
+def _lines(record: MatrixRecord, panel: GrowthPanel) -> list[PanelLine]:
     """Return the lines of a chart.
 
     A line over agents has one mission length. A line over blocks has one number of agents; beside lines over agents,
@@ -162,7 +162,7 @@ def _lines(record: MatrixRecord, panel: Panel) -> list[PanelLine]:
     """
     matrix, over_agents = record.matrix, panel.over == "agents"
     losses = matrix.loss if over_agents or not matrix.grows_with_agents else [max(matrix.loss)]
-    by_place: dict[LineKey, list[Cell]] = {}
+    by_place: dict[ChartLineKey, list[Cell]] = {}
     for cell in record.cells:
         if cell.loss in losses:
             by_place.setdefault(_place_of(cell, panel), []).append(cell)
@@ -184,12 +184,12 @@ def _lines(record: MatrixRecord, panel: Panel) -> list[PanelLine]:
     ]
 
 
-def _place_of(item: Cell | Growth, panel: Panel) -> LineKey:
+def _place_of(item: Cell | Growth, panel: GrowthPanel) -> ChartLineKey:
     along = panel.over == "agents"
-    return LineKey(item.backend, item.loss, None if along else item.agents, item.duration_s if along else None)
+    return ChartLineKey(item.backend, item.loss, None if along else item.agents, item.duration_s if along else None)
 
 
-def _name(matrix: Matrix, losses: Sequence[float], place: LineKey) -> str:
+def _name(matrix: Matrix, losses: Sequence[float], place: ChartLineKey) -> str:
     """Return the values in which a line differs from the others, as text."""
     return ", ".join(
         [
@@ -201,7 +201,7 @@ def _name(matrix: Matrix, losses: Sequence[float], place: LineKey) -> str:
     )
 
 
-def _panel(record: MatrixRecord, panel: Panel, area: ChartArea) -> Markup:
+def _panel(record: MatrixRecord, panel: GrowthPanel, area: ChartArea) -> Markup:
     lines = _lines(record, panel)
     across, up = _across(panel, lines, area), _up(panel, lines, area)
     frame = svg.frame(
@@ -220,7 +220,7 @@ def _panel(record: MatrixRecord, panel: Panel, area: ChartArea) -> Markup:
     return Markup('<g class="panel">{}{}</g>\n').format(frame, Markup("").join(drawn))
 
 
-def _line(panel: Panel, line: PanelLine, across: Axis, up: Axis) -> Markup:
+def _line(panel: GrowthPanel, line: PanelLine, across: Axis, up: Axis) -> Markup:
     """Draw the dots with tooltips, and the fitted law. Without a law, draw straight lines between the dots."""
     points = [(x, y, cell) for cell in line.cells if (x := _x(panel, cell)) and (y := _y(panel, cell)) is not None]
     ends = _ends(panel, line) or [(x, y) for x, y, _ in points]
@@ -231,7 +231,7 @@ def _line(panel: Panel, line: PanelLine, across: Axis, up: Axis) -> Markup:
     return Markup('<g class="series {}">{}</g>').format(svg.CLASSES[line.number], Markup("").join(parts))
 
 
-def _power(panel: Panel, line: PanelLine, law: Law, prefix: str, x: float, y: float) -> Markup:
+def _power(panel: GrowthPanel, line: PanelLine, law: Law, prefix: str, x: float, y: float) -> Markup:
     """Write the exponent of a law into an empty corner of the chart."""
     value, margin = say_exponent(law.exponents[panel.over]).split("\u00b1")
     text = Markup('{}{}<tspan dy="-4" font-size="10">{}</tspan><tspan dy="4" font-size="10"> \u00b1{}</tspan>').format(
@@ -242,7 +242,7 @@ def _power(panel: Panel, line: PanelLine, law: Law, prefix: str, x: float, y: fl
     )
 
 
-def _ends(panel: Panel, line: PanelLine) -> list[tuple[float, float]]:
+def _ends(panel: GrowthPanel, line: PanelLine) -> list[tuple[float, float]]:
     """Return the ends of the law's line, at the first and the last dot."""
     xs = [x for cell in line.cells if (x := _x(panel, cell)) and _y(panel, cell)]
     if not line.law or not xs:
@@ -251,7 +251,7 @@ def _ends(panel: Panel, line: PanelLine) -> list[tuple[float, float]]:
     return [(x, line.law.factor * x**power) for x in (min(xs), max(xs))]
 
 
-def _across(panel: Panel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
+def _across(panel: GrowthPanel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
     """Return the horizontal axis. For numbers of agents, its ticks are these numbers if there is enough space."""
     xs = sorted({x for line in lines for cell in line.cells if (x := _x(panel, cell))}) or [1.0, 10.0]
     if panel.over == "blocks":
@@ -264,7 +264,7 @@ def _across(panel: Panel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
     return replace(axis, ticks=ticks)
 
 
-def _up(panel: Panel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
+def _up(panel: GrowthPanel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
     if panel.shares:
         return svg.share_axis(area.up)
     ys = [y for line in lines for cell in line.cells if (y := _y(panel, cell))]
@@ -272,12 +272,12 @@ def _up(panel: Panel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
     return svg.log_axis(min(ys, default=1.0), max(ys, default=10.0), area.up)
 
 
-def _x(panel: Panel, cell: Cell) -> float | None:
+def _x(panel: GrowthPanel, cell: Cell) -> float | None:
     """Return the value of a cell on the horizontal axis, or None if a logarithmic axis cannot show the value."""
     return float(cell.agents) if panel.over == "agents" else _mean("blocks", cell) or None
 
 
-def _y(panel: Panel, cell: Cell) -> float | None:
+def _y(panel: GrowthPanel, cell: Cell) -> float | None:
     mean = _mean(panel.metric, cell)
     return mean if mean or panel.shares else None
 
@@ -286,11 +286,11 @@ def _mean(metric: str, cell: Cell) -> float | None:
     return cell.estimates[metric].mean if metric in cell.estimates else None
 
 
-def _at(panel: Panel, cell: Cell) -> str:
+def _at(panel: GrowthPanel, cell: Cell) -> str:
     return f"{say_number(_x(panel, cell) or 0.0)} {panel.over}"
 
 
-def _say(panel: Panel, cell: Cell) -> str:
+def _say(panel: GrowthPanel, cell: Cell) -> str:
     return say(BY_NAME[panel.metric], cell.estimates.get(panel.metric, Estimate(n=0)))
 
 

@@ -9,7 +9,7 @@ from harness.proof import Bounds
 from harness.proof.coverage import ReachedStates, existing, to_json
 from harness.proof.coverage.reached import BRANCHES
 from harness.sweep.matrix._cell import CellRecord
-from harness.sweep.matrix._matrix_file import Matrix, Point
+from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 
 MOST_AGENTS, MOST_BLOCKS = 3, 3
 """Bounds of the states that coverage is compared with: numbers of agents and blocks."""
@@ -37,9 +37,9 @@ class CoverageTally:
     def __init__(self) -> None:
         self._runs = 0
         self._reached = ReachedStates()
-        self._by_point: dict[Point, ReachedStates] = defaultdict(ReachedStates)
+        self._by_point: dict[MatrixPoint, ReachedStates] = defaultdict(ReachedStates)
 
-    def add(self, point: Point, reached: ReachedStates) -> None:
+    def add(self, point: MatrixPoint, reached: ReachedStates) -> None:
         self._runs += 1
         self._reached.add(reached)
         self._by_point[point].add(reached)

@@ -12,7 +12,7 @@ from harness.errors import ScenarioError
 from harness.play.backends import BACKENDS
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
 from harness.scenario.scenario import MAX_DURATION_S
-from harness.scenario.strict_model import MAX_AGENTS, Model, Probability, Seconds
+from harness.scenario.strict_model import MAX_AGENTS, Probability, Seconds, StrictModel
 from ucp.short_value import shown
 
 MAX_SEEDS = 10_000
@@ -21,7 +21,7 @@ SIZES_FOR_GROWTH = 3
 """Numbers of agents, or mission lengths, from which on a matrix fits growth: two points fit any law."""
 
 
-class Point(NamedTuple):
+class MatrixPoint(NamedTuple):
     """A combination of values in the matrix. `duration_s` is None if the mission length is not varied."""
 
     loss: float
@@ -36,14 +36,14 @@ class Point(NamedTuple):
         return f"loss-{self.loss}-agents-{self.agents}{length}"
 
 
-class Task(NamedTuple):
+class MatrixTask(NamedTuple):
     """One run of the matrix: its combination of values, and its seed."""
 
-    point: Point
+    point: MatrixPoint
     seed: int
 
 
-class Matrix(Model):
+class Matrix(StrictModel):
     """A scenario and the values to vary: `backend`, `duration_s`, `agents`, `loss` and `seeds`.
 
     Each combination of values is one run. `loss` replaces the scenario's `network.loss`. `agents` and `duration_s`, if
@@ -88,18 +88,18 @@ class Matrix(Model):
         return list(range(1, self.seeds + 1)) if isinstance(self.seeds, int) else self.seeds
 
     @property
-    def points(self) -> list[Point]:
+    def points(self) -> list[MatrixPoint]:
         agents = self.agents or [len(self.scenario.roster)]
         return [
-            Point(loss, number, backend, duration_s)
+            MatrixPoint(loss, number, backend, duration_s)
             for backend, duration_s, number, loss in product(self.backend, self.duration_axis, agents, self.loss)
         ]
 
     @property
-    def tasks(self) -> list[Task]:
-        return [Task(point, seed) for point in self.points for seed in self.seed_list]
+    def tasks(self) -> list[MatrixTask]:
+        return [MatrixTask(point, seed) for point in self.points for seed in self.seed_list]
 
-    def scenario_at(self, point: Point) -> Scenario:
+    def scenario_at(self, point: MatrixPoint) -> Scenario:
         network = self.scenario.network.model_copy(update={"loss": point.loss})
         agents = point.agents if self.agents else self.scenario.agents
         duration_s = self.scenario.duration_s if point.duration_s is None else point.duration_s

@@ -24,7 +24,7 @@ HEAD, SERIES_HEAD, PANEL_HEIGHT, FOOT = 74, 26, 218, 26
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class ChartPanel:
     """The contents of a chart: its figures, with the names of their lines."""
 
     title: str
@@ -36,12 +36,12 @@ class Panel:
 
 
 PANELS = (
-    Panel("Runs with one uniform chain", (("uniform", ""),)),
-    Panel("Blocks in the mutual chain", (("mutual_share", ""),)),
-    Panel("Distinct chains", (("distinct_chains", ""),)),
-    Panel("Copies of a block", (("copies_mean", "mean"), ("copies_min", "fewest"))),
-    Panel("Reconciles", (("reconciles", ""),)),
-    Panel("Messages per block", (("messages_per_block", ""),)),
+    ChartPanel("Runs with one uniform chain", (("uniform", ""),)),
+    ChartPanel("Blocks in the mutual chain", (("mutual_share", ""),)),
+    ChartPanel("Distinct chains", (("distinct_chains", ""),)),
+    ChartPanel("Copies of a block", (("copies_mean", "mean"), ("copies_min", "fewest"))),
+    ChartPanel("Reconciles", (("reconciles", ""),)),
+    ChartPanel("Messages per block", (("messages_per_block", ""),)),
 )
 
 
@@ -59,12 +59,12 @@ class PlacedPanel:
     """A chart, with its ID in the SVG file and its area in the picture."""
 
     id: str
-    panel: Panel
+    panel: ChartPanel
     area: ChartArea
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class PanelRow:
     """A row of charts below its name. `name` is empty if there is only one row."""
 
     name: str
@@ -73,7 +73,7 @@ class Series:
     panels: list[PlacedPanel]
 
 
-def series_of(record: MatrixRecord) -> list[Series]:
+def series_of(record: MatrixRecord) -> list[PanelRow]:
     """Return the rows of the picture from top to bottom."""
     top: float = HEAD
     made = []
@@ -82,7 +82,7 @@ def series_of(record: MatrixRecord) -> list[Series]:
         top += SERIES_HEAD if name else 0
         areas = svg.grid(len(PANELS), COLUMNS, top, PANEL_HEIGHT)
         panels = [PlacedPanel(f"panel-{number}-{at}", panel, areas[at]) for at, panel in enumerate(PANELS)]
-        made.append(Series(name, cells, begins, panels))
+        made.append(PanelRow(name, cells, begins, panels))
         top += math.ceil(len(PANELS) / COLUMNS) * PANEL_HEIGHT
     return made
 
@@ -208,7 +208,7 @@ def _loss_axis(losses: Sequence[float], area: ChartArea) -> Axis:
     return svg.linear_axis(first, last, area.across)
 
 
-def _value_axis(panel: Panel, cells: Sequence[Cell], area: ChartArea) -> Axis:
+def _value_axis(panel: ChartPanel, cells: Sequence[Cell], area: ChartArea) -> Axis:
     """Return a vertical axis from 0 to the first tick above all means and nearly all confidence intervals."""
     if panel.shares:
         return svg.share_axis(area.up)

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from harness.archive.directory import claim
 from harness.errors import MachineError, RunDirectoryError
 from harness.sweep.matrix._cell import Run
-from harness.sweep.matrix._matrix_file import Matrix, Task
+from harness.sweep.matrix._matrix_file import Matrix, MatrixTask
 from ucp.agent_files import write_atomically
 from ucp.plain_file import parse_json
 
@@ -27,7 +27,7 @@ SCHEMA = "ucp-matrix-results/1"
 class MatrixResults:
     """The finished runs of a matrix, at most one for each task."""
 
-    def __init__(self, directory: Path, started_at: str, runs: dict[Task, Run], file: BinaryIO) -> None:
+    def __init__(self, directory: Path, started_at: str, runs: dict[MatrixTask, Run], file: BinaryIO) -> None:
         self.directory, self.started_at, self.runs = directory, started_at, runs
         self._file = file
 
@@ -92,9 +92,9 @@ def _start_time(line: bytes, matrix: Matrix, directory: Path) -> str:
     return str(header.get("started_at"))
 
 
-def _read(lines: list[bytes], matrix: Matrix, path: Path) -> dict[Task, Run]:
+def _read(lines: list[bytes], matrix: Matrix, path: Path) -> dict[MatrixTask, Run]:
     asked = set(matrix.tasks)
-    runs: dict[Task, Run] = {}
+    runs: dict[MatrixTask, Run] = {}
     for number, line in enumerate(lines, 2):
         try:
             run = Run.model_validate_json(line)

@@ -26,7 +26,7 @@ from harness.sweep.matrix._cell import Cell, Run
 from harness.sweep.matrix._cell_scenarios import write_scenarios
 from harness.sweep.matrix._estimate import METRICS
 from harness.sweep.matrix._growth_picture import draw_growth
-from harness.sweep.matrix._matrix_file import Point
+from harness.sweep.matrix._matrix_file import MatrixPoint
 from harness.sweep.matrix._matrix_picture import draw
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
@@ -93,7 +93,7 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
     return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in ALL_CHECKS}
 
 
-def _place(point: Point) -> dict[str, Any]:
+def _place(point: MatrixPoint) -> dict[str, Any]:
     """Return the table columns that name a combination of values. A constant mission length has no column."""
     return {axis: value for axis, value in point._asdict().items() if value is not None}
 

@@ -21,14 +21,14 @@ from harness.sweep.matrix._comparison import Comparison, compare, compare_pairs,
 from harness.sweep.matrix._culprits import find_culprits
 from harness.sweep.matrix._growth import growths
 from harness.sweep.matrix._matrix_coverage import CoverageTally
-from harness.sweep.matrix._matrix_file import Matrix, Point, Task
+from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint, MatrixTask
 from harness.sweep.matrix._results_file import MatrixResults, opened
 from harness.sweep.matrix._run_steps import FirstChange, first_changed, name_change
 from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
-from harness.sweep.matrix.nights import Baseline
+from harness.sweep.matrix.nights import BaselineNight
 
-Outcomes = Iterator[tuple[Task, Run | FailedTask]]
-Spread = Callable[[Iterable[Task], Callable[[Task], Run]], AbstractContextManager[Outcomes]]
+Outcomes = Iterator[tuple[MatrixTask, Run | FailedTask]]
+Spread = Callable[[Iterable[MatrixTask], Callable[[MatrixTask], Run]], AbstractContextManager[Outcomes]]
 """Distributes tasks, and yields their outcomes in order of completion."""
 
 
@@ -109,7 +109,7 @@ def _run_missing(
     except (KeyboardInterrupt, InterruptedRunError):
         interrupted = True
     runs = [results.runs[task] for task in matrix.tasks if task in results.runs]
-    by_point: dict[Point, list[Run]] = defaultdict(list)
+    by_point: dict[MatrixPoint, list[Run]] = defaultdict(list)
     for run in runs:
         by_point[run.point].append(run)
     cells = [sum_up(point, its_runs, grows=matrix.grows) for point, its_runs in by_point.items()]
@@ -131,7 +131,7 @@ def _run_missing(
     return Finished(record, runs)
 
 
-def compare_with(finished: Finished, baseline: Baseline) -> Finished:
+def compare_with(finished: Finished, baseline: BaselineNight) -> Finished:
     """Return the results together with their changes since an earlier night."""
     if baseline.record is None:
         comparison = Comparison(baseline=str(baseline.path), changes=[], not_compared=baseline.not_compared)
@@ -158,7 +158,7 @@ def compare_with(finished: Finished, baseline: Baseline) -> Finished:
     return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
 
 
-def name_changes(finished: Finished, baseline: Baseline, jobs: int) -> Finished:
+def name_changes(finished: Finished, baseline: BaselineNight, jobs: int) -> Finished:
     """Return the results together with the first changed handler run of each changed run, at most MAX_NAMED per cell.
 
     The runs are played again. Ctrl-C ends this search; the remaining changes then have no name.
@@ -167,10 +167,10 @@ def name_changes(finished: Finished, baseline: Baseline, jobs: int) -> Finished:
     if comparison is None or earlier is None:
         return finished
     before, now = ({run.task: run.steps for run in record.results} for record in (earlier, finished.record))
-    tasks = [Task(each.point, seed) for each in comparison.changed_runs for seed in each.seeds[:MAX_NAMED]]
+    tasks = [MatrixTask(each.point, seed) for each in comparison.changed_runs for seed in each.seeds[:MAX_NAMED]]
     tasks = [task for task in tasks if before.get(task) and now.get(task)]
 
-    def name(task: Task) -> FirstChange | None:
+    def name(task: MatrixTask) -> FirstChange | None:
         position = first_changed(before[task], now[task])
         return (
             None
@@ -178,7 +178,7 @@ def name_changes(finished: Finished, baseline: Baseline, jobs: int) -> Finished:
             else name_change(finished.record.matrix.scenario_at(task.point), task.seed, position)
         )
 
-    named: dict[Point, list[FirstChange]] = defaultdict(list)
+    named: dict[MatrixPoint, list[FirstChange]] = defaultdict(list)
     with suppress(KeyboardInterrupt), sweep(tasks, name, jobs, what="changed runs") as outcomes:
         for task, change in outcomes:
             if isinstance(change, FirstChange):
@@ -189,7 +189,7 @@ def name_changes(finished: Finished, baseline: Baseline, jobs: int) -> Finished:
 
 
 def name_culprits(
-    finished: Finished, baseline: Baseline, budget_s: float, report_progress: Callable[[str], None]
+    finished: Finished, baseline: BaselineNight, budget_s: float, report_progress: Callable[[str], None]
 ) -> Finished:
     """Return the results together with the commits that made figures worse."""
     if finished.record.against is None or baseline.record is None:
@@ -211,5 +211,5 @@ def _without_result(run: Run, reason: str) -> RunWithoutResult:
     return RunWithoutResult(**run.point._asdict(), seed=run.seed, reason=reason)
 
 
-def _failed(task: Task, reason: str) -> Run:
+def _failed(task: MatrixTask, reason: str) -> Run:
     return Run(**task.point._asdict(), seed=task.seed, failed=reason)

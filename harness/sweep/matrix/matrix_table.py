@@ -13,7 +13,7 @@ from harness.sweep.matrix import _growth_table
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._comparison import Change, ChangedRuns, Culprit
 from harness.sweep.matrix._estimate import BY_NAME, METRICS, Estimate, Metric
-from harness.sweep.matrix._matrix_file import Matrix, Point
+from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 from harness.sweep.matrix.matrix_record import MatrixRecord
 
 NAMED = 5
@@ -57,12 +57,12 @@ def series(record: MatrixRecord) -> list[list[Cell]]:
     return list(groups.values())
 
 
-def axes(matrix: Matrix) -> dict[str, Callable[[Point], str]]:
+def axes(matrix: Matrix) -> dict[str, Callable[[MatrixPoint], str]]:
     """Return the loss rate and all other values that vary, each with a function that formats it.
 
     Each axis comes with a function that formats the value of a point.
     """
-    named: dict[str, Callable[[Point], str]] = {"loss": lambda point: words.percent(point.loss)}
+    named: dict[str, Callable[[MatrixPoint], str]] = {"loss": lambda point: words.percent(point.loss)}
     if len(matrix.agents or ()) > 1:
         named["agents"] = lambda point: str(point.agents)
     if len(matrix.lengths) > 1:
@@ -72,12 +72,12 @@ def axes(matrix: Matrix) -> dict[str, Callable[[Point], str]]:
     return named
 
 
-def name_of(matrix: Matrix, point: Point) -> str:
+def name_of(matrix: Matrix, point: MatrixPoint) -> str:
     """Return the name of a combination of values, such as "15 % loss" or "15 % loss, 10 agents, process"."""
     return ", ".join([f"{words.percent(point.loss)} loss", *series_name(matrix, point)])
 
 
-def series_name(matrix: Matrix, point: Point) -> list[str]:
+def series_name(matrix: Matrix, point: MatrixPoint) -> list[str]:
     """Return the values, apart from the loss rate, that identify a combination."""
     named = axes(matrix)
     return [

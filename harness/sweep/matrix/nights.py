@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from harness.errors import MachineError, RunDirectoryError, ScenarioError
-from harness.sweep.matrix._matrix_file import Matrix, Point
+from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 from harness.sweep.matrix.matrix_record import SCHEMA, MatrixRecord
 from ucp.agent_files import write_json_atomically
 from ucp.plain_file import json_problem, read_json
@@ -25,7 +25,7 @@ class OtherVersionError(ScenarioError):
 
 
 @dataclass(frozen=True, slots=True)
-class Baseline:
+class BaselineNight:
     """An earlier night for a comparison. `not_compared` is the reason why some combinations of values are left out.
 
     `record` is None if another version of the harness wrote the file and this version cannot read it.
@@ -33,11 +33,11 @@ class Baseline:
 
     path: Path
     record: MatrixRecord | None
-    points: frozenset[Point]
+    points: frozenset[MatrixPoint]
     not_compared: list[str]
 
 
-def load_baseline(path: Path, matrix: Matrix) -> Baseline:
+def load_baseline(path: Path, matrix: Matrix) -> BaselineNight:
     """Load a night for a comparison. If its matrix differs, some combinations of values are not compared.
 
     Raises ScenarioError if the file is no finished record of a matrix, or if the matrix has only one seed.
@@ -47,12 +47,12 @@ def load_baseline(path: Path, matrix: Matrix) -> Baseline:
     try:
         record = _load(path)
     except OtherVersionError as error:
-        return Baseline(path, None, frozenset(), [f"{error}, so no cell is compared"])
+        return BaselineNight(path, None, frozenset(), [f"{error}, so no cell is compared"])
     if record.matrix.traces != matrix.traces:
         reason = f"`traces` was {shown(record.matrix.traces)} and is {shown(matrix.traces)}, so no cell is compared"
-        return Baseline(path, record, frozenset(), [reason])
+        return BaselineNight(path, record, frozenset(), [reason])
     earlier = frozenset(record.matrix.points)
-    points: set[Point] = set()
+    points: set[MatrixPoint] = set()
     reasons: dict[str, None] = {}
     for point in matrix.points:
         if point not in earlier:
@@ -62,10 +62,10 @@ def load_baseline(path: Path, matrix: Matrix) -> Baseline:
         if not differing:
             points.add(point)
         reasons |= dict.fromkeys(f"{each}, so the baseline is not compared" for each in differing)
-    return Baseline(path, record, frozenset(points), [*reasons][:MAX_REASONS])
+    return BaselineNight(path, record, frozenset(points), [*reasons][:MAX_REASONS])
 
 
-def _scenario_at(matrix: Matrix, point: Point) -> Any:
+def _scenario_at(matrix: Matrix, point: MatrixPoint) -> Any:
     return matrix.scenario_at(point).model_dump(mode="json", exclude={"name", "about"})
 
 

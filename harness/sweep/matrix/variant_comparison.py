@@ -14,7 +14,7 @@ from harness.present import text as words
 from harness.scenario.verdict_names import CHARACTERISTICS, kind_of
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._estimate import Estimate, estimate_mean
-from harness.sweep.matrix._matrix_file import Matrix, Point
+from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 from harness.sweep.matrix.matrix_run import Finished
 from harness.sweep.matrix.matrix_table import name_of
 
@@ -95,7 +95,7 @@ class VariantComparison:
 
     variant: Variant
     matrix: Matrix
-    rows: dict[Point, list[ComparisonRow]]
+    rows: dict[MatrixPoint, list[ComparisonRow]]
 
     def to_json(self) -> dict[str, Any]:
         cells = [{**point._asdict(), "rows": [row.to_json() for row in rows]} for point, rows in self.rows.items()]
@@ -127,7 +127,7 @@ class VariantComparison:
 def compare_runs(variant: Variant, matrix: Matrix, original: Finished, changed: Finished) -> VariantComparison:
     """Compare all pairs of runs that have ended, and return the result."""
     before = {run.task: run for run in original.runs if run.judged}
-    pairs: dict[Point, list[tuple[Run, Run]]] = {}
+    pairs: dict[MatrixPoint, list[tuple[Run, Run]]] = {}
     for run in changed.runs:
         if run.judged and run.task in before:
             pairs.setdefault(run.point, []).append((before[run.task], run))

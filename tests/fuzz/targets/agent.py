@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from harness.archive.traces import HEADER, HeldBlocks, Trace
-from harness.checker.recorded_inputs import Blocks
+from harness.checker.recorded_inputs import BlockIndex
 from harness.checker.steps import wrongly_dropped
 from harness.checker.steps.follower import OptionalTraceFields, StepComparer
 from harness.checker.steps.trace_header import checked
@@ -204,7 +204,7 @@ class _Driven:
         """Check that the agent's trace follows the reference implementation."""
         header, parts = checked(self.trace.header), OptionalTraceFields.of(self.trace)
         for life in self.trace.incarnations():
-            follower = StepComparer(header, parts, Blocks(()), lambda since, until: False)
+            follower = StepComparer(header, parts, BlockIndex(()), lambda since, until: False)
             for line, run in life:
                 follower.follow(line, run)
             require(not follower.deviations, f"it deviates: {follower.deviations[:1]}")

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 from pydantic import ValidationError
 
-from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError, Status
+from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError, AgentStatus
 from tests.fuzz.finding import require, sound
 from ucp._status import status_of
 from ucp.agent import Agent
@@ -34,10 +34,10 @@ async def _ask(path: Path, data: bytes) -> None:
     else:
         json.dumps(answer)
         try:
-            status = Status.model_validate(answer)
+            status = AgentStatus.model_validate(answer)
         except ValidationError:
             return
-        require(Status.model_validate_json(status.model_dump_json()) == status, "a status is read otherwise")
+        require(AgentStatus.model_validate_json(status.model_dump_json()) == status, "a status is read otherwise")
     finally:
         control.close()
         server.close()

@@ -10,7 +10,7 @@ from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import read_captures
 from harness.archive.packets.exchanges import RequestAnswers, count_losses
 from harness.archive.packets.packets_document import document
-from harness.archive.packets.packets_text import TransmissionText
+from harness.archive.packets.packets_text import TransmissionFormatter
 from harness.archive.packets.pcap import OUTBOUND, CaptureFile, Frame
 from harness.archive.packets.transmissions import join
 from harness.errors import HarnessError
@@ -56,7 +56,7 @@ def _show(paths: list[Path]) -> None:
         sound(sentence)
     transmissions = join(captures)
     exchanges, names = RequestAnswers(transmissions), BlockNames(transmissions, [])
-    list(packets_text.transmission_lines(transmissions, exchanges, TransmissionText(names, str, {}), None))
+    list(packets_text.transmission_lines(transmissions, exchanges, TransmissionFormatter(names, str, {}), None))
     packets_text.header(captures)
     list(packets_text.totals(captures, transmissions))
     list(document(captures, count_losses(transmissions), transmissions, exchanges, names, {}))

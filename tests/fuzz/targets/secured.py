@@ -32,7 +32,7 @@ from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret
 from ucp.secure.envelope import CLEAR, MAGIC, SEAL_BYTES, TAG_BYTES, VERSION, ClearHeader, read_clear_header
-from ucp.secure.opening import Opener
+from ucp.secure.opening import DatagramOpener
 from ucp.secure.revocation import Revocation
 from ucp.secure.sealed_datagrams import CRYPTO_FUNCTIONS, NO_REQUEST, CryptoFunctions, Request, signing_domain
 from ucp.secure.secured_agent import SecuredAgent, make_boot
@@ -217,7 +217,7 @@ class _Driven:
         for datagram in agent.datagrams_to_send():
             require(len(datagram) <= MAX_DATAGRAM_BYTES, "it sends what no datagram holds")
             if read_clear_header(datagram).type < 10:
-                Opener(KEYS.bundle(2)).open(datagram)
+                DatagramOpener(KEYS.bundle(2)).open(datagram)
         for entry in agent.trace():
             entry.to_line()
         state = agent.state
@@ -264,7 +264,7 @@ def run(data: bytes) -> None:
         _driven(data, CRYPTO_FUNCTIONS) == _driven(data, cached_crypto()), "cached cryptography gives another result"
     )
     with suppress(MalformedDatagramError):
-        Opener(KEYS.bundle(1)).open(data)
+        DatagramOpener(KEYS.bundle(1)).open(data)
 
 
 def seeds(flown: Path) -> Iterator[bytes]:

@@ -7,7 +7,16 @@ import pytest
 
 from harness.archive import archive
 from harness.archive.archive import RunArchive
-from harness.archive.history import CUT_SHORT, Message, Phase, Phase2Tie, Reconcile, Vote, end_of_traces, history_of
+from harness.archive.history import (
+    CUT_SHORT,
+    Message,
+    Phase2Tie,
+    Reconcile,
+    ReconcilePhase,
+    Vote,
+    end_of_traces,
+    history_of,
+)
 from harness.archive.replication import Replication, replication_of
 from harness.archive.run_record import FaultRecord
 from harness.archive.traces import Header, Trace
@@ -70,7 +79,7 @@ def test_tie_has_votes_and_phases_of_both_reconciles() -> None:
         (1, "1.1", 42.0, 52.0, "approved"),
         (2, "2.1", 3.0, 13.0, "approved"),
     ]
-    phases = [Phase("phase 1", 32.0, 37.0, 1), Phase("phase 2", 37.0, 42.0, 1)]
+    phases = [ReconcilePhase("phase 1", 32.0, 37.0, 1), ReconcilePhase("phase 2", 37.0, 42.0, 1)]
     assert found.reconciles[0] == Reconcile(1, 32.0, 42.0, "vote not approved", phases, done=True)
     assert found.ties[0] == Phase2Tie(1, 42.0, "tie: top of chain")
     fetched = next(one for one in found.reconciles if one.agent == 2 and one.reason == "chain diverged")
@@ -114,7 +123,7 @@ def test_vote_ends_at_the_loss_or_at_the_end_of_the_run() -> None:
         Vote(1, "aa", 5.0, 8.0, CUT_SHORT),
         Vote(1, "", 30.0, 50.0, CUT_SHORT),
     ]
-    phases = [Phase("phase 1", 6.0, 8.0, 1)]
+    phases = [ReconcilePhase("phase 1", 6.0, 8.0, 1)]
     assert found.reconciles == [Reconcile(1, 6.0, 8.0, "asked by the operator", phases, done=False)]
 
 

@@ -10,7 +10,7 @@ from harness.archive.packets.block_names import BlockNames, run_directories
 from harness.archive.packets.capture_files import Captures as Read
 from harness.archive.packets.capture_files import capture_files, read_captures
 from harness.archive.packets.exchanges import LinkLosses, RequestAnswers, RequestOutcome, count_losses
-from harness.archive.packets.packets_text import TransmissionText
+from harness.archive.packets.packets_text import TransmissionFormatter
 from harness.archive.packets.selection import MessageFilter, block_arrivals, exchanges_about
 from harness.archive.packets.transmissions import Transmission, join
 from harness.errors import CaptureError
@@ -218,7 +218,7 @@ def test_answered_request_arrived_although_the_capture_lacks_it(tmp_path: Path) 
 def test_outcomes_are_listed_from_answers_to_losses() -> None:
     answers = [RequestOutcome(2, "request lost"), RequestOutcome(3, "no answer"), RequestOutcome(4, "request lost")]
     assert (
-        TransmissionText(BlockNames([], []), str.upper, {}).answers(answers)
+        TransmissionFormatter(BlockNames([], []), str.upper, {}).answers(answers)
         == "answers: no answer: 3; REQUEST LOST: 2 4"
     )
 

@@ -19,7 +19,7 @@ from harness.report import logbook
 from harness.report.logbook import Logbook
 from harness.report.logbook.logbook_text import document, lines
 from harness.report.logbook.map_files import geojson, kml
-from harness.report.logbook.positions import LAST_TIMESTAMP_US, Track, tracks
+from harness.report.logbook.positions import LAST_TIMESTAMP_US, EventTrack, tracks
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.mission import CONNECTED, edit, edit_lines, fly, write_exports, write_run
 from tests.ucp.air import Air
@@ -426,7 +426,7 @@ def test_impossible_positions_and_times_are_left_out(flown: Air) -> None:
 def test_single_position_is_a_point_and_no_line(flown: Air) -> None:
     (track, *_) = tracks(logbook_of(flown))
     entry = next(entry for entry in track.entries if entry.is_position)
-    alone = Track(1, [entry], track.fixes[:1])
+    alone = EventTrack(1, [entry], track.fixes[:1])
     (feature,) = geojson([alone])["features"]
     assert feature["geometry"]["type"] == "Point"
     assert kml([alone]).count("<gx:coord>") == 1

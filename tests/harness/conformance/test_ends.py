@@ -9,13 +9,13 @@ from harness.conformance import _udp_lab
 from harness.conformance._kept_failures import keep
 from harness.conformance._state_space import VARIANTS, explore
 from harness.conformance.conformance_run import ConformanceRequest, conform
-from harness.conformance.results import CaseResult, Results
+from harness.conformance.results import CaseResult, ConformanceResults
 from harness.conformance.results_table import lines_of
 from harness.conformance.vectors import VectorSet
 from tests.harness.conformance import wrong_programs
 
 
-def results_of(mistake: str, place: Path, *, virtual: bool = False) -> Results:
+def results_of(mistake: str, place: Path, *, virtual: bool = False) -> ConformanceResults:
     steps = list(explore(VARIANTS["default"]))
     wanted = {step.key: step for step in steps if step.before.activity == "idle" and len(step.path) <= 2}
     command = (sys.executable, "-P", "-m", wrong_programs.__name__, mistake)

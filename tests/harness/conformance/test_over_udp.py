@@ -14,7 +14,7 @@ from harness.conformance._state_space import VARIANTS, explore
 from harness.conformance._udp_agent import TIMING_IN_PARALLEL, UdpAgent
 from harness.conformance._udp_lab import UdpLab
 from harness.conformance.conformance_run import ConformanceRequest, conform
-from harness.conformance.results import Results
+from harness.conformance.results import ConformanceResults
 from harness.conformance.results_table import to_junit
 from harness.conformance.vectors import VectorSet
 
@@ -33,7 +33,7 @@ def idle() -> list[VectorSet]:
     return [VectorSet(VARIANTS["default"], steps, wanted)]
 
 
-def results_of(vectors: list[VectorSet], place: Path, *command: str, keep: Path | None = None) -> Results:
+def results_of(vectors: list[VectorSet], place: Path, *command: str, keep: Path | None = None) -> ConformanceResults:
     place.mkdir()
     asked = ConformanceRequest(command, None, keep, handwritten=False, max_suspicions=4, limit_s=LIMIT_S)
     return conform(asked, place, lambda count, total: None, vectors)

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from harness.conformance.conformance_page import AgentsFileError, read_agents, to_html
-from harness.conformance.results import AlgorithmCounts, CaseResult, Results
+from harness.conformance.results import AlgorithmCounts, CaseResult, ConformanceResults
 
 
 def test_page_has_a_column_for_each_agent_and_escapes_names() -> None:
-    good = Results(
+    good = ConformanceResults(
         ["ours"],
         3.0,
         "2026-11-22T15:00:00+00:00",
@@ -18,7 +18,9 @@ def test_page_has_a_column_for_each_agent_and_escapes_names() -> None:
     case = CaseResult(
         "<b>idle</b>; a request", 13, "failed", "receive_request_next_in_sequence", "diverged", "it sent nothing"
     )
-    bad = Results(["c"], 3.0, "2026-11-22T15:00:00+00:00", [case], {3: AlgorithmCounts(3, passed=39, not_tried=1)})
+    bad = ConformanceResults(
+        ["c"], 3.0, "2026-11-22T15:00:00+00:00", [case], {3: AlgorithmCounts(3, passed=39, not_tried=1)}
+    )
     page = to_html({"ours": good, "c": bad, "gone": "the agent could not be started"})
     assert '<th scope="col">ours</th><th scope="col">c</th>' in page
     assert "1 failed, 0 passed" in page and "39 passed, 1 not tried" in page and "not tested" in page

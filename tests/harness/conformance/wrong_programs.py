@@ -383,7 +383,7 @@ def reads_times_as_doubles() -> None:
 @mistake
 def answers_requests_only_one_by_one() -> None:
     """Lose a request that arrives together with another one."""
-    from ucp.control import _Client
+    from ucp.control import _ControlClient
 
     def go_on(old: Callable[..., Any], self: Any) -> None:
         line, newline, _ = self._received.partition(b"\n")
@@ -391,7 +391,7 @@ def answers_requests_only_one_by_one() -> None:
             self._received = line + newline
         old(self)
 
-    _patch(_Client, "_answer_next_line", go_on)
+    _patch(_ControlClient, "_answer_next_line", go_on)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -13,7 +13,7 @@ from harness.errors import ScenarioError
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
 from harness.play.mission import RunOutcome, Swarm
-from harness.play.progress import Progress, SilentProgress
+from harness.play.progress import ProgressDisplay, SilentProgress
 from harness.run.run import run
 from harness.scenario import Scenario
 from harness.scenario.changes import Change
@@ -88,7 +88,7 @@ class PerfectAir(Backend):
         scenario: Scenario,
         seed: int,
         rundir: RunDirectory,
-        progress: Progress,
+        progress: ProgressDisplay,
         interrupted: asyncio.Event,
         *,
         interactive: bool = False,

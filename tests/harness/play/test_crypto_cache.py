@@ -15,7 +15,7 @@ from ucp.messages import BlockAddRequest, CommitBlock, MalformedDatagramError
 from ucp.secure._window import ReplayWindow
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import Bundle, KeySet
-from ucp.secure.crypto_suite import SignatureClaim, verify
+from ucp.secure.crypto_suite import UnverifiedSignature, verify
 from ucp.secure.sealed_datagrams import CryptoFunctions
 from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
@@ -86,20 +86,20 @@ def test_cached_verification_equals_the_library() -> None:
     signatures = RecordedSignatures()
     makers = {agent_id: signatures.signer(KEYS.vehicles[agent_id]) for agent_id in (1, 2)}
     made = [
-        SignatureClaim(KEYS.public.vehicles[each], makers[each].sign(data), data)
+        UnverifiedSignature(KEYS.public.vehicles[each], makers[each].sign(data), data)
         for each in (1, 2)
         for data in (b"a", b"b")
     ]
     for one in made:
         for two in made:
             for three in made:
-                claim = SignatureClaim(one.public_key, two.signature, three.signed)
+                claim = UnverifiedSignature(one.public_key, two.signature, three.signed)
                 assert signatures.verified(claim) == verify(claim) == (claim in made)
 
 
 def test_signature_of_another_process_is_verified() -> None:
     maker, here = RecordedSignatures().signer(KEYS.vehicles[1]), RecordedSignatures()
-    claim = SignatureClaim(KEYS.public.vehicles[1], maker.sign(b"a"), b"a")
+    claim = UnverifiedSignature(KEYS.public.vehicles[1], maker.sign(b"a"), b"a")
     assert here.verified(claim)
     assert not here.verified(claim._replace(signed=b"b"))
 
@@ -108,7 +108,9 @@ def test_library_with_wrong_signatures_is_found(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(cache, "verify", lambda claim: False)
     signatures = RecordedSignatures()
     maker = signatures.signer(KEYS.vehicles[1])
-    claims = [SignatureClaim(KEYS.public.vehicles[1], maker.sign(data), data) for data in map(bytes, range(1, 300))]
+    claims = [
+        UnverifiedSignature(KEYS.public.vehicles[1], maker.sign(data), data) for data in map(bytes, range(1, 300))
+    ]
     assert not all(map(signatures.verified, claims))
 
 
@@ -116,7 +118,7 @@ def test_full_cache_drops_entries_and_stays_correct(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(cache, "SIGNATURES_CACHED", 2)
     signatures = RecordedSignatures()
     maker = signatures.signer(KEYS.vehicles[1])
-    claims = [SignatureClaim(KEYS.public.vehicles[1], maker.sign(data), data) for data in (b"a", b"b", b"c", b"d")]
+    claims = [UnverifiedSignature(KEYS.public.vehicles[1], maker.sign(data), data) for data in (b"a", b"b", b"c", b"d")]
     assert all(map(signatures.verified, claims))
     assert len(signatures._made) == 2
 

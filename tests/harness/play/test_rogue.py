@@ -191,7 +191,7 @@ def test_sequence_numbers_identify_the_injection() -> None:
 def test_the_journal_has_a_line_for_each_datagram_and_counts_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_journal, "LINES", 2)
     lines: list[dict[str, Any]] = []
-    book = _journal.Journal(lines.append)
+    book = _journal.RogueJournal(lines.append)
     for at_s, datagram in ((1.0, COMMIT), (1.1, COMMIT[:-1]), (2.1, COMMIT), (2.9, COMMIT[:5]), (3.0, COMMIT)):
         book.add(RogueDatagram(1, "replay", 1, datagram), at_s)
     book.close()

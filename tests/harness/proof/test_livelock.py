@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from harness.archive.run_record import Cycle
-from harness.proof import Bounds, Progress, in_words, prove
+from harness.proof import Bounds, ExplorationProgress, in_words, prove
 from harness.proof._progress_bar import ExplorationBudget
 from harness.proof.examples._example import ViolationExample
 from harness.proof.graph._exploration import explore
@@ -65,7 +65,7 @@ def test_possible_forms_come_first_and_the_rest_is_counted(tmp_path: Path, monke
 
 
 def test_cycle_is_found_in_an_incomplete_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(progress: Progress) -> None:
+    def stop(progress: ExplorationProgress) -> None:
         if progress.looked_at >= 500:
             monkeypatch.setattr(ExplorationBudget, "ended", lambda *_: "time")
 

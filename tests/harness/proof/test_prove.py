@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from harness.errors import INCOMPLETE, INTERRUPTED
-from harness.proof import Bounds, BoundsError, Limits, Progress, in_words, prove
+from harness.proof import Bounds, BoundsError, ExplorationProgress, Limits, in_words, prove
 from harness.proof._progress_bar import memory_bytes
 from harness.proof.graph._exploration import LOOK_EVERY, explore
 from harness.proof.graph._workers import Workers
@@ -192,7 +192,7 @@ def test_ctrl_c_prints_the_progress(tmp_path: Path) -> None:
 
 
 def test_interrupted_workers_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(progress: Progress) -> None:
+    def interrupt(progress: ExplorationProgress) -> None:
         assert multiprocessing.active_children()
         raise KeyboardInterrupt
 
@@ -233,7 +233,7 @@ def test_limits_also_concern_questions_to_the_whole_graph(tmp_path: Path, monkey
 
 def test_progress_shows_the_question_to_the_whole_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.proof._progress_bar.LOOK_EVERY_S", 0.0)
-    told: list[Progress] = []
+    told: list[ExplorationProgress] = []
     proof = prove(Bounds(2, 3, "lossless"), out=tmp_path / "asked.yaml", watch=told.append)
     assert proof.liveness is not None
     asked = dict.fromkeys(progress.asked for progress in told if progress.asked is not None)

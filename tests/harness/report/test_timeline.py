@@ -13,7 +13,7 @@ import pytest
 
 from harness.archive import archive
 from harness.archive.archive import RunArchive
-from harness.archive.history import Commit, History, Phase, Phase2Tie, Reconcile, Vote
+from harness.archive.history import BlockCommit, History, Phase2Tie, Reconcile, ReconcilePhase, Vote
 from harness.archive.replication import Replication
 from harness.play.progress import SilentProgress
 from harness.report import _timeline_charts, _timeline_lanes, _timeline_section, write_report
@@ -128,11 +128,11 @@ def test_page_of_twenty_minutes_with_all_messages_stays_small(troubled: Path) ->
 
 
 def test_long_run_with_many_changes_is_thinned_and_reported() -> None:
-    phases = [Phase("phase 1", 0.0, 1.0, 1)] * 3
+    phases = [ReconcilePhase("phase 1", 0.0, 1.0, 1)] * 3
     spans = [(agent, float(at_s)) for agent in range(1, 51) for at_s in range(200)]
     votes = [Vote(agent, "aa", at_s, at_s + 1, "approved") for agent, at_s in spans]
     reconciles = [Reconcile(agent, at_s, at_s + 1, "why", phases, done=True) for agent, at_s in spans]
-    commits = [Commit(agent, at_s + part / 4, "aa", "heard") for agent, at_s in spans for part in range(4)]
+    commits = [BlockCommit(agent, at_s + part / 4, "aa", "heard") for agent, at_s in spans for part in range(4)]
     ties = [Phase2Tie(agent, at_s, "tie: block") for agent, at_s in spans]
     restless = History(votes, reconciles, commits, ties, None)
     picture = _timeline_lanes.draw(restless, [], [], range(1, 51), {}, 200.0, "")

@@ -9,7 +9,7 @@ from tests.ucp.secure.swarm import KEYS, ROSTER, session
 from ucp.block import Block
 from ucp.messages import CommitBlock, RequestForBlock
 from ucp.secure._budget import BURST
-from ucp.secure.crypto_suite import SignatureClaim, verify
+from ucp.secure.crypto_suite import UnverifiedSignature, verify
 from ucp.secure.envelope import CLEAR, REVOCATION, ClearHeader
 from ucp.secure.sealed_datagrams import CRYPTO_FUNCTIONS
 from ucp.secure.secured_agent import SecuredAgent, make_boot
@@ -27,7 +27,7 @@ class CountingAgent(SecuredAgent):
         crypto = replace(CRYPTO_FUNCTIONS, verify=self._verify)
         super().__init__(Session(KEYS.bundle(1), BOOT, crypto=crypto), 1, ROSTER, b"test")
 
-    def _verify(self, claim: SignatureClaim) -> bool:
+    def _verify(self, claim: UnverifiedSignature) -> bool:
         self.verified += 1
         return verify(claim)
 

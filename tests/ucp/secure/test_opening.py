@@ -17,7 +17,7 @@ from ucp.messages import ChainContainQuery, Message, encode
 from ucp.scapy import UCP, Sealed, SecuredUCP, message_of, opened
 from ucp.secure.bundle import KeySet
 from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, MalformedDatagramError, read_clear_header
-from ucp.secure.opening import EPOCHS_AHEAD, Opener
+from ucp.secure.opening import EPOCHS_AHEAD, DatagramOpener
 from ucp.secure.revocation import Revocation
 from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
@@ -34,8 +34,8 @@ def sealed(message: Message, sequence: int = 7, by: Session | None = None) -> by
     return (by or session(2)).seal(sequence, message, None, None, 0)
 
 
-def opener(keys: KeySet = KEYS) -> Opener:
-    return Opener(keys.bundle(1))
+def opener(keys: KeySet = KEYS) -> DatagramOpener:
+    return DatagramOpener(keys.bundle(1))
 
 
 @given(all_messages)
@@ -75,7 +75,7 @@ def test_opener_opens_later_epochs_and_rejects_earlier_and_far_ones() -> None:
         assert reads.open(datagram).datagram == reads.open(datagram).datagram == (2, sequence, message)
     assert kept[-1].epoch == 5
     with pytest.raises(MalformedDatagramError, match="epoch out of range"):
-        Opener(kept[-1]).open(datagrams[0])
+        DatagramOpener(kept[-1]).open(datagrams[0])
     far = read_clear_header(datagrams[0])._replace(epoch=EPOCHS_AHEAD + 1)
     with pytest.raises(MalformedDatagramError, match="epoch out of range"):
         reads.open(far.pack(len(datagrams[0]) - CLEAR.size) + datagrams[0][CLEAR.size :])

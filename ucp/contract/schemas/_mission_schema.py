@@ -5,7 +5,7 @@ import dataclasses
 from ucp.contract.schemas._schema_parts import AGENT_ID, BASE64, FLAG, ROSTER, Schema, listed, record
 from ucp.events import MAX_MEAN_S
 from ucp.mission import LATEST_EPOCH_US, MAX_SPEEDUP, SCHEMA
-from ucp.settings import ADDED, DECLARED, Choice, Number, Settings
+from ucp.settings import ADDED, DECLARED, ChoiceSetting, NumberSetting, Settings
 from ucp.telemetry import EVENT_KINDS
 
 ABOVE_0: Schema = {"type": "number", "exclusiveMinimum": 0}
@@ -14,8 +14,8 @@ IPV4: Schema = {"type": "string", "format": "ipv4", "pattern": rf"^{OCTET}(\.{OC
 PORT: Schema = {"type": "integer", "minimum": 1, "maximum": 65535}
 
 
-def _setting(declared: Number | Choice) -> Schema:
-    if isinstance(declared, Choice):
+def _setting(declared: NumberSetting | ChoiceSetting) -> Schema:
+    if isinstance(declared, ChoiceSetting):
         return FLAG if declared.values == (False, True) else {"enum": list(declared.values)}
     if declared.whole:
         return {"type": "integer", "minimum": declared.low, "maximum": declared.high}

@@ -13,7 +13,7 @@ from ucp.sealed import seal_to
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import KeySet, bundle_name
 from ucp.secure.envelope import CHALLENGE, CONTROL_NAMES, REQUEST_OF, read_clear_header
-from ucp.secure.opening import Opener
+from ucp.secure.opening import DatagramOpener
 from ucp.secure.revocation import Revocation
 from ucp.secure.sealed_datagrams import Request
 from ucp.secure.secured_agent import make_boot
@@ -31,7 +31,7 @@ class SecuredStory(RecordedMission):
         assert KEYS.public.depot is not None, "the mission seals event data"
         self.initial_data = seal_to(INITIAL_DATA, KEYS.public.depot)
         self._incarnations = 0
-        self._opener = Opener(KEYS.bundle(AGENT_ID))
+        self._opener = DatagramOpener(KEYS.bundle(AGENT_ID))
         self._peers = {peer: Session(KEYS.bundle(peer), make_boot(peer, b"a chance")) for peer in ROSTER}
         for session in self._peers.values():
             session.set_clock(0.0)

@@ -15,7 +15,7 @@ from harness.archive.tracks import PositionFix
 from harness.present import text
 from harness.present.colours import AgentColours
 from harness.present.svg import FONT, n
-from harness.report.logbook.positions import GlobalPosition, LogEntry, Track
+from harness.report.logbook.positions import EventTrack, GlobalPosition, LogEntry
 from harness.report.map_parts import MapProjection, Point, extent, thin
 from harness.report.map_svg import end_mark, frame, start_mark, tags
 from ucp.telemetry import describe
@@ -39,11 +39,11 @@ class EventMap:
 
 
 def draw(
-    tracks: Sequence[Track],
+    tracks: Sequence[EventTrack],
     rare: Iterable[str],
     lost: Mapping[int, Sequence[int]],
     ink: Mapping[int, AgentColours],
-    flown: Sequence[Track] = (),
+    flown: Sequence[EventTrack] = (),
 ) -> EventMap:
     """Draw the map. `rare` names blocks on one vehicle only, `lost` numbers each agent's lost blocks, and `flown` are
     paths from flight logs.
@@ -90,7 +90,7 @@ def draw(
 class _Field:
     """Converts positions to metres north and east of the median of all positions."""
 
-    def __init__(self, tracks: Sequence[Track]) -> None:
+    def __init__(self, tracks: Sequence[EventTrack]) -> None:
         positions = [position for track in tracks for _, position in track.fixes]
         self._lat = sorted(position.lat_e7 for position in positions)[len(positions) // 2] / 1e7
         self._lon = sorted(position.lon_e7 for position in positions)[len(positions) // 2] / 1e7
@@ -107,7 +107,7 @@ class _Field:
 
 
 def _flown(
-    tracks: Sequence[Track],
+    tracks: Sequence[EventTrack],
     paths: Sequence[Sequence[PositionFix]],
     projection: MapProjection,
     ink: Mapping[int, AgentColours],
@@ -123,7 +123,7 @@ def _flown(
 
 
 def _paths(
-    tracks: Sequence[Track],
+    tracks: Sequence[EventTrack],
     paths: Mapping[int, Sequence[PositionFix]],
     lost: Mapping[int, Sequence[int]],
     projection: MapProjection,
@@ -146,7 +146,7 @@ def _paths(
 
 
 def _pieces(
-    track: Track, path: Sequence[PositionFix], lost: Mapping[int, Sequence[int]]
+    track: EventTrack, path: Sequence[PositionFix], lost: Mapping[int, Sequence[int]]
 ) -> Iterable[tuple[bool, Sequence[PositionFix]]]:
     """Yield the pieces of a path, each with true if the piece is a gap.
 
@@ -168,7 +168,7 @@ def _ordinal(name: str) -> int | None:
     return int(ordinal) if ordinal.isdecimal() else None
 
 
-def _logged(track: Track, single_copies: set[str]) -> Iterable[tuple[bool, int, LogEntry]]:
+def _logged(track: EventTrack, single_copies: set[str]) -> Iterable[tuple[bool, int, LogEntry]]:
     """Yield each event to mark on the map, as (true if only one vehicle holds it, agent ID, event)."""
     for entry in track.entries:
         rare = entry.block in single_copies

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from harness.archive.exports import Export
 from harness.errors import AgentFailedError
-from harness.play.agent_control import Status, is_shell_error, last_line
+from harness.play.agent_control import AgentStatus, is_shell_error, last_line
 from harness.play.simulation._simulated_agent import AgentOutput, DiskContents
 from harness.play.simulation.foreign._answer import (
     AgentLacksError,
@@ -120,7 +120,7 @@ class ForeignAgent:
         self._trace: list[Entry] = []
         self._completed: list[bytes] | None = [] if tracing else None
         """Hashes of the completed blocks from the trace. None without a trace."""
-        self._status: Status | None = None
+        self._status: AgentStatus | None = None
         """The current status. None if it is unknown, because an input may have changed it."""
         self._export: dict[str, Any] | None = None
         """The export at the end of the incarnation."""
@@ -187,18 +187,18 @@ class ForeignAgent:
 
     # Queries about the agent
 
-    def status(self) -> Status:
+    def status(self) -> AgentStatus:
         if self._status is None:
             command_answer = self._ask("status", self._now)
             try:
-                self._status = Status.model_validate(command_answer)
+                self._status = AgentStatus.model_validate(command_answer)
             except ValidationError as error:
                 raise self._failure(
                     "crashed", f"answered to the command status without a proper {_where(error)}"
                 ) from None
         return self._status
 
-    def known_status(self) -> Status | None:
+    def known_status(self) -> AgentStatus | None:
         return None if self.failed else self.status()
 
     def completed(self) -> list[bytes]:

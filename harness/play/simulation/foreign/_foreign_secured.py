@@ -10,7 +10,7 @@ from harness.play.simulation.foreign._foreign_agent import ForeignAgent
 from ucp.messages import MalformedDatagramError
 from ucp.secure.bundle import Bundle
 from ucp.secure.envelope import CONTROL_NAMES, read_clear_header
-from ucp.secure.opening import Opener
+from ucp.secure.opening import DatagramOpener
 from ucp.secure.secured_agent import OutgoingDatagram
 from ucp.trace import in_base64
 
@@ -25,7 +25,7 @@ class SecuredForeignAgent(ForeignAgent):
     """
 
     def __init__(self, bundle: Bundle, *arguments: Any, **options: Any) -> None:
-        self._opener = Opener(bundle)
+        self._opener = DatagramOpener(bundle)
         self._secrets = [secret.hex() for secret in (bundle.private_key, bundle.group_secret)]
         super().__init__(*arguments, **options)
 

@@ -11,7 +11,7 @@ from harness.present import text as words
 from harness.present.colours import ramp
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, Metric, estimate_share, figure
-from harness.sweep.matrix._matrix_file import Point
+from harness.sweep.matrix._matrix_file import MatrixPoint
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import name_of, say, say_interval, say_mean, violated
 
@@ -35,7 +35,7 @@ _VIOLATED = Metric("violated", "violated", figure("violated"), "share of runs")
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class HeatmapFigure:
     metric: Metric
 
     @property
@@ -50,7 +50,7 @@ class Figure:
         return cell.estimates.get(self.metric.name, Estimate(n=0))
 
 
-def known_figures(cells: Iterable[Cell]) -> list[Figure]:
+def known_figures(cells: Iterable[Cell]) -> list[HeatmapFigure]:
     """Return the figures that runs determined. Those before the final reconcile come first.
 
     "violated" is always included.
@@ -59,7 +59,7 @@ def known_figures(cells: Iterable[Cell]) -> list[Figure]:
     names = {name for cell in cells for name, estimate in cell.estimates.items() if estimate.n}
     metrics = [metric for metric in BEFORE_FINAL_RECONCILE + METRICS if metric.name in names]
     judged = [_FINISHED] if any(cell.finished.n for cell in cells) else []
-    return [Figure(metric) for metric in (*metrics, *judged, _VIOLATED)]
+    return [HeatmapFigure(metric) for metric in (*metrics, *judged, _VIOLATED)]
 
 
 SHADES = 11
@@ -101,7 +101,7 @@ class HeatmapTile:
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class HeatmapGrid:
     """The tiles for one backend and mission length, with a row for each number of agents and a column for each loss
     rate.
     """
@@ -115,18 +115,18 @@ class Grid:
 class Heatmap:
     """A heatmap. `lowest` and `highest` are the values of the first and the last shade."""
 
-    figure: Figure
+    figure: HeatmapFigure
     lowest: str
     highest: str
-    grids: list[Grid]
+    grids: list[HeatmapGrid]
 
 
-def anchor(point: Point) -> str:
+def anchor(point: MatrixPoint) -> str:
     """Return the HTML ID of the section with the runs for a combination of values."""
     return f"{point.file_name}-{point.backend}"
 
 
-def heatmap(record: MatrixRecord, figure: Figure) -> Heatmap:
+def heatmap(record: MatrixRecord, figure: HeatmapFigure) -> Heatmap:
     cells = {cell.point: cell for cell in record.cells}
     scale = _scale(figure, record)
     points = record.matrix.points
@@ -135,16 +135,16 @@ def heatmap(record: MatrixRecord, figure: Figure) -> Heatmap:
     for backend, duration_s in dict.fromkeys((point.backend, point.duration_s) for point in points):
         rows = []
         for number in agents:
-            its_points = [Point(loss, number, backend, duration_s) for loss in record.matrix.loss]
+            its_points = [MatrixPoint(loss, number, backend, duration_s) for loss in record.matrix.loss]
             tiles = [_tile(record, figure, point, cells.get(point), scale) for point in its_points]
             rows.append((f"{number} agents" if number > 1 else "1 agent", tiles))
         name = backend if duration_s is None else f"{backend}, {words.duration(duration_s)}"
-        grids.append(Grid(name, [words.percent(loss) for loss in record.matrix.loss], rows))
+        grids.append(HeatmapGrid(name, [words.percent(loss) for loss in record.matrix.loss], rows))
     lowest, highest = (say_mean(figure.metric, Estimate(n=1, mean=bound)) for bound in scale)
     return Heatmap(figure, lowest, highest, grids)
 
 
-def _scale(figure: Figure, record: MatrixRecord) -> tuple[float, float]:
+def _scale(figure: HeatmapFigure, record: MatrixRecord) -> tuple[float, float]:
     """Return the values of the first and the last shade: 0 and 1 for shares, otherwise the smallest and largest
     mean.
     """
@@ -155,7 +155,7 @@ def _scale(figure: Figure, record: MatrixRecord) -> tuple[float, float]:
 
 
 def _tile(
-    record: MatrixRecord, figure: Figure, point: Point, cell: Cell | None, scale: tuple[float, float]
+    record: MatrixRecord, figure: HeatmapFigure, point: MatrixPoint, cell: Cell | None, scale: tuple[float, float]
 ) -> HeatmapTile:
     name = name_of(record.matrix, point)
     if cell is None:
@@ -176,7 +176,7 @@ def _shade(mean: float, lowest: float, highest: float) -> int:
     return round((SHADES - 1) * (mean - lowest) / (highest - lowest)) if highest > lowest else 0
 
 
-def _marks(record: MatrixRecord, figure: Figure, cell: Cell) -> list[TileMark]:
+def _marks(record: MatrixRecord, figure: HeatmapFigure, cell: Cell) -> list[TileMark]:
     marks = []
     if number := violated(cell):
         marks.append(TileMark("\u2717", f"{number} violated", "bad"))

@@ -94,7 +94,7 @@ def _changed(record: MatrixRecord) -> Iterator[tuple[str, ChangedRuns, str]]:
         yield name_of(record.matrix, changed.point), changed, command
 
 
-def _choosing(shown: list[_heatmap.Figure]) -> str:
+def _choosing(shown: list[_heatmap.HeatmapFigure]) -> str:
     """Return CSS that shows only the parts for the chosen figure. On paper, all heatmaps are shown."""
     others = [
         f"main:has(#show-{figure.metric.name}:checked) {{}} .figure:not(.of-{figure.metric.name})" for figure in shown

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from harness.present import text
-from harness.sweep.matrix._matrix_file import Point
+from harness.sweep.matrix._matrix_file import MatrixPoint
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import name_of, violated
 
@@ -41,7 +41,7 @@ def rows(nights: Sequence[MatrixRecord], tonight: MatrixRecord) -> list[tuple[st
     ]
 
 
-def _field(night: MatrixRecord, point: Point) -> NightCell:
+def _field(night: MatrixRecord, point: MatrixPoint) -> NightCell:
     cell = next((cell for cell in night.cells if cell.point == point), None)
     if cell is None:
         return NightCell("", "no runs", "unknown")

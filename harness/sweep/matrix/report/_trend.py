@@ -16,7 +16,7 @@ from harness.sweep.matrix._estimate import Estimate
 from harness.sweep.matrix._matrix_picture import LinePoint, curve
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_table import say, series, series_name
-from harness.sweep.matrix.report._heatmap import Figure
+from harness.sweep.matrix.report._heatmap import HeatmapFigure
 
 COLUMNS, PANEL_HEIGHT, FOOT = 4, 158, 4
 MAX_DOTS = 12_000
@@ -30,7 +30,7 @@ def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures:
     return nights[-max(2, MAX_DOTS // max(1, len(tonight.cells) * figures)) :]
 
 
-def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: Figure) -> list[tuple[str, Markup]]:
+def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: HeatmapFigure) -> list[tuple[str, Markup]]:
     """Return a drawing for each number of agents and backend, with a name if there are several."""
     of_night = [{cell.point: figure.of(cell) for cell in night.cells} for night in nights]
     begun = [text.started(night.started_at)[:16] for night in nights]
@@ -61,7 +61,9 @@ def _drawing(height: float, label: str, panels: Sequence[Markup]) -> Markup:
     ).format(w=svg.WIDTH, h=n(height), label=label, panels=Markup("").join(panels))
 
 
-def _panel(figure: Figure, cell: Cell, dots: Sequence[LinePoint], dates: Sequence[str], area: ChartArea) -> Markup:
+def _panel(
+    figure: HeatmapFigure, cell: Cell, dots: Sequence[LinePoint], dates: Sequence[str], area: ChartArea
+) -> Markup:
     last = len(dates) - 1
     across = Axis(0, last, *area.across, sorted({0, last // 2, last} if last > 3 else {0, last}))
     up = _value_axis(figure, [dot.estimate for dot in dots], area)
@@ -76,7 +78,7 @@ def _panel(figure: Figure, cell: Cell, dots: Sequence[LinePoint], dates: Sequenc
     return Markup('<g class="panel">{}<g class="series {}">{}</g></g>\n').format(frame, svg.CLASSES[0], drawing)
 
 
-def _value_axis(figure: Figure, estimates: Sequence[Estimate], area: ChartArea) -> Axis:
+def _value_axis(figure: HeatmapFigure, estimates: Sequence[Estimate], area: ChartArea) -> Axis:
     """Return a vertical axis for all confidence intervals. Its minimum length makes small changes look small."""
     bounds = [
         bound for estimate in estimates for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.report.live._agent_course import Change
-from harness.report.live.feed import Feed
+from harness.report.live.feed import ChangeFeed
 from tests.harness.field.flights import flown
 
 PLAYED = {
@@ -28,7 +28,7 @@ def played(directory: Path, **keys: Any) -> Path:
 
 def film(directory: Path, stride_s: float = 20.0) -> list[Change]:
     """Return all changes in a finished run, read `stride_s` mission seconds at a time."""
-    feed = Feed(directory)
+    feed = ChangeFeed(directory)
     told, until_s = [feed.run_change(live=False)], 0.0
     while True:
         changes, more = feed.poll(until_s)

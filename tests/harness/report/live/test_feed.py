@@ -13,9 +13,9 @@ from harness.archive.trace_files import SUFFIX
 from harness.archive.traces import Trace
 from harness.errors import RunDirectoryError
 from harness.report.live import feed as feeds
-from harness.report.live._agent_course import KEY_LENGTH, AgentCourse, Change
+from harness.report.live._agent_course import KEY_LENGTH, AgentActions, Change
 from harness.report.live.change_log import FAR_BEHIND_BYTES, ChangeLog
-from harness.report.live.feed import Feed
+from harness.report.live.feed import ChangeFeed
 from tests.harness.archive.test_history import handler_run, trace_of
 from tests.harness.report.live.runs import film, of_kind, played
 from ucp.trace import SentMessage
@@ -89,7 +89,7 @@ def test_growing_files_give_the_same_changes(run: Path, tmp_path: Path) -> None:
     shutil.copy(run / "run.json", growing)
     sources = [path for path in run.rglob("*.jsonl") if path.is_file()]
     content = {path: path.read_bytes() for path in sources}
-    feed = Feed(growing)
+    feed = ChangeFeed(growing)
     told: list[Change] = []
     for share in range(0, 101, 7):
         for path, data in content.items():
@@ -107,7 +107,7 @@ def late_film(run: Path, growing: Path, lag: int = 3) -> list[Change]:
     shutil.copy(run / "run.json", growing)
     shutil.copy(run / "network.jsonl", growing)
     content = {path: path.read_bytes().splitlines(keepends=True) for path in run.glob(f"agents/*{SUFFIX}")}
-    feed = Feed(growing)
+    feed = ChangeFeed(growing)
     told = [feed.run_change(live=True)]
     for step in range(50):
         for path, lines in content.items():
@@ -140,7 +140,7 @@ def test_message_gets_the_receivers_that_record_it_late(tmp_path: Path) -> None:
 
 def test_live_feed_reports_messages_while_it_is_behind(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(feeds, "LINES_AT_ONCE", 5)
-    feed, polls, told = Feed(run), 0, list[Change]()
+    feed, polls, told = ChangeFeed(run), 0, list[Change]()
     while not of_kind("m", told):
         changes, more = feed.poll()
         told, polls = told + changes, polls + 1
@@ -208,10 +208,10 @@ def test_directory_without_a_run_is_refused_in_one_sentence(
 ) -> None:
     for path, why in ((tmp_path / "nowhere", "does not exist"), (tmp_path, "neither a run directory")):
         with pytest.raises(RunDirectoryError, match=why):
-            Feed(path)
+            ChangeFeed(path)
     monkeypatch.setattr(feeds, "MAX_VEHICLES", 3)
     with pytest.raises(RunDirectoryError, match="at most 3"):
-        Feed(run)
+        ChangeFeed(run)
 
 
 def intervals(told: list[Change]) -> list[tuple[str, float, float, str]]:
@@ -249,7 +249,7 @@ def reconcile_during_a_vote(directory: Path) -> tuple[list[Change], Trace]:
     trace = trace_of(1, runs)
     lines = [trace.header.to_line(), *(run.to_line() for run in runs)]
     (directory / f"1{SUFFIX}").write_text("".join(lines))
-    course = AgentCourse(directory, 1)
+    course = AgentActions(directory, 1)
     course.read(100.0, 100)
     course.close()
     return course.changes, trace

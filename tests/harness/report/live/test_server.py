@@ -14,14 +14,17 @@ import pytest
 from harness.errors import MachineError
 from harness.report.live import server as servers
 from harness.report.live.change_log import ChangeLog
-from harness.report.live.server import Server
+from harness.report.live.server import LivePageServer
 
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 
 
 @asynccontextmanager
 async def served(directory: Path, log: ChangeLog | None = None) -> AsyncIterator[tuple[aiohttp.ClientSession, str]]:
-    async with Server(log or ChangeLog(), directory, live=True).open(0) as address, aiohttp.ClientSession() as client:
+    async with (
+        LivePageServer(log or ChangeLog(), directory, live=True).open(0) as address,
+        aiohttp.ClientSession() as client,
+    ):
         yield client, address
 
 
@@ -132,7 +135,7 @@ def test_browser_that_does_not_read_delays_no_other_page(tmp_path: Path) -> None
     log = ChangeLog()
 
     async def visit() -> None:
-        server = Server(log, tmp_path, live=True)
+        server = LivePageServer(log, tmp_path, live=True)
         async with server.open(0) as address, aiohttp.ClientSession() as client:
             port, path = urlsplit(address).port, urlsplit(address).path
             key = "dGhlIHNhbXBsZSBub25jZQ=="
@@ -182,7 +185,7 @@ def test_used_port_is_reported_in_one_sentence(tmp_path: Path) -> None:
             port = urlsplit(address).port
             assert port is not None
             with pytest.raises(MachineError, match=f"port {port} of 127.0.0.1 is not available: .*use"):
-                async with Server(ChangeLog(), tmp_path, live=False).open(port):
+                async with LivePageServer(ChangeLog(), tmp_path, live=False).open(port):
                     pass
 
     asyncio.run(visit())

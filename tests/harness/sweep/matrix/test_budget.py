@@ -9,7 +9,7 @@ import pytest
 from harness.sweep.matrix import matrix_outputs, run_matrix
 from harness.sweep.matrix._budget import informative
 from harness.sweep.matrix._cell import Run
-from harness.sweep.matrix._matrix_file import Task
+from harness.sweep.matrix._matrix_file import MatrixTask
 from harness.sweep.matrix.matrix_run import on_cores
 from harness.sweep.matrix.matrix_summary import verdict
 from tests.harness.command import harness
@@ -28,9 +28,9 @@ def ticking(seconds: list[float]) -> Callable[[], float]:
     return clock
 
 
-def order(most: float, chains: Callable[[float, int], int], late: int = 0) -> list[Task]:
+def order(most: float, chains: Callable[[float, int], int], late: int = 0) -> list[MatrixTask]:
     """Return the tasks in the order in which they begin. Each result is known after `late` further tasks."""
-    asked, runs, begun = matrix(loss=LOSS, seeds=20), dict[Task, Run](), list[Task]()
+    asked, runs, begun = matrix(loss=LOSS, seeds=20), dict[MatrixTask, Run](), list[MatrixTask]()
     for task in informative(asked.tasks, runs, most, ticking([0.0])):
         begun.append(task)
         if len(begun) > late:

@@ -14,7 +14,7 @@ from harness.sweep.matrix._culprits import find_culprits
 from harness.sweep.matrix._run_steps import fingerprint, first_changed, name_change
 from harness.sweep.matrix.matrix_run import compare_with, name_changes, on_cores
 from harness.sweep.matrix.matrix_table import changed_runs, troubles
-from harness.sweep.matrix.nights import Baseline, Nights
+from harness.sweep.matrix.nights import BaselineNight, Nights
 from harness.sweep.matrix.report import to_html
 from tests.harness.command import harness
 from tests.harness.sweep.matrix.stub import judge, matrix, played
@@ -57,7 +57,7 @@ def test_changed_runs_list_their_first_changed_handler_runs(tmp_path: Path) -> N
         return run_matrix(asked, tmp_path / name, on_cores(asked, 1))
 
     before, now = night("before"), night("now", timeline=[{"at_s": 50, "reconcile": [2]}])
-    baseline = Baseline(Path("x"), before.record, frozenset(now.record.matrix.points), [])
+    baseline = BaselineNight(Path("x"), before.record, frozenset(now.record.matrix.points), [])
     finished = name_changes(compare_with(now, baseline), baseline, 1)
     assert finished.record.against is not None
     (changed,) = finished.record.against.changed_runs
@@ -116,7 +116,7 @@ def regression(good: str, bad: str) -> tuple[MatrixRecord, MatrixRecord]:
     asked = matrix(seeds=[1, 3, 4])
     baseline = night(played(asked, 1, judge), good)
     now = played(asked, 1, busier)
-    compared = compare_with(now, Baseline(Path("x"), baseline, frozenset(asked.points), []))
+    compared = compare_with(now, BaselineNight(Path("x"), baseline, frozenset(asked.points), []))
     return night(compared, bad), baseline
 
 

@@ -10,7 +10,7 @@ import yaml
 
 from harness.errors import ScenarioError
 from harness.sweep.matrix import Matrix, load_matrix
-from harness.sweep.matrix._matrix_file import Point
+from harness.sweep.matrix._matrix_file import MatrixPoint
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 THESIS = SCENARIOS / "thesis_matrix.yaml"
@@ -48,7 +48,7 @@ def test_the_page_on_nights_has_a_matrix_and_a_workflow() -> None:
 
 def test_each_cell_has_the_scenario_with_its_loss(tmp_path: Path) -> None:
     scenario = {"agents": 3, "network": {"receivers": {2: {"loss": 0.9}}}}
-    cell = load_matrix(written(tmp_path, scenario=scenario)).scenario_at(Point(0.5, 3, "sim"))
+    cell = load_matrix(written(tmp_path, scenario=scenario)).scenario_at(MatrixPoint(0.5, 3, "sim"))
     assert cell.network.loss == 0.5
     assert cell.network.receivers[2].loss == 0.9
     assert cell.agents == 3
@@ -63,15 +63,15 @@ def test_a_scenario_may_stand_in_a_file_of_its_own(tmp_path: Path) -> None:
 def test_cells_are_all_combinations_of_backends_agents_and_losses(tmp_path: Path) -> None:
     asked = load_matrix(written(tmp_path, scenario={}, agents=[3, 10], backend=["sim", "process"]))
     assert asked.points == [
-        Point(loss, agents, backend) for backend in asked.backend for agents in (3, 10) for loss in (0.0, 0.5)
+        MatrixPoint(loss, agents, backend) for backend in asked.backend for agents in (3, 10) for loss in (0.0, 0.5)
     ]
     assert len(asked.tasks) == len(set(asked.tasks)) == 2 * len(asked.points)
-    assert len(asked.scenario_at(Point(0.5, 10, "sim")).roster) == 10
+    assert len(asked.scenario_at(MatrixPoint(0.5, 10, "sim")).roster) == 10
 
 
 def test_cells_have_the_mission_lengths_of_the_axis(tmp_path: Path) -> None:
     asked = load_matrix(written(tmp_path, duration_s=[60, 90.5]))
-    assert asked.points == [Point(loss, 3, "sim", length) for length in (60, 90.5) for loss in (0.0, 0.5)]
+    assert asked.points == [MatrixPoint(loss, 3, "sim", length) for length in (60, 90.5) for loss in (0.0, 0.5)]
     assert [asked.scenario_at(point).duration_s for point in asked.points] == [60, 60, 90.5, 90.5]
     assert asked.points[2].file_name == "loss-0.0-agents-3-duration-90.5"
 
@@ -98,7 +98,7 @@ def test_an_axis_may_be_one_value(tmp_path: Path) -> None:
 
 def test_without_the_axis_agents_are_the_scenarios(tmp_path: Path) -> None:
     asked = load_matrix(written(tmp_path, scenario={"agents": [7, 9]}))
-    assert asked.points[1] == Point(0.5, 2, "sim")
+    assert asked.points[1] == MatrixPoint(0.5, 2, "sim")
     assert asked.scenario_at(asked.points[1]).roster == (7, 9)
 
 

@@ -15,7 +15,7 @@ from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._cell_play import directory_name
 from harness.sweep.matrix._cell_scenarios import scenario_file, write_scenarios
 from harness.sweep.matrix.matrix_run import compare_with
-from harness.sweep.matrix.nights import Baseline, Nights
+from harness.sweep.matrix.nights import BaselineNight, Nights
 from harness.sweep.matrix.report import _drilldown, _heatmap, _trend, to_html
 from harness.sweep.matrix.report._heatmap import known_figures
 from tests.harness.command import harness
@@ -68,7 +68,7 @@ def test_a_figure_that_became_worse_is_marked_where_it_is_shown() -> None:
     for run in baseline["results"]:
         run["figures"]["reconciles"] -= 5 * (run["loss"] == 0.5)
     record = MatrixRecord.model_validate(baseline)
-    finished = compare_with(finished, Baseline(Path("before.json"), record, frozenset(matrix().points), []))
+    finished = compare_with(finished, BaselineNight(Path("before.json"), record, frozenset(matrix().points), []))
     assert [mark.text for mark in tiles(finished, "reconciles")["#loss-0.5-agents-5-sim"].marks] == [
         "1 violated",
         "worse",

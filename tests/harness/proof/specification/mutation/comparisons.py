@@ -165,7 +165,7 @@ class Inputs(abc.ABC):
         return ", ".join([self.inputs, *_settings_words(dict(self.settings))])
 
     @functools.cached_property
-    def encoded(self) -> tuple[_validate.Constants, _validate._Batch]:
+    def encoded(self) -> tuple[_validate.Constants, _validate._EncodedStepBatch]:
         """The steps of the core, with the settings of the specification."""
         with _all_tallies():
             [batch] = _validate._batches([RunTraces(self.name, self.traces())], _validate.TraceValidation())
