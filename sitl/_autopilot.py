@@ -2,7 +2,12 @@
 parsers.
 
 `Autopilot` is the vehicle. A client exchanges bytes with it through a `ClientChannel` (serial_channel.py). The module
-streams.py decides which messages the vehicle sends at intervals. Times are simulated seconds since boot.
+streams.py contains the messages that the vehicle sends at intervals. Times are simulated seconds since boot.
+
+The autopilot answers like ArduPilot wherever a client can see a difference. It refuses to arm until its position is
+known. It acknowledges a mode that is set in the first seconds after boot, and then undoes it. A copter begins a mission
+on command, a plane and a rover as soon as they are armed in AUTO mode. A course of closed formulas moves the vehicle. A
+new movement begins at the exact second at which the previous one ends, whatever the step size of `advance` is.
 """
 
 from __future__ import annotations
