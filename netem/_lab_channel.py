@@ -76,7 +76,7 @@ class LabConnection:
             await self._loop.sock_sendall(self._control, data)
 
     def close(self) -> None:
-        """Close the connection. This ends the virtual network."""
+        """Close the connection, which ends the virtual network."""
         self._finish("The lab is closed")
 
     def _receive(self) -> None:

@@ -38,7 +38,9 @@ def enter_network(namespace: int) -> None:
 
 @contextmanager
 def inside(namespace: int, home: int) -> Iterator[None]:
-    """Run code in the network namespace `namespace`, and then return to `home`. Both are file descriptors."""
+    """Run code in the network namespace `namespace`, and then return to the namespace `home`. Both arguments are file
+    descriptors.
+    """
     enter_network(namespace)
     try:
         yield

@@ -105,7 +105,7 @@ class Engine(ABC):
     """True if the engine supports all conditions. Otherwise it supports only independent loss and partitions."""
 
     def __init__(self, fabric: VirtualSwitch) -> None:
-        """Install the engine with perfect conditions. Raises EngineError if the kernel does not support it."""
+        """Install the engine, without loss and delay at first. Raises EngineError if the kernel does not support it."""
         self._fabric = fabric
         self._vehicles = fabric.vehicles
         self._in_force = NetworkConditions()

@@ -48,7 +48,7 @@ _CLOSE_DEADLINE_S = 5.0
 
 
 class LabProcess:
-    """A program in the virtual network. It ends at the latest when the network is closed."""
+    """A program in the virtual network. The program ends at the latest when the network is closed."""
 
     def __init__(self, channel: LabConnection, vehicle: int | None, pid: int, ended: asyncio.Future[int]) -> None:
         self._channel = channel

@@ -1,4 +1,4 @@
-"""Convert a route to a MAVLink mission and upload it. This is the pilot's side of the mission protocol.
+"""Convert a route to a MAVLink mission and upload the mission. This module is the pilot's side of the mission protocol.
 
 https://mavlink.io/en/services/mission.html. Item 0 is home. ArduPilot replaces it by its own.
 """

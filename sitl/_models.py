@@ -1,4 +1,6 @@
-"""Select the motion model for each type of vehicle. It converts a goal and the current motion into segments."""
+"""Select the motion model for each type of vehicle. A motion model converts a goal and the current motion into
+segments.
+"""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def is_near(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) ->
 
 
 def to_go_m(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
-    """Return the remaining distance over the ground in metres. It is negative inside the tolerance."""
+    """Return the remaining distance over the ground in metres, which is negative inside the tolerance."""
     return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
 
 

@@ -1,4 +1,4 @@
-"""Read text files that a user names. They must be regular files of limited size."""
+"""Read text files that a user names. The files must be regular and of limited size."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from sitl.vehicle import VehicleType
 
 @dataclass(frozen=True)
 class VehicleTrack:
-    """The computed path of one vehicle, in mission seconds and metres. It never ends."""
+    """The computed path of one vehicle, in mission seconds and metres. The path has no end."""
 
     course: PlannedMotion
     home_offset: tuple[float, float, float]

@@ -95,7 +95,7 @@ class Home:
         return Home(max(-90.0, min(90.0, lat)), (lon + 180.0) % 360.0 - 180.0, self.alt_m, self.heading_deg)
 
     def metres_to(self, lat_deg: float, lon_deg: float, alt_m: float) -> tuple[float, float, float]:
-        """Return the offset of another place from this one, in metres north, east and up. It is the inverse of
+        """Return the offset of another place from this one, in metres north, east and up. This method is the inverse of
         `offset`.
         """
         north_m = (lat_deg - self.lat_deg) * METRES_PER_DEGREE

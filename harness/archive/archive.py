@@ -278,7 +278,7 @@ class RunArchive:
 
     @cached_property
     def _public_keys(self) -> tuple["PublicKeys | None", list[str]]:
-        """Return the public keys, and a sentence about each problem with them."""
+        """Return the public keys of the mission, and a sentence about each problem with them."""
         if self._trusted_keys is not None:
             return self._trusted_keys, []
         beside = [*([self.directory] if self.directory else []), *self._agents]
@@ -311,7 +311,9 @@ class RunArchive:
 
     @property
     def stores(self) -> dict[int, Path]:
-        """The store on disk of each agent that has one, by agent ID. It is the one since the agent's last restart."""
+        """The store file of each agent with a disk, by agent ID. After restarts, this is the file of the last
+        incarnation.
+        """
         if self.directory is None:
             return {}
         agents = agents_directory(self.directory)

@@ -1,5 +1,5 @@
-"""Define a line of `channel.jsonl`, the log of a shared radio channel. It describes a message that a radio sent or
-dropped.
+"""Define a line of `channel.jsonl`, the log of a shared radio channel. Each line describes a message that a radio sent
+or dropped.
 """
 
 from typing import Annotated

@@ -172,7 +172,7 @@ class NetworkReplay:
         return LossRates(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
 
     def by_link(self) -> dict[Link, float]:
-        """Return the current loss rate of each link in each direction. It is 1.0 if no message passes."""
+        """Return the current loss rate of each link in each direction. A loss rate of 1.0 means that no message passes."""
         losses: dict[Link, float] = {}
         for low, high in self._scripted:
             there, back = (1.0, 1.0) if self.lost & {low, high} else self._directions((low, high))
@@ -180,13 +180,15 @@ class NetworkReplay:
         return losses
 
     def directions(self, pair: Pair) -> tuple[float, float]:
-        """Return the current loss rates of a pair: from the lower to the higher ID, and back. They are 1.0 without a
-        link.
+        """Return the current loss rates of a pair of vehicles: from the lower to the higher ID, and back. Without a
+        link, both are 1.0.
         """
         return self._directions(pair) if self._is_up(pair) else (1.0, 1.0)
 
     def by_pair(self) -> dict[Pair, float]:
-        """Return the current loss rate of each pair, as the mean of both directions. It is 1.0 without a link."""
+        """Return the current loss rate of each pair of vehicles, as the mean of both directions. Without a link, the
+        loss rate is 1.0.
+        """
         return {pair: sum(self._directions(pair)) / 2 if self._is_up(pair) else 1.0 for pair in self._scripted}
 
     def _is_up(self, pair: Pair) -> bool:
@@ -289,7 +291,9 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
 
 
 def _append_state(states: list[Topology], state: Topology) -> None:
-    """Append a state that differs from the previous one. It replaces a state of the same second."""
+    """Append a state of the network if it differs from the previous state. A state of the same mission second is
+    replaced.
+    """
     if states and states[-1].at_s == state.at_s:
         states.pop()
     if not states or states[-1].components != state.components:

@@ -70,7 +70,7 @@ class ExportedBlock(BaseModel):
 
     @property
     def event_bytes(self) -> bytes:
-        """The encoded events of a block (Section 3.1). They may be encrypted."""
+        """The encoded events of a block (Section 3.1), which may be encrypted."""
         return base64.b64decode(self.event_data)
 
 

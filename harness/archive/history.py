@@ -96,7 +96,9 @@ class BlockCommit:
 
 @dataclass(frozen=True, slots=True)
 class Phase2Tie:
-    """A tie at the end of reconcile phase 2. `branch` names its result."""
+    """A tie at the end of reconcile phase 2: several answers have equally many votes. `branch` names the branch that
+    the handler then took.
+    """
 
     agent: int
     at_s: float

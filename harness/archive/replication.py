@@ -31,7 +31,7 @@ class Replication:
 
 
 def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -> list[Replication]:
-    """Return the figures at 0 s and after each change."""
+    """Return the replication figures at mission second 0 and after each change."""
     steps: list[tuple[float, int, int, FaultRecord | HandlerRun]] = []
     for fault in faults:
         steps += [(fault.at_s, 0, agent, fault) for agent in fault.agents or () if agent in traces]

@@ -36,8 +36,7 @@ Record = TypeVar("Record")
 
 
 class Header(BaseModel):
-    """The header of a trace. `initial_data` is in base64. It is None in version 1, which does not record complete
-    inputs.
+    """The header of a trace. `initial_data` is in base64, or None in version 1, which does not record complete inputs.
 
     In a `secured` mission the recorded datagrams are plain. The sent ones were longer, and a datagram that looks valid
     here may have been dropped.
@@ -102,7 +101,7 @@ ASIDE = TypeAdapter(DroppedDatagram | CommandEntry)
 
 
 def read_clock(path: Path) -> dict[str, Any]:
-    """Return the clock in the header of a trace. It is empty if the header cannot be read."""
+    """Return the clock in the header of a trace, or an empty clock if the header cannot be read."""
     try:
         with open_trace(path) as file:
             return _validate(HEADER, file.readline(MAX_LINE_BYTES)).clock
@@ -181,7 +180,7 @@ class Trace:
         return counts
 
     def extend(self, entries: Iterable[Entry]) -> None:
-        """Append further entries."""
+        """Append further entries to the trace."""
         for entry in entries:
             if isinstance(entry, HandlerRun):
                 self.runs.append(entry)
@@ -189,7 +188,7 @@ class Trace:
                 self.asides.append((len(self.runs), entry))
 
     def entries(self) -> Iterator[Header | Gap | Entry]:
-        """Yield all entries in order.
+        """Yield all entries of the trace in order.
 
         The header is repeated for each incarnation, and a gap stands for missing lines.
         """

@@ -99,7 +99,7 @@ def _explain_agent(evidence: Evidence, since: float, agent_id: int) -> str:
 
 
 def describe_absent_agents(evidence: Evidence) -> str:
-    """Return a phrase that names the switched-off agents, whose chains are ignored. It completes a sentence."""
+    """Return a phrase that names the switched-off agents, whose chains are ignored. The phrase completes a sentence."""
     away = set(evidence.exports) - set(evidence.present)
     return f"; without {agents(away)}, which {'was' if len(away) == 1 else 'were'} switched off" if away else ""
 

@@ -17,8 +17,8 @@ ANSWERS = frozenset(
 
 
 def spread_of(trace: Trace) -> float:
-    """Return the longest random delay of the agent's answers (`answer_spread_s`) in mission seconds. It is 0 if the
-    trace header has no valid value.
+    """Return the longest random delay of the agent's answers (`answer_spread_s`) in mission seconds, or 0 if the trace
+    header has no valid value.
     """
     spread_s = trace.header.settings.get("answer_spread_s", 0.0)
     return float(spread_s) if isinstance(spread_s, int | float) and spread_s > 0 else 0.0

@@ -105,8 +105,8 @@ def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Unfini
 
 
 def longest(trace: Trace, timers: tuple[str, ...]) -> float:
-    """Return the duration of the longest of these timers in mission seconds, with a tolerance. It is infinite if a
-    duration is unknown.
+    """Return the duration of the longest of these timers in mission seconds, plus a tolerance. The result is infinite
+    if a duration is unknown.
     """
     settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
     if not all(isinstance(setting, int | float) for setting in settings):

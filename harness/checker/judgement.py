@@ -49,8 +49,8 @@ class Judgement:
 
 
 def violated(name: str, what: str, findings: list[Finding]) -> Judgement:
-    """Return a judgement with a bad verdict. Its reason counts the findings and adds `what`, as in "1 time an idle
-    agent ...".
+    """Return a judgement with a bad verdict. The reason of the judgement counts the findings and adds `what`, as in "1
+    time an idle agent ...".
     """
     return Judgement(name, "violated", f"{times(len(findings))}: {what}", findings[:MAX_EVIDENCE])
 

@@ -78,7 +78,7 @@ def stored_blocks(record: RecordedBytes | None) -> Iterator[Block]:
 
 
 class BlockIndex:
-    """An index of all blocks on record by hash. They come from exports and from messages."""
+    """An index of all recorded blocks by hash. The blocks come from exports and from messages."""
 
     def __init__(self, exported: Iterable[ExportedBlock]) -> None:
         self._exported = {block.block_hash: block for block in exported}

@@ -248,8 +248,8 @@ def findings(cycle: Cycle) -> list[Finding]:
 
 
 def _round_in_words(cycle: Cycle, agent_id: int) -> str:
-    """Return a text that lists the runs of one period. It starts after the longest pause, so equal cycles give equal
-    texts.
+    """Return a text that lists the handler runs of one period. The text starts after the longest pause, so equal cycles
+    give equal texts.
     """
     steps = [step for step in cycle.steps if step.agent_id == agent_id]
     if not steps or cycle.period_s is None:

@@ -96,7 +96,7 @@ class SignatureChecks:
         self._checked: dict[_Content, str | None] = {}
 
     def find_error(self, block: ExportedBlock) -> str | None:
-        """Return the end of a sentence about a block without a valid signature, else None."""
+        """Return a phrase with the reason why the signature of a block is not valid, or None if it is valid."""
         claim = block.agent_id, block.timestamp_us, block.event_data, block.block_hash, block.signature
         if claim not in self._checked:
             self._checked[claim] = self._verify(block)
@@ -116,7 +116,8 @@ class SignatureChecks:
         return None
 
     def find_head_error(self, export: Export) -> str | None:
-        """Return the end of a sentence about an export whose signed head is not valid, else None.
+        """Return a phrase with the reason why the signed head of an export is not valid, or None if the head is valid
+        or missing.
 
         The head may be missing, because agents of earlier versions export none.
         """

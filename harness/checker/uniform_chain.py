@@ -16,7 +16,7 @@ NAME = "one uniform chain"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge whether all exported chains are equal.
+    """Judge whether the exported chains of all agents are equal.
 
     `not applicable` where an export is missing, an agent was not idle, or those that differ had no chance.
     """

@@ -293,7 +293,7 @@ def _outcome_of_timer(snapshot: ModelSnapshot, now: float, name: str, *, counts:
 
 
 def handlers_and_messages(outcome: ExpectedOutcome) -> tuple[object, ...]:
-    """Return the handlers, branches and message names of these handler runs. They do not depend on block hashes."""
+    """Return the handlers, branches and message names of these handler runs. None of these depends on block hashes."""
     return tuple((run.handler, run.branch, tuple(message.NAME for message in run.sent)) for run in outcome.runs)
 
 

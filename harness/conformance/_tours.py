@@ -124,7 +124,7 @@ class VectorMap:
         return True
 
     def give_up(self) -> None:
-        """Remove all remaining tests."""
+        """Remove all tests that have not been played."""
         self._unseen.clear()
         self.left = 0
 

@@ -257,7 +257,7 @@ class UdpAgent(AgentUnderTest):
         return False
 
     async def _status(self) -> dict[str, Any]:
-        """Return the status of the agent. It is empty if the agent does not answer."""
+        """Return the status of the agent, or an empty status if the agent does not answer."""
         try:
             return await self.process.ask("status")
         except (AgentEndedError, AgentRefusedError):

@@ -166,7 +166,8 @@ class UdpLab:
 
 
 class PeerSocket:
-    """The UDP socket for all simulated agents of one test. It receives the tested agent's datagrams, and sends theirs.
+    """The UDP socket for all simulated agents of one test. The socket receives the datagrams of the tested agent, and
+    sends those of the simulated agents.
 
     `received` has pairs of arrival and datagram. The arrival is the time at which the kernel received the datagram, in
     seconds since the Unix epoch. It does not depend on when the harness reads the socket.

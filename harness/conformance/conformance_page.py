@@ -28,7 +28,7 @@ class AgentsFileError(HarnessError):
 
 @dataclass(frozen=True)
 class TableCell:
-    """The results of one agent for one Algorithm."""
+    """The conformance results of one agent for one Algorithm."""
 
     text: str
     kind: str

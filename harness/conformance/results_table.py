@@ -120,8 +120,8 @@ REDRAW_EVERY_S, LINE_EVERY_S = 0.2, 10.0
 
 @contextmanager
 def progress() -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that shows progress. Its arguments are the number of passed tests and the number of all
-    tests.
+    """Yield a function that shows progress. The arguments of the function are the number of passed tests and the number
+    of all tests.
     """
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

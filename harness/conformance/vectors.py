@@ -60,7 +60,7 @@ def generate(only: str | None = None) -> list[VectorSet]:
 
 @cache
 def _all_sets() -> tuple[VectorSet, ...]:
-    """Return all generated tests. They are computed once for all agents, because that takes seconds."""
+    """Return all generated tests. Their computation takes seconds, so all agents share one result."""
     default_results: dict[VectorKey, tuple[object, ...]] = {}
     generated = []
     for variant in VARIANTS.values():

@@ -46,7 +46,7 @@ class VirtualTimePace:
         self._change()
 
     def pause(self) -> None:
-        """Stop virtual time."""
+        """Pause virtual time."""
         self.paused = True
         self._change()
 
@@ -75,7 +75,7 @@ class VirtualTimePace:
             self._limited = True
 
     def end_step(self) -> None:
-        """End the current step, if there is one."""
+        """End the current single step of paused virtual time, if there is one."""
         if self._step is not None:
             self._step.set_result(self._now_s)
         self._step = None

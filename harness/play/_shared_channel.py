@@ -1,4 +1,4 @@
-"""Simulate a radio channel that all agents share. It is used in virtual time and in real time.
+"""Simulate a radio channel that all agents share, in virtual time and in real time.
 
 A message waits for the processing time of its agent, then in the queue of its radio. It arrives, if at all, when its
 frame ends. `ChannelTraffic` connects the messages with their frames, and counts their fates. It reads no clock: the

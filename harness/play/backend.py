@@ -51,7 +51,7 @@ class Backend(ABC):
         delivers_all: bool = False,
         pace: VirtualTimePace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
-        """Return a context manager that starts the agents of a scenario. They write their files to `rundir`.
+        """Return a context manager that starts the agents of a scenario. The agents write their files to `rundir`.
 
         `refuse` must have accepted the scenario. An error that ends the mission early is raised inside the context. The
         context catches it, and records it in `played`. Raises HarnessError if the swarm cannot be opened.

@@ -43,7 +43,9 @@ class ChildProcesses:
         self._mark = f"{NAME}={secrets.token_hex(16)}".encode()
 
     def environment(self, inherited: Mapping[str, str]) -> dict[str, str]:
-        """Return the environment variables with which the agent must be started. They identify its child processes."""
+        """Return the environment variables with which the agent must be started. The variables identify the agent's
+        child processes.
+        """
         name, _, value = self._mark.decode().partition("=")
         return {**passed_on(inherited), name: value}
 

@@ -128,7 +128,7 @@ class Interventions(GrowingTimeline):
 
     @property
     def by_hand(self) -> list[TimelineEntry]:
-        """The entries that the user has added by request."""
+        """The timeline entries that the user has added by request."""
         return list(self._by_hand.values())
 
     @property
@@ -151,7 +151,7 @@ class Interventions(GrowingTimeline):
 
     @property
     def paused(self) -> bool:
-        """True if virtual time is paused. It may still advance in single steps."""
+        """True if virtual time is paused. Single steps can still advance paused virtual time."""
         return self.pace is not None and self.pace.paused
 
     @property

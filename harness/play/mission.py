@@ -89,7 +89,7 @@ class Swarm(Protocol):
     def now(self) -> float: ...
 
     def enter(self, stage: str) -> None:
-        """Show the current stage of the mission to the user."""
+        """Show the user the current stage of the mission."""
 
     async def begin(self, first: Change) -> None:
         """Apply the initial conditions, start all agents, and start the clock of the mission."""
@@ -156,7 +156,7 @@ async def play(swarm: Swarm, scenario: Scenario) -> None:
 
 
 async def play_on(opening: AbstractAsyncContextManager[Swarm], scenario: Scenario, story: Story = play) -> RunOutcome:
-    """Start the agents, call `story` with them, and return the result."""
+    """Start the agents, play the mission with the function `story`, and return the result."""
     async with opening as swarm:
         await story(swarm, scenario)
     return swarm.played

@@ -45,7 +45,9 @@ def estimated_bytes(scenario: Scenario, *, all_delivered: bool) -> int:
 
 
 def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) -> tuple[str, str]:
-    """Return a remark on large traces, and a warning if they will probably not fit. Both are empty for small traces."""
+    """Return a remark on large traces, and a warning if the traces will probably not fit. Both texts are empty for
+    small traces.
+    """
     expected = estimated_bytes(scenario, all_delivered=all_delivered)
     quota = trace_quota(scenario, directory) * len(scenario.roster)
     if expected < PACKED_FROM_BYTES and expected < quota:

@@ -43,7 +43,7 @@ class VariantError(HarnessError):
 
 @dataclass(frozen=True)
 class CoreChange:
-    """A variant's new handler for one algorithm of the agents. Its other fields add to the declarations of the original
+    """A variant's new handler for one algorithm of the agents. The other fields add to the declarations of the original
     handler.
     """
 

@@ -13,7 +13,7 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 @dataclass(frozen=True, slots=True)
 class JunitCase:
-    """A test case. It passed if `skipped` is None and `wrong` is empty.
+    """A test case in a JUnit XML file. The test case passed if `skipped` is None and `wrong` is empty.
 
     The first line of `wrong` is a complete message. `skipped` is a reason. `note` is the output of a passed case.
     """

@@ -93,7 +93,7 @@ class Limits:
 
 @dataclass
 class Proof:
-    """The result of a proof.
+    """The result of a proof within bounds, with a violation if the prover found one.
 
     `complete` says whether all states within the bounds were explored. `flaw` is a violation, and `example` a scenario
     that shows it. `exit_status` is 0 if every claim holds, 1 if one does not, and 4 if a limit was reached first.

@@ -60,7 +60,7 @@ class ProofComparison:
 
     @property
     def shared(self) -> dict[str, str]:
-        """The violations that both cores have."""
+        """The violations that both agent cores have: the one in use and the original."""
         return {key: text for key, text in self.proof.findings.items() if key in self.original.findings}
 
     @property

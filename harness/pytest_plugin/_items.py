@@ -80,7 +80,9 @@ class StoryFile(pytest.File):
 
 
 class StoryItem(pytest.Item):
-    """The test of one run of a story. `pytest_runtest_call` judges the run."""
+    """The pytest item for one run of a story, a text file that describes a mission. `pytest_runtest_call` judges the
+    run.
+    """
 
     def __init__(self, *, play: Story, backend: BackendName, **node: Any) -> None:
         super().__init__(**node)
@@ -129,7 +131,7 @@ class StoryItem(pytest.Item):
             pytest.fail(f"{self.path} cannot be written: {error.strerror}", pytrace=False)
 
     def _played_text(self, archive: RunArchive) -> str:
-        """Return the text of the story with the reactions of agents in this run."""
+        """Return the text of a story file in which the reactions are those of the agents in this run."""
         narrator = StoryWriter(archive.traces, self._story.scenario.roster)
         answers = [narrator.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
         return self._story.with_answers(answers)

@@ -1,4 +1,4 @@
-"""Implement `--ucp-kernel uml`, which runs all tests in User Mode Linux. It supports netem and needs no root."""
+"""Implement `--ucp-kernel uml`, which runs all tests in User Mode Linux. This kernel supports netem and needs no root."""
 
 import os
 import shutil

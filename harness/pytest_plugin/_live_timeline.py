@@ -69,7 +69,7 @@ class LiveTimeline(GrowingTimeline):
         self._actions.put_nowait((action, answer))
 
     def stop(self) -> None:
-        """Accept no further actions."""
+        """Reject all further actions of the test."""
         self._actions.put_nowait(None)
 
     async def change(self, swarm: mission.Swarm, **entry: Any) -> float:

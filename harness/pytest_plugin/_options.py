@@ -1,4 +1,4 @@
-"""Define pytest's command-line options for runs. They replace the values in tests and scenarios."""
+"""Define pytest's command-line options for runs. These options replace the values in tests and scenarios."""
 
 from dataclasses import dataclass
 from pathlib import Path

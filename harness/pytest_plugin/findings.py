@@ -94,5 +94,5 @@ class Findings:
 
     @property
     def report(self) -> Path:
-        """The path of the report. It exists after the test if the test failed, or if `--ucp-keep` is set."""
+        """The path of the report. The report exists after the test if the test failed, or if `--ucp-keep` is set."""
         return self.directory / "report.html"

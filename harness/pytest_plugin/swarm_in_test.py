@@ -159,7 +159,7 @@ class Swarm:
         self._act(lambda swarm: self._timeline.release(swarm, **_of_message(message, which)))
 
     def __getattr__(self, verb: str) -> Callable[..., None]:
-        """Return the method for a fault or an injection. Its arguments are the keys of a timeline entry.
+        """Return the method for a fault or an injection. The arguments of the method are the keys of a timeline entry.
 
         Faults: `kill(2, 4)`, `reboot(3, down_s=10)`. Injections: `replay("Commit Block", sender=2, count=3)`,
         `flood(for_s=10, per_s=50)`.
@@ -270,7 +270,7 @@ class Swarm:
 
     @property
     def report(self) -> Path:
-        """The path of the report. It exists after the test if the test failed, or if `--ucp-keep` is set."""
+        """The path of the report. The report exists after the test if the test failed, or if `--ucp-keep` is set."""
         return self.directory / "report.html"
 
     def _findings(self) -> Findings:

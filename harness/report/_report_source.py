@@ -62,7 +62,7 @@ class ReportSource:
 
     @property
     def files_missing(self) -> list[str]:
-        """Sentences about all other missing or damaged files."""
+        """Sentences about the missing or damaged files that no other attribute describes."""
         exports = set(self.exports.errors)
         problems = [*(problem for problem in self.archive.problems if problem not in exports), *self.archive.gaps]
         return [

@@ -86,7 +86,7 @@ def draw(left: ReportSource) -> str:
 
 
 def _again(left: ReportSource, scenario: str) -> str:
-    """Return the command that plays the run again. It is empty if the record does not contain the scenario."""
+    """Return the command that plays the run again, or an empty text if the record does not contain the scenario."""
     if not scenario:
         return ""
     given = SCENARIO_FILE if len(scenario) <= MAX_SCENARIO else str(left.run_dir)

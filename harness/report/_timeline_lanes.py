@@ -254,7 +254,7 @@ def _commit(group: Sequence[BlockCommit], lane_height: int, names: Mapping[str, 
 
 
 def _tie(tie: Phase2Tie, lane_height: int) -> Markup:
-    """Draw a dot as a line of length 0 with round ends. It stays round when the picture is stretched."""
+    """Draw a dot as a line of length 0 with round ends. The dot stays round when the picture is stretched."""
     return Markup('<path class="tie" d="M{} {}h0"><title>{}</title></path>').format(
         format_number(tie.at_s),
         n(lane_height - 3 - _PHASES_HEIGHT / 2),

@@ -173,8 +173,8 @@ class ChainTreePicture:
 
 
 def _path(below: PlacedMark, above: PlacedMark) -> str:
-    """Return an SVG path from the top of one mark to the bottom of another. It has two corners if they are not
-    aligned.
+    """Return an SVG path from the top of one mark to the bottom of another. The path has two corners if the marks are
+    not aligned.
     """
     start, end = below.y, above.y + above.height
     if above.x == below.x:

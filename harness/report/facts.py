@@ -116,7 +116,7 @@ def command_again(record: RunRecord, scenario: str) -> str:
 
 
 def scenario_text(record: RunRecord) -> str:
-    """Return the recorded scenario as YAML without default values. It is empty if no scenario is recorded."""
+    """Return the recorded scenario as YAML without default values, or an empty text if no scenario is recorded."""
     if record.scenario is None:
         return ""
     return to_yaml(record.scenario.model_dump(mode="json", exclude_defaults=True), [])

@@ -224,7 +224,7 @@ def _shape(vehicle_type: VehicleType, place: Point) -> str:
 
 
 def sample(which: str) -> Markup:
-    """Draw a sample for the legend.
+    """Draw a sample of a line for the legend.
 
     `which` is one of LOOKS, "start", "end", "lost", "reboot", a link quality such as "q1", or a vehicle type.
     """

@@ -93,7 +93,7 @@ def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None, ex
 
 
 def headline(verdicts: list[VerdictEntry], *, completed: bool) -> tuple[str, str]:
-    """Return a summary of the verdicts and its kind.
+    """Return a one-line summary of the verdicts, and its kind (the CSS class).
 
     A run that did not complete is never "holds". A run whose bad verdicts are all expected is "unknown".
     """

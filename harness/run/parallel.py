@@ -98,7 +98,7 @@ def raise_error(outcome: R | HarnessError) -> R:
 
 
 class WorkerProcess(Generic[T, R]):
-    """A process that executes tasks until it is killed. It also ends with its parent process."""
+    """A process that executes tasks until it is killed. The process also ends with its parent process."""
 
     def __init__(self, work: Callable[[T], R]) -> None:
         self.connection, its_end = _FORK.Pipe()

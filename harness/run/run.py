@@ -166,7 +166,9 @@ class RunRecording:
         self._update(scenario=scenario)
 
     def record_requests(self, interventions: Interventions) -> None:
-        """Write the user's requests to the record so far, and a scenario that plays them again."""
+        """Write the actions that the user has requested until now to the record of the run. Also write a scenario that
+        repeats them.
+        """
         self.update_scenario(interventions.scenario)
         by_hand_s = [entry.at_s for entry in interventions.by_hand]
         replay = replay_of(self._record, by_hand_s)
@@ -176,7 +178,7 @@ class RunRecording:
             raise MachineError(f"{self.directory.path / REPLAY_FILE} cannot be written: {error.strerror}") from None
 
     def record_outcome(self, played: RunOutcome) -> None:
-        """Write the result so far to the record."""
+        """Write the results that are known until now to the record of the run."""
         self._update(
             engine=played.engine,
             mission_s=played.mission_s,

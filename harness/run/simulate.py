@@ -95,7 +95,9 @@ def check_determinism(scenario: Scenario, seed: int) -> None:
 
 
 def run_to_end(story: Coroutine[Any, Any, Returned]) -> Returned:
-    """Run a coroutine without an event loop. It must never wait, which is the case for a mission in virtual time."""
+    """Run a coroutine without an event loop. The coroutine must never wait, as is the case for a mission in virtual
+    time.
+    """
     try:
         story.send(None)
     except StopIteration as end:

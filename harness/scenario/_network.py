@@ -247,7 +247,7 @@ class NetworkDisturbance(StrictModel):
 
     @property
     def groups(self) -> tuple[frozenset[int], ...]:
-        """The groups of the partition."""
+        """The groups of vehicles into which the partition divides the network."""
         return tuple(frozenset(group) for group in self.partition or ())
 
 

@@ -22,7 +22,7 @@ PARTITION = "partition"
 
 @dataclass
 class NetworkState:
-    """The network at one moment of the mission."""
+    """The conditions and partitions of the network at one moment of the mission."""
 
     roster: tuple[int, ...]
     lasting: NetworkValues

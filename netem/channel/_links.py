@@ -75,7 +75,7 @@ class FrameReach:
 
     @property
     def powers(self) -> list[float]:
-        """The power at each receiver. It is computed only if frames overlap."""
+        """The received power at each receiver, computed only if frames overlap."""
         if self._powers is None:
             self._powers = [linear(level) for level in self.levels]
         return self._powers

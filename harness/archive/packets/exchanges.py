@@ -29,7 +29,7 @@ class RequestOutcome(NamedTuple):
 
 
 class RequestAnswers:
-    """The answers to each request."""
+    """The answers of vehicles to each captured request."""
 
     def __init__(self, transmissions: Sequence[Transmission]) -> None:
         self._responses: dict[int, list[Transmission]] = {}

@@ -35,7 +35,7 @@ MAGICS = (_SECTION, *_PCAP)
 
 
 class Frame(NamedTuple):
-    """A captured frame.
+    """A network frame in a packet capture file.
 
     `time_ns` counts from the Unix epoch. `length` is the length on the wire, and `data` may be shorter.
     """
@@ -57,7 +57,7 @@ class _Interface(NamedTuple):
 
 
 class _BrokenCaptureError(Exception):
-    """An error: the rest of the file cannot be read."""
+    """An error: the rest of the packet capture file cannot be read."""
 
 
 class CaptureFile:

@@ -84,7 +84,7 @@ class _Listeners:
 
 
 def join(captures: Captures) -> list[Transmission]:
-    """Return all messages in the order of sending."""
+    """Return the messages of all captures, in the order of sending."""
     by_number = {capture.number: capture for capture in captures.used}
     listeners = _Listeners(captures.used)
     transmissions = [

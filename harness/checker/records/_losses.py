@@ -235,7 +235,7 @@ def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer
 
 
 def _relative_entropy(share: float, mean: float) -> float:
-    """Return the relative entropy of `share` and `mean` in nats. It is infinite if the share is impossible."""
+    """Return the relative entropy of `share` and `mean` in nats, or infinity if the share is impossible."""
     if mean in (0.0, 1.0):
         return 0.0 if share == mean else float("inf")
     parts = ((share, mean), (1 - share, 1 - mean))

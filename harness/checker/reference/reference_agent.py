@@ -1,4 +1,5 @@
-"""The reference implementation as an agent without I/O. It has the same interface as `ucp.agent.Agent`.
+"""The reference implementation as an agent without I/O. The reference agent has the same interface as
+`ucp.agent.Agent`.
 
 `prove` puts it into the state of an agent and gives both the same input. `conformance` runs it beside the agent under
 test.

@@ -64,7 +64,7 @@ class Timer:
             self._paused_at = now
 
     def resume(self, now: float) -> None:
-        """Continue a paused timer. Its deadline moves by the duration of the pause."""
+        """Continue a paused timer. The deadline of the timer moves by the duration of the pause."""
         if self.deadline is not None and self._paused_at is not None:
             self.deadline, self._paused_at = self.deadline + (now - self._paused_at), None
 
@@ -217,7 +217,7 @@ class State:
         self.started[timer.name] = duration_s
 
     def trigger(self, local_event: str) -> None:
-        """Queue a local event. Its handler runs after the current handler."""
+        """Queue a local event. The handler of the event runs after the current handler."""
         self.triggered.append((local_event, self.running.name))
 
     def changed(self, operation: str, block: Block) -> None:

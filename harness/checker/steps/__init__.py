@@ -117,7 +117,7 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Ste
 
 
 def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | CommandEntry) -> StepDeviation | None:
-    """Return a deviation if the agent dropped a datagram that it had to handle, else None."""
+    """Return a deviation if the agent dropped a datagram that it had to handle, otherwise None."""
     if not isinstance(aside, DroppedDatagram) or header.secured:
         return None  # a secured agent drops datagrams before it decrypts them
     try:
@@ -151,7 +151,7 @@ def deviates(evidence: Evidence, deviations: list[StepDeviation], steps: int, lo
 
 
 def _known(deviation: StepDeviation) -> str | None:
-    """Return the handler of the deviation if it is one of the 20 handlers of the protocol, else None."""
+    """Return the handler of the deviation if it is one of the 20 handlers of the protocol, otherwise None."""
     return deviation.handler if deviation.handler in HANDLERS else None
 
 

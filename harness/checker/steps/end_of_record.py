@@ -67,7 +67,8 @@ def last_line(trace: Trace) -> tuple[int, float]:
 def unfinished(
     follower: StepComparer, trace: Trace, others_until_s: float, arrivals: Iterator[MessageArrival] | None
 ) -> str | None:
-    """Return a sentence about the end of a trace without an export, if the mission went on after it. None otherwise.
+    """Return a sentence if a trace ends early: it has no export, and the mission went on after the end of the trace.
+    Otherwise return None.
 
     `others_until_s` is a mission second until which others certainly went on. `arrivals` are the messages to the agent.
     None if messages prove nothing.

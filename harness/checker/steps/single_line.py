@@ -38,7 +38,7 @@ Line = tuple[int, HandlerRun]
 
 
 class OtherRecords(Protocol):
-    """The other records of the flight."""
+    """The records of a flight that belong to other agents than the judged one."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
         """Return the datagrams of a sender with a sequence number."""

@@ -97,7 +97,8 @@ class SecuredPeers:
         return len(received)
 
     async def require_single_answer(self, after: str) -> bytes:
-        """Ask the agent whether it has the inception block. Its next datagram must be the answer to this request.
+        """Ask the agent whether it has the inception block. Fail if the agent's next datagram is not the answer to this
+        request.
 
         Return the datagram of the request.
         """

@@ -43,7 +43,7 @@ LOOK_EVERY_S = 5.0
 
 
 class ContainerLab:
-    """A virtual network whose programs run in containers. Its errors are DockerError and those of netem."""
+    """A virtual network whose programs run in containers. The methods raise DockerError and the errors of netem."""
 
     def __init__(self, engine: DockerEngine, rundir: RunDirectory, scenario: Scenario) -> None:
         self._engine = engine
@@ -328,7 +328,7 @@ class ContainerLab:
             raise error
 
     def _kill_processes(self) -> None:
-        """Kill all processes in the networks of the lab. This is needed when Docker does not answer."""
+        """Kill all processes in the networks of the lab, for the case that Docker does not answer."""
         for process in Path("/proc").iterdir():
             if process.name.isdecimal():
                 with contextlib.suppress(OSError):

@@ -112,13 +112,13 @@ def project(engine: DockerEngine, say: Callable[[str], object]) -> ContainerImag
 
 
 def project_name() -> str:
-    """Return a name for the image of this project. It depends on the contents of the image."""
+    """Return a name for the Docker image of this project. The name depends on the contents of the image."""
     made_of = _tar(context()) + json.dumps(build_arguments()).encode("ascii")
     return f"{PROJECT_IMAGE}:{version('ucp-harness')}-{hashlib.sha256(made_of).hexdigest()[:12]}"
 
 
 def build_arguments() -> dict[str, str]:
-    """Return the versions of the packages to install in the image. They equal the versions installed here."""
+    """Return the versions of the packages to install in the Docker image. The versions equal those installed here."""
     arguments = {"PYMAVLINK": version("pymavlink")}
     with suppress(PackageNotFoundError):  # optional: needed only for secure missions
         arguments["CRYPTOGRAPHY"] = version("cryptography")

@@ -289,8 +289,8 @@ class AgentProcess:
             raise self._failure("hung", f"stopped answering: {error}") from None
 
     async def _has_ended(self, process: LabProgram) -> bool:
-        """Return true if the process has ended. It waits a moment, because the connection can end before the process
-        does.
+        """Wait a moment, and return whether the process has ended. The connection to a process can end before the
+        process does.
         """
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(process.wait(), END_LIMIT_S)

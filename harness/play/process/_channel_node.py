@@ -180,7 +180,7 @@ class ChannelNode:
         return {}
 
     def _totals(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Write the channel's data for `run.json` to a file."""
+        """Write the counts of the channel, for `run.json`, to a file."""
         if self._relay is not None:
             self._lateness.missed = self._relay.count_missed()
         self._journal.flush()

@@ -1,4 +1,4 @@
-"""Decide when each broadcast on a shared radio channel reaches each vehicle. This module uses no I/O and no clock.
+"""Decide when each broadcast on a shared radio channel reaches each vehicle, without I/O and without a clock.
 
 The model and the random draws are those of virtual time. A message of an agent waits for its processing time and in the
 queue of its radio. When its frame ends, the conditions of the network apply to each copy that the channel delivers.

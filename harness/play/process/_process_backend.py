@@ -1,4 +1,4 @@
-"""The process backend. It plays vehicles and agents as programs on this machine, in a private network.
+"""The process backend, which plays vehicles and agents as programs on this machine, in a private network.
 
 The modules for networks and vehicles are imported only when a run needs them, because these imports are slow.
 """

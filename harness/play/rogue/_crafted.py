@@ -33,7 +33,7 @@ def forged_commit(block: Block, chain_hash: bytes) -> CommitBlock:
 
 
 def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, rng: Random) -> Packet:
-    """Return a valid message with random content. Its type is `name`, or random if that is None.
+    """Return a valid message with random content. If `name` is None, the type of the message is random, too.
 
     Its block is in a roster agent's name.
     """

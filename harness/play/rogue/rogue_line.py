@@ -11,8 +11,8 @@ OF_NO_INJECTION = -1
 
 
 def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, Any]:
-    """Return the log entry of a datagram that was sent at `at_s`. Its field `refused` is the reason why agents drop the
-    datagram.
+    """Return the log entry of a datagram that was sent at `at_s`. The field `refused` of the entry is the reason why
+    agents drop the datagram.
     """
     record = {"at_s": round(at_s, 6), "injection": injection, "what": what, "source": source}
     if datagram[2:3] == bytes([SECURED]):

@@ -219,7 +219,7 @@ class EventLoop:
             self.fail(crash)
 
     def fail(self, error: AgentFailedError) -> None:
-        """Record that an agent crashed. Its record ends, and the others go on."""
+        """Record that an agent crashed, and end the record of this agent. The other agents continue."""
         raise NotImplementedError
 
     def _handle_message(self, number: int, incarnation: Incarnation, flight: MessageInFlight) -> None:
@@ -357,7 +357,8 @@ class EventLoop:
         self._air.busy_until[number] = 0.0 if busy_until is None else incarnation.mission_s(busy_until)
 
     def _timer_end(self, number: int, incarnation: Incarnation, soonest: float) -> float:
-        """Return the mission second at which the next timer expires, or at which the agent next needs waiting answers.
+        """Return the next mission second at which a timer of the agent expires, or at which the agent must send a
+        delayed answer.
 
         `soonest` is this time by the agent's clock, if none of its timers is late.
         """

@@ -139,4 +139,4 @@ class OwnAgent(Agent):
         return StoredState.of(self.state)
 
     def end(self, now: float) -> None:
-        """Do nothing. The object keeps the state of the agent."""
+        """Do nothing when the agent ends, because this object keeps the state of the agent."""

@@ -281,7 +281,7 @@ class VirtualAir:
     # Shared channel
 
     def move(self, places: Mapping[int, Place], now: float) -> None:
-        """Put the vehicles at these places."""
+        """Set the positions of the vehicles in the simulated network."""
         if self._channel is not None:
             self._channel.move([places[agent_id] for agent_id in self._roster], now)
 
@@ -479,8 +479,8 @@ class VirtualAir:
         return True
 
     def release(self, number: int, at: float) -> None:
-        """Stop holding back the messages of this rule. They arrive at the time `at`, or at their own time if that is
-        later.
+        """Stop holding back the messages of this rule. The messages arrive at the time `at`, or at their own time if
+        that is later.
         """
         for flight, receiver, would_arrive in self._held.pop(number, ()):
             self._schedule_arrival(flight, receiver, max(at, would_arrive))

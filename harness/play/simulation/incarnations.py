@@ -81,7 +81,7 @@ class Incarnation:
 
     @property
     def chain_changed_at(self) -> float | None:
-        """The mission second of the last change of the chain. It is 0 if there was no change, and None if it is
+        """The mission second of the last change of the chain, 0 if there was no change, and None if the time is
         unknown.
         """
         local_s = self.agent.chain_changed_at

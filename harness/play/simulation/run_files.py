@@ -96,7 +96,7 @@ class Recorder(Protocol):
     """True if handler runs are recorded. Otherwise `write` is not called."""
 
     def begin(self, incarnation: Incarnation) -> None:
-        """Record that an agent started."""
+        """Record the start of an agent."""
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
         """Record that an agent logs an event with `data_bytes` bytes of data."""

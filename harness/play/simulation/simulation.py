@@ -159,7 +159,9 @@ class Simulation(EventLoop):
                 await self._breathe(self)
 
     async def _run_at(self, pace: "VirtualTimePace", furthest: float) -> None:
-        """Play the simulation like `run`, but stop at the time that the requested speed allows."""
+        """Play the simulation like `run`, but only up to the mission second that the requested speed allows at this
+        moment.
+        """
         allowed_s = await pace.allowed_until(self._now)
         if allowed_s is None:
             return
@@ -342,7 +344,7 @@ class Simulation(EventLoop):
         return played
 
     def fail(self, error: "AgentFailedError | AgentLacksError") -> None:
-        """Record that an agent crashed, hung, or does not support the mission. Its record ends."""
+        """Record that an agent crashed, hung, or does not support the mission, and end the record of this agent."""
         number = self._number[error.agent_id]
         if (incarnation := self._alive[number]) is not None:
             incarnation.ended_at = self._now
@@ -358,7 +360,7 @@ class Simulation(EventLoop):
             self._foreign_swarm.close()
 
     def end(self) -> None:
-        """Record the result at the end of the mission."""
+        """Store the result of the run at the end of the mission."""
         if self._rogue is not None:
             self._rogue.close()
         self.played = self._outcome_so_far()
@@ -393,8 +395,8 @@ class Simulation(EventLoop):
         return (incarnation for incarnation in self._alive if incarnation is not None)
 
     def exporting(self) -> Iterator[Incarnation]:
-        """Yield the agents that leave a chain export, in the order of the roster. They are alive or were switched
-        off.
+        """Yield the agents that leave a chain export, in the order of the roster: those alive, and those that were
+        switched off.
         """
         for number, incarnation in enumerate(self._alive):
             if (leaves := self._switched_off.get(number, incarnation)) is not None:
@@ -478,7 +480,7 @@ class Simulation(EventLoop):
         self._start(number, self._disks.pop(number, None))
 
     async def fall(self, agent_id: int) -> None:
-        """Remove the vehicle from the ground station's display. Its flight path does not change."""
+        """Remove the vehicle from the ground station's display. The flight path of the vehicle does not change."""
         self.lost_vehicles.add(agent_id)
 
     async def revoke(self, agent_id: int, heard_by: Sequence[int]) -> None:

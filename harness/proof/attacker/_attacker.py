@@ -34,8 +34,8 @@ class _AgentKnowledge(NamedTuple):
 
 
 class ForgedTimestamps:
-    """Timestamps before, between and after those of `blocks` honest blocks. They let up to `lies` forged blocks have
-    any age.
+    """Timestamps before, between and after those of `blocks` honest blocks. With these timestamps, up to `lies` forged
+    blocks can have any age.
     """
 
     def __init__(self, blocks: int, lies: int) -> None:

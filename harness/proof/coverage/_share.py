@@ -17,7 +17,7 @@ from harness.proof.model._shape import HeldBlockOrder, Shape, shape_of
 
 @dataclass
 class ExistingStates:
-    """The agent states and (state, input) pairs that exist within `bounds`. They are complete if `ended` is
+    """The agent states and (state, input) pairs that exist within `bounds`. The sets are complete if `ended` is
     "complete".
     """
 

@@ -40,7 +40,9 @@ Document = dict[str, Any]
 
 @dataclass(eq=False)
 class _BroadcastOnPath:
-    """A broadcast message on the path. `count` numbers the messages of this sender with the same name."""
+    """A broadcast message that an agent sends on a path through the state graph. `count` numbers the messages of one
+    name from this sender.
+    """
 
     sender: int
     message: int
@@ -52,8 +54,8 @@ class _BroadcastOnPath:
 
 @dataclass
 class _AgentOnPath:
-    """An agent on the path. `timers` maps each running timer to its number among all started timers and to its
-    expiry.
+    """An agent on a path through the state graph. `timers` maps each running timer to its number among all started
+    timers and to its expiry.
     """
 
     agent_id: int
@@ -153,7 +155,7 @@ class PathScript:
     # Times
 
     def _runs(self) -> list[TimerRun]:
-        """Return all timers that run on the path."""
+        """Return all runs of timers on the path."""
         running: dict[tuple[int, int], tuple[int, float]] = {}
         runs = []
         for instant, move in enumerate(self._moves):

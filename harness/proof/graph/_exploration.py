@@ -20,8 +20,8 @@ NO_PARENT = -1
 
 @dataclass
 class StateGraph:
-    """The explored states by number, and the predecessor of each. They are all reachable states if `ended` is
-    "complete".
+    """The explored states by number, and the predecessor of each. If `ended` is "complete", the graph contains all
+    reachable states.
 
     `quiet` and `crossing` have the fields `by_timer` and `crossing` of the expansion of each state.
     """

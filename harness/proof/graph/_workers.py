@@ -118,7 +118,7 @@ class _NumberTranslator:
 
 
 class _StateTranslator:
-    """One end of the connection between two processes. It translates the numbers of states."""
+    """One end of the connection between two processes, which translates the numbers of states."""
 
     def __init__(self, swarm: ModelSwarm) -> None:
         local, zones = swarm.local, swarm.zones

@@ -1,4 +1,5 @@
-"""Explore each agent alone. It may receive every message that any agent can ever have sent (network model `any`).
+"""Explore each agent alone. The agent may receive every message that any agent can ever have sent (network model
+`any`).
 
 A message may be lost, duplicated, delayed for any time and overtaken. An agent can therefore receive each sent message
 at any moment, any number of times, and depends on other agents in no other way. The only exception: no agent can

@@ -70,7 +70,7 @@ class MessageRound(NamedTuple):
 
 
 class FinalMessageRound(NamedTuple):
-    """The last round of messages that leads to a result.
+    """The last round of messages in an instant, with all rounds before it.
 
     `lost` is the number of lost messages, counted for each receiver. It is 0 if losses are not counted.
     """

@@ -162,6 +162,6 @@ class KnownStates:
 
 
 def _back(names: Names) -> Names:
-    """Return the IDs that undo a renaming of agents."""
+    """Return the mapping of agent IDs that undoes a renaming of agents."""
     before = {name: other for other, name in enumerate(names, FIRST_OTHER)}
     return tuple(before[name] for name in sorted(names))

@@ -86,7 +86,7 @@ def dead(state: AgentState) -> Snapshot:
 
 
 def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) -> None:
-    """Set the agent to the state of a snapshot. Its running timers get the deadline RUNNING_S.
+    """Set the agent to the state of a snapshot. Each running timer of the agent gets the deadline RUNNING_S.
 
     `since` is the agent's present state, if it is known. Parts that both have are not changed.
     """
@@ -279,7 +279,7 @@ class SnapshotParts:
         self._hashes: dict[int, bytes] = {}
 
     def part(self, name: str, value: Any) -> Any:
-        """Return the stored part that is equal to this one."""
+        """Return the stored part that is equal to the given part."""
         key = name, keyed(value, self.name)
         part = self._parts.setdefault(key, value)
         if part is value:
@@ -301,8 +301,8 @@ class SnapshotParts:
         return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
 
     def anonymous(self, agent_id: int, flaw: PropertyViolation | None, snapshot: Snapshot) -> int:
-        """Return a number for a state that does not depend on the identity of voters and responders. It is the same on
-        all machines.
+        """Return a number for a state that does not depend on the identity of voters and responders. The number is the
+        same on all machines.
         """
         parts = [
             len(value) if name in NAMES_OF_OTHERS else self._digests[id(value)] for name, value in snapshot.items()
@@ -310,7 +310,7 @@ class SnapshotParts:
         return int.from_bytes(blake2b(repr((agent_id, flaw, parts)).encode(), digest_size=8).digest())
 
     def name(self, digest: bytes) -> int:
-        """Return a number for a hash. It is the same on all machines."""
+        """Return a number for a hash. The number is the same on all machines."""
         name = int.from_bytes(digest[:8])
         assert self._hashes.setdefault(name, digest) == digest, "no two hashes that there are begin alike"
         return name

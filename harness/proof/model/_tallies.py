@@ -49,7 +49,7 @@ class VoteCounts:
         return number
 
     def _left(self, local: int) -> Snapshot:
-        """Return the simplified vote counts of a state."""
+        """Return the vote counts of a state in simplified form."""
         known = self._states.known[local]
         snapshot = known.snapshot
         left: Snapshot = {}

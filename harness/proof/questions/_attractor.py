@@ -43,7 +43,7 @@ class BackwardReachableStates:
 
     @property
     def left(self) -> int:
-        """The number of states outside the set."""
+        """The number of states that are not in the set."""
         return self._inside.count(0)
 
     @property

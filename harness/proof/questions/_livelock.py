@@ -86,7 +86,7 @@ def forms(graph: StateGraph, cycles: Sequence[list[int]]) -> list[list[list[int]
 
 
 def _form(graph: StateGraph, cycle: Sequence[int]) -> _Form:
-    """Return the form of a cycle. It is the same for any choice of the cycle's first state."""
+    """Return the form of a cycle, which does not depend on the choice of the cycle's first state."""
     known = graph.swarm.local.known
     looks = [
         tuple(

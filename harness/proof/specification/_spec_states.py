@@ -42,7 +42,7 @@ _FIELD = re.compile(r"(\w+) \|->")
 
 
 def specified(graph: Path) -> Iterator[Plain]:
-    """Yield all states that TLC found."""
+    """Yield all states that TLC found in the specification."""
     with graph.open() as lines:
         for line in lines:
             if node := _NODE.match(line):

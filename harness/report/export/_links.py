@@ -21,7 +21,7 @@ def vehicle_frame(vehicle: int) -> str:
 
 
 class LinkLine(NamedTuple):
-    """The link between two vehicles. `loss` is the larger loss rate of both directions. It is below 1."""
+    """The link between two vehicles, with a loss rate below 1. `loss` is the larger loss rate of both directions."""
 
     low: Metres
     high: Metres

@@ -1,4 +1,4 @@
-"""Manage the live page of an active run. Its web server is a separate process.
+"""Manage the live page of an active run. The web server of the page is a separate process.
 
 The two processes exchange lines of JSON. The run sends `["t", mission second]`, `["hand", state]` and answers to
 requests. The server first sends the page's address, and then `[page, number, request]` for each request.

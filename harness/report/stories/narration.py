@@ -77,7 +77,7 @@ class AgentReaction:
 
 
 class StoryWriter:
-    """Writes a story from the traces of all agents."""
+    """Writes a story, a text with the steps of a mission, from the traces of all agents."""
 
     def __init__(self, traces: Mapping[int, Trace], roster: Sequence[int]) -> None:
         self._traces = traces

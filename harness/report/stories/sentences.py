@@ -1,4 +1,4 @@
-"""Translate the sentences of a story into entries of a scenario."""
+"""Translate the sentences of a story (a text file that describes a mission) into entries of a scenario."""
 
 import re
 from collections.abc import Callable
@@ -34,7 +34,9 @@ class StoryEntries:
         self.ends_at_s: int | None = None
 
     def add(self, at_s: int, sentence: str) -> None:
-        """Add a sentence of the story. Raises ScenarioError if its form is unknown."""
+        """Add the scenario entries for one sentence of the story. Raises ScenarioError if the sentence has an unknown
+        form.
+        """
         if sentence == "end":
             self.ends_at_s = at_s
         elif sentence == "heal":

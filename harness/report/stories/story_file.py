@@ -1,4 +1,5 @@
-"""Read and write story files: scenario keys, then sentences with their seconds, and below them the agents' reactions.
+"""Read and write story files. A story file contains scenario keys, then sentences with their mission seconds, and below
+each sentence the reactions of the agents.
 
     # Figure 3.8: the course of a vote.
     agents: 3
@@ -47,7 +48,9 @@ class StorySection:
 
 @dataclass(frozen=True)
 class Story:
-    """A story file. `lines` contains its lines without the reactions of agents."""
+    """The content of a story file, which describes a mission in sentences. `lines` contains the lines without the
+    reactions of agents.
+    """
 
     path: Path
     text: str
@@ -78,7 +81,7 @@ class Story:
 
 
 def is_story(path: Path) -> bool:
-    """Return true if the file is a story. Other tools use the same file name suffix."""
+    """Return whether the file is a story of this harness. Other tools use the same file name suffix."""
     try:
         lines = read_text(path, MAX_BYTES).splitlines()
         return any(_SENTENCE.fullmatch(line) for line in lines[:MAX_LINES])

@@ -1,4 +1,4 @@
-"""Name the blocks, chains and messages in a story."""
+"""Name the blocks, chains and messages in a story file."""
 
 import base64
 import binascii

@@ -39,13 +39,13 @@ class AgentOperations(Protocol):
         """End the agent, and also its vehicle if `with_vehicle` is true. `disk_kept` keeps the data on its disk."""
 
     async def begin_incarnation(self, agent_id: int, *, new_vehicle: bool = False) -> None:
-        """Start the agent again with the data on its disk. It gets a new vehicle if `new_vehicle` is true."""
+        """Start the agent again with the data on its disk. If `new_vehicle` is true, the agent gets a new vehicle."""
 
     async def fall(self, agent_id: int) -> None:
         """Let the vehicle of the agent fall to the ground."""
 
     async def pause(self, agent_id: int) -> None:
-        """Stop the agent temporarily. Its incoming messages wait."""
+        """Stop the agent temporarily. Messages to the agent wait."""
 
     async def resume(self, agent_id: int) -> None: ...
 

@@ -36,7 +36,7 @@ class RecordedEvent:
 
 @dataclass(frozen=True, slots=True)
 class LostMessage:
-    """A message that `receiver` did not receive. It was number `count` of its type from `sender`, sent at `at_s`.
+    """A message that `receiver` did not receive. `sender` sent it at `at_s`, as message number `count` of its type.
 
     `by_quirk` is true if the message arrived and the receiver ignored it.
     """

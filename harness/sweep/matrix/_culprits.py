@@ -25,7 +25,7 @@ LIMIT_S = 600.0
 
 
 class _TimeIsUpError(Exception):
-    """The budget is used up."""
+    """An error: the time for the search is used up."""
 
 
 def find_culprits(
@@ -59,7 +59,7 @@ def _paired_regressions(record: MatrixRecord) -> list[Change]:
 
 
 def _worst_seed(tonight: MatrixRecord, baseline: MatrixRecord, change: Change) -> int:
-    """Return the seed whose figure became worse by most."""
+    """Return the seed of the run whose figure became worse by the largest amount."""
     metric = BY_NAME[change.metric]
     sign = 1 if metric.worse == "higher" else -1
     before = {run.seed: metric.of(run.figures) for run in baseline.results if run.point == change.point}

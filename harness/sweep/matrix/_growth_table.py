@@ -103,7 +103,7 @@ def law_row(variable: Variable, laws: dict[str, Law]) -> list[tuple[str, str]]:
 
 
 def render(record: MatrixRecord) -> Iterator[RenderableType]:
-    """Yield the tables for the terminal."""
+    """Yield the growth tables for the terminal."""
     for part in growth_tables(record):
         yield Text(f"Growth at {part.name}", style="bold")
         sizes = _table(["s", "N", *map(label, SIZE_METRICS)])

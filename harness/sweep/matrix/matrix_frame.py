@@ -18,7 +18,7 @@ _TYPES = {
 
 
 def matrix_frame(finished: Finished) -> pl.DataFrame:
-    """Return a table with one row for each run of a matrix. Its columns are those of `runs.csv`.
+    """Return a table with one row for each run of a matrix. The columns of the table are those of `runs.csv`.
 
     - `loss` (0 to 1), `agents`, `backend` and `seed` identify the run, and `duration_s` if it is an axis of the matrix.
     - The figures of run.json follow, such as `mutual_chain`, `distinct_chains` and `messages`. Unknown figures are

@@ -200,8 +200,8 @@ def name_culprits(
 
 
 def _effort(scenario: Scenario) -> float:
-    """Estimate the relative cost of a run. It grows with the number of messages, and large swarms take long to become
-    idle.
+    """Estimate the relative cost of a run. The cost grows with the number of messages, and large swarms take long to
+    become idle.
     """
     agents = len(scenario.roster)
     return agents**2 * (scenario.duration_s + min(scenario.settle.limit_s, 30 * agents))

@@ -70,7 +70,7 @@ def _scenario_at(matrix: Matrix, point: MatrixPoint) -> Any:
 
 
 def _differing(before: Any, now: Any, key: str) -> Iterator[str]:
-    """Yield a phrase for each key whose value differs."""
+    """Yield a phrase for each key of the matrix whose value differs from an earlier night."""
     if isinstance(before, dict) and isinstance(now, dict):
         for name in dict.fromkeys((*before, *now)):
             yield from _differing(before.get(name), now.get(name), f"{key}.{name}")

@@ -337,5 +337,5 @@ def _changes(entries: list[Entry]) -> Iterator[tuple[str, str]]:
 
 
 def _where(error: ValidationError) -> str:
-    """Return the name of the first invalid key."""
+    """Return the path of the first invalid key in an answer."""
     return f"`{'.'.join(str(part) for part in error.errors()[0]['loc'])}`"

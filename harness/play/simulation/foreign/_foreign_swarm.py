@@ -121,7 +121,7 @@ class ForeignSwarm:
         self._playing.clear()
 
     def _mission(self, agent_id: int, incarnation: int) -> dict[str, Any]:
-        """Return the mission file of an agent. It differs from that of a real process where virtual time requires
+        """Return the mission file of an agent. The file differs from that of a real process where virtual time requires
         it.
         """
         mission = mission_file(

@@ -103,9 +103,7 @@ class _Findings(BaseModel):
 
 @dataclass
 class Corpus:
-    """An open corpus directory, locked against other commands. `left_out` contains a sentence about each unused
-    file.
-    """
+    """An open corpus directory, locked against other commands. `left_out` has a sentence about each unused file."""
 
     directory: Path
     base: Document

@@ -91,7 +91,7 @@ def _form(cycle: Cycle) -> list[str]:
 
 
 def _one_repetition(pattern: Sequence[str]) -> Sequence[str]:
-    """Return one repetition of a sequence of timers. It starts with the vote if there is one."""
+    """Return one repetition of a sequence of timers. The repetition starts with the vote if there is one."""
     length = len(pattern)
     divisors = (part for part in range(1, length + 1) if length % part == 0)
     once = next(part for part in divisors if [*pattern[:part]] * (length // part) == pattern)

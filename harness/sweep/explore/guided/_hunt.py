@@ -78,8 +78,8 @@ class CandidateRun(NamedTuple):
 
 @dataclass
 class KeptRun:
-    """A stored document. It reached `new_states` new agent states, or something of similar value, in `steps` handler
-    runs.
+    """A stored scenario document. In `steps` handler runs, the document reached `new_states` new agent states, or
+    something of similar value.
     """
 
     candidate: CandidateRun

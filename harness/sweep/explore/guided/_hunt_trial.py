@@ -91,7 +91,7 @@ Divergence = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True)
 class PlayedRun:
-    """The coverage of a run, and the findings that it shows."""
+    """The coverage of a run, and the findings of the run."""
 
     reached: ReachedStates
     found: tuple[FindingIdentity, ...]

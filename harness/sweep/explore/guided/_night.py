@@ -59,7 +59,7 @@ class NightProgress:
 
 @dataclass
 class NightFinding:
-    """A finding and its status in this night. It appeared with `shown` of `of` seeds."""
+    """A finding and its status in this night. `shown` of `of` seeds showed the finding."""
 
     finding: Finding
     status: Status
@@ -223,7 +223,7 @@ class _NightRun:
             return sum(outcome is True for _, outcome in outcomes), len(seeds)
 
     def _hunt(self, initial: list[CandidateRun]) -> None:
-        """Continue the search from the stored runs.
+        """Continue the search from the runs that the corpus contains.
 
         Runs that reach nothing new any more are dropped, if there was time to play all of them.
         """
@@ -246,7 +246,7 @@ class _NightRun:
         return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
 
     def _kept_runs(self, runs: Iterator[tuple[CandidateRun, bool]]) -> Iterator[CandidateRun]:
-        """Yield the runs to store. They and new findings are written at once."""
+        """Yield the runs to store. Each of these runs and each new finding is written at once."""
         night, hunt = self._night, self._night.hunt
         for candidate, is_kept in runs:
             night.grow()

@@ -51,7 +51,7 @@ class HeatmapFigure:
 
 
 def known_figures(cells: Iterable[Cell]) -> list[HeatmapFigure]:
-    """Return the figures that runs determined. Those before the final reconcile come first.
+    """Return the figures that at least one run determined. Figures from before the final reconcile come first.
 
     "violated" is always included.
     """
