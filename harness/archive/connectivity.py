@@ -172,7 +172,7 @@ class NetworkReplay:
         return LossRates(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
 
     def by_link(self) -> dict[Link, float]:
-        """Return the current loss rate of each link in each direction. A loss rate of 1.0 means that no message passes."""
+        """Return the current loss rate of each link in each direction. The rate is 1.0 if no message passes."""
         losses: dict[Link, float] = {}
         for low, high in self._scripted:
             there, back = (1.0, 1.0) if self.lost & {low, high} else self._directions((low, high))

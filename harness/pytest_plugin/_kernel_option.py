@@ -1,4 +1,4 @@
-"""Implement `--ucp-kernel uml`, which runs all tests in User Mode Linux. This kernel supports netem and needs no root."""
+"""Implement `--ucp-kernel uml`, which runs all tests in User Mode Linux, with netem and without root."""
 
 import os
 import shutil

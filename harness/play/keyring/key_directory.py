@@ -167,7 +167,7 @@ class KeyDirectory:
         return revocation
 
     def authority(self, public: PublicKeys) -> bytes:
-        """Return the private key that signs lists of excluded vehicles. The private key must match these public keys."""
+        """Return the private key that signs lists of excluded vehicles. This key must match `public`."""
 
         def parse(document: dict[str, Any]) -> bytes:
             key = key_in(document, "private_key", KEY_BYTES)

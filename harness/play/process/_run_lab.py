@@ -23,7 +23,7 @@ class LabProgram(Protocol):
 
     @property
     def returncode(self) -> int | None:
-        """The exit status, or the negative number of the signal that killed the program. None while the program runs."""
+        """The exit status, or the negative number of the signal that killed the program. None during its run."""
 
     @property
     def end(self) -> str:
