@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 
 from benchmarks.judging import scenario
 from harness.archive.directory import RunDirectory
-from harness.field.replay import Record, RecordPlayer, open_record
+from harness.field.replay import RecordedTrace, RecordPlayer, open_record
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.simulation.run_files import DiskRecorder
@@ -53,7 +53,7 @@ def opened(directory: Path) -> None:
     subprocess.run(command, input=b"next\nquit\n", stdout=subprocess.DEVNULL, check=True)
 
 
-def backs(record: Record) -> list[float]:
+def backs(record: RecordedTrace) -> list[float]:
     """Return the seconds that single steps back take, from random positions."""
     player, draw = RecordPlayer(record), Random(1)
     player.to_end()

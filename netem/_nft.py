@@ -218,7 +218,7 @@ def _match(operator: str, left: dict[str, Any], right: int) -> dict[str, Any]:
 
 
 def _loss_rules(chain: str, port: str, loss: float) -> list[dict[str, Any]]:
-    """Return rules that drop packets to a port with this probability, and pass the others."""
+    """Return nftables rules that drop packets to a port with this probability, and pass the other packets."""
     drop: list[dict[str, Any]] = [{"counter": f"lost_{port}"}, {"drop": None}]
     if loss == 1.0:
         return [_rule(chain, *drop)]

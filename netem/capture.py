@@ -79,7 +79,7 @@ class LiveCapture:
         return capture
 
     async def begin(self, epoch_us: int, speedup: float) -> None:
-        """Create the files, and write the frames that have been captured so far. Raises OSError."""
+        """Create the capture files, and write the frames that were captured before. Raises OSError."""
         for vehicle in self._vehicles:
             begin_file(self._folder, vehicle, epoch_us, speedup)
         await self._process.send_signal(signal.SIGUSR1)

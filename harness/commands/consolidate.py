@@ -14,14 +14,14 @@ from harness.commands.terminal import complain, print_lines
 from harness.errors import ExportError
 from harness.field.depot import record_outputs
 from harness.field.depot.collected_exports import collect_exports
-from harness.field.depot.consolidation import Consolidation, consolidate
+from harness.field.depot.consolidation import MergedRecord, consolidate
 from harness.field.depot.record_lines import ReconcileResult
 from harness.field.depot.record_outputs import in_words
 from harness.report.logbook.map_files import geojson, kml
 from harness.report.logbook.positions import EventTrack
 
 if TYPE_CHECKING:
-    from harness.field.depot.depot_reconcile import Reconciliation
+    from harness.field.depot.depot_reconcile import ReconciledExports
 
 FINDING = 1
 MAX_FINDINGS_SHOWN = 20
@@ -88,7 +88,7 @@ def consolidate_command(
         raise typer.Exit(FINDING)
 
 
-def _reconcile(record: Consolidation, directory: Path) -> "Reconciliation":
+def _reconcile(record: MergedRecord, directory: Path) -> "ReconciledExports":
     from harness.field.depot.depot_reconcile import reconcile, write  # slow: it imports the simulation
 
     claim(directory)
@@ -99,7 +99,7 @@ def _reconcile(record: Consolidation, directory: Path) -> "Reconciliation":
 
 
 def _write_outputs(
-    record: Consolidation,
+    record: MergedRecord,
     reconciled: ReconcileResult | None,
     out: Path | None,
     kml_file: Path | None,
@@ -119,7 +119,7 @@ def _write_outputs(
         yield from _maps(_tracks(record), {kml_file: kml, geojson_file: _geojson})
 
 
-def _tracks(record: Consolidation) -> list[EventTrack]:
+def _tracks(record: MergedRecord) -> list[EventTrack]:
     """Return the logged paths of vehicles, and those in flight logs of vehicles that logged no position."""
     logged = record_outputs.tracks(record)
     known = {track.agent_id for track in logged}

@@ -13,7 +13,7 @@ from harness.checker.steps.core_in_use import IN_USE
 from harness.checker.steps.implementation import REFERENCE
 from harness.commands.terminal import complain, output, print_json
 from harness.errors import VIOLATED, WRONG_REQUEST, InterruptedRunError
-from harness.field.replay import Record, RecordPlayer, ReplayResult, open_record, open_records
+from harness.field.replay import RecordedTrace, RecordPlayer, ReplayResult, open_record, open_records
 from harness.field.replay.breakpoints import parse_breakpoint
 from harness.field.replay.prompt import ReplayPrompt
 from harness.field.replay.replay_document import ReplayedRecord, document, header_text, replayed, summary
@@ -59,7 +59,7 @@ def replay_command(
         raise InterruptedRunError("interrupted") from None
 
 
-def _play(console: Console, records: Sequence[Record], until: float | None, as_json: bool) -> NoReturn:
+def _play(console: Console, records: Sequence[RecordedTrace], until: float | None, as_json: bool) -> NoReturn:
     """Replay whole records, and print the differences."""
     replayed_records, differ, judged = list[ReplayedRecord](), False, False
     for record in records:
@@ -79,7 +79,7 @@ def _play(console: Console, records: Sequence[Record], until: float | None, as_j
 
 
 def _step_through(
-    console: Console, record: Record, until: float | None, at_start: bool, breaks: Sequence[str], debug: bool
+    console: Console, record: RecordedTrace, until: float | None, at_start: bool, breaks: Sequence[str], debug: bool
 ) -> NoReturn:
     """Step through a record by the user's commands. When the commands end, replay the rest."""
     _print_problems(record)
@@ -114,7 +114,7 @@ def _in_use(in_use: ReplayResult, result: ReplayResult) -> list[Text]:
     return [Text(f"The core of this installation{edited} first differs from the record in {where}.")]
 
 
-def _print_problems(record: Record) -> None:
+def _print_problems(record: RecordedTrace) -> None:
     for sentence in record.problems:
         complain(sentence)
 

@@ -336,8 +336,7 @@ class VectorSuite:
         return replace(failure, needs_earlier_round=needs_earlier_round)
 
     async def _play_repeatedly(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Repeat these inputs several times. Return RIGHT if the agent is right once, or the failure if all REPETITIONS
-        fail.
+        """Repeat these inputs several times. Return RIGHT if the agent is right at least once, otherwise the failure.
 
         Return TOO_LATE if the machine was late in too many replays.
         """

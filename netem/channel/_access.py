@@ -29,7 +29,7 @@ class ChannelAccess(Protocol):
         """Choose the time at which the sender of `frame` sends it. `active` contains the frames that are being sent."""
 
     def begun(self, frames: list[Frame], now: int) -> None:
-        """Process the beginning of these frames, which `take_due` has returned."""
+        """Process the beginning of frames that `take_due` returned before."""
 
     def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Collection[Frame]) -> None:
         """Process the end of `frame`. `waiting` is the next frame of its sender."""

@@ -371,7 +371,7 @@ def receive_request_block_for_hash(state: State, sender: int, message: RequestFo
 
 @_algorithm(18, message=BlockResponse)
 def receive_response_block_for_hash(state: State, sender: int, message: BlockResponse) -> str:
-    """Algorithm 18, Receive Response Block for Hash (Section 3.6.3): commit the block that was asked for (reading 12).
+    """Algorithm 18, Receive Response Block for Hash (Section 3.6.3): commit the requested block (reading 12).
 
     The pause has no effect, because handlers are atomic (reading 12).
     """

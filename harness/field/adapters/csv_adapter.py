@@ -48,13 +48,13 @@ class CsvAdapter(Adapter):
         return _layout(beginning.partition(b"\n")[0].decode("utf-8", "replace")) is not None
 
     def observations(self, source: Path) -> Iterator[Observation]:
-        layout: _Layout | None = None
+        layout: _ColumnLayout | None = None
         with BoundedFile(source, MAX_BYTES) as file:
             for number, row in _rows(file):
                 if layout is None:
                     layout = _layout(row)
                     if layout is None:
-                        layout = _Layout(",", {name: place for place, name in enumerate(COLUMNS)})
+                        layout = _ColumnLayout(",", {name: place for place, name in enumerate(COLUMNS)})
                         yield Unusable(
                             f"it has no header with column names: the columns are read as {','.join(COLUMNS)}", number
                         )
@@ -66,7 +66,7 @@ class CsvAdapter(Adapter):
                 yield Unusable(file.problem)
 
 
-class _Layout:
+class _ColumnLayout:
     """The positions of the columns in a CSV file, and the separator."""
 
     def __init__(self, separator: str, places: dict[str, int]) -> None:
@@ -89,11 +89,11 @@ class _Layout:
         return {name: cells[place] for name, place in self._places.items()}
 
 
-def _layout(row: str) -> _Layout | None:
+def _layout(row: str) -> _ColumnLayout | None:
     for separator in _SEPARATORS:
         names = [name.strip(" \"'\r\n").lower() for name in row.removeprefix(_BOM).split(separator)]
         if {"agent", "kind", "data"} <= {*names}:
-            return _Layout(separator, {name: names.index(name) for name in COLUMNS if name in names})
+            return _ColumnLayout(separator, {name: names.index(name) for name in COLUMNS if name in names})
     return None
 
 

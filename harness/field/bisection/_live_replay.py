@@ -26,7 +26,7 @@ from harness.archive.vocabulary import first_unknown, unknown_names
 from harness.checker.recorded_inputs import decoded
 from harness.errors import FieldError, HarnessError, MachineError
 from harness.field.bisection.outcome import RecordDifference
-from harness.field.replay import Record
+from harness.field.replay import RecordedTrace
 from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
 from harness.play.process.agent_mission import mission_file
 from harness.scenario import Scenario
@@ -123,7 +123,7 @@ class PeerScript:
         return index < len(self.finished) and self.finished[index] <= at_s + slack_s
 
 
-def script_of(record: Record) -> PeerScript:
+def script_of(record: RecordedTrace) -> PeerScript:
     """Return the inputs up to the first restart of the agent. Later inputs would need the content of its disk."""
     datagrams: list[ScriptedDatagram] = []
     reconciles: list[float] = []
@@ -207,7 +207,9 @@ def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:
                 yield sent.datagram.text, decoded(sent.datagram).message
 
 
-def play_live(record: Record, command: Sequence[str], directory: Path, *, speedup: float) -> list[RecordDifference]:
+def play_live(
+    record: RecordedTrace, command: Sequence[str], directory: Path, *, speedup: float
+) -> list[RecordDifference]:
     """Send the recorded inputs to an agent program, and return the differences of its answers.
 
     Raises MachineError, NotStartedError, ReplayFailedError, or FieldError if the record has unknown names.
@@ -216,7 +218,7 @@ def play_live(record: Record, command: Sequence[str], directory: Path, *, speedu
         raise FieldError(f"{record.path}: {unknown}, so it cannot be played; give another record")
     script = script_of(record)
     try:
-        received = asyncio.run(_LiveReplay(record, script, command, directory, speedup).play())
+        received = asyncio.run(_AgentProgramReplay(record, script, command, directory, speedup).play())
     except LabUnavailable as error:
         raise MachineError(str(error)) from None
     except NetemError as error:
@@ -225,9 +227,9 @@ def play_live(record: Record, command: Sequence[str], directory: Path, *, speedu
     return [difference for _, difference in found]
 
 
-class _LiveReplay:
+class _AgentProgramReplay:
     def __init__(
-        self, record: Record, script: PeerScript, command: Sequence[str], directory: Path, speedup: float
+        self, record: RecordedTrace, script: PeerScript, command: Sequence[str], directory: Path, speedup: float
     ) -> None:
         self._record = record
         self._script = script

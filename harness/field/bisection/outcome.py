@@ -21,11 +21,11 @@ TIMING_DEPENDENT = ("2", "5", "6", "liveness")
 """Keys of judgements that depend on the progress of the agent processes at the end of the run."""
 
 
-class _Model(BaseModel):
+class _OutcomeModel(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
 
-class RecordDifference(_Model):
+class RecordDifference(_OutcomeModel):
     """A difference between an agent core and a record."""
 
     line: int
@@ -33,7 +33,7 @@ class RecordDifference(_Model):
     detail: str
 
 
-class AgentResult(_Model):
+class AgentResult(_OutcomeModel):
     """The result of one agent. A part that is None is not compared.
 
     `chain` has the names of its blocks, oldest first, and `top` its top chain hash. `deviates` is the handler of its
@@ -46,7 +46,7 @@ class AgentResult(_Model):
     differences: list[RecordDifference] | None = None
 
 
-class Outcome(_Model):
+class Outcome(_OutcomeModel):
     """The result of playing a scenario or record once.
 
     `crashed` is the place of the exception in the code under test that ended it.
@@ -114,7 +114,7 @@ def outcome_of_run(subject: str, result: Result, exports: dict[int, Export], *, 
 
 
 def differences(before: Outcome, after: Outcome) -> list[str]:
-    """Return a sentence for each difference between two results."""
+    """Return a sentence for each difference between two outcomes."""
     return list(_differences(before, after))
 
 
@@ -197,7 +197,7 @@ class BisectionSubject:
 
 
 def subject_of(path: Path, seed: int | None, agent: int | None) -> BisectionSubject:
-    """Return the scenario or records at `path`.
+    """Return the scenario or records at `path`, which the bisection plays.
 
     A YAML file, a library name, or a run directory of virtual time is a scenario. Every other path is a record. Raises
     HarnessError.

@@ -40,7 +40,9 @@ class _SentMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class ObservedTransmissions:
-    """All transmissions of messages to receivers, their source, and a sentence for each part that cannot be used."""
+    """All transmissions of messages to receivers, the source of these data, and a sentence for each part that cannot be
+    used.
+    """
 
     attempts: list[TransmissionAttempt]
     source: str
@@ -103,7 +105,7 @@ def _from_traces(traces: dict[int, Trace], problems: list[str]) -> Iterator[_Sen
     for agent_id, trace in traces.items():
         if trace.jumps:
             problems.append(f"agent {agent_id}: its clock jumps, so the messages that it sent after that are left out")
-    receivers = {agent_id: _Receiver(trace) for agent_id, trace in traces.items()}
+    receivers = {agent_id: _ReceivingAgent(trace) for agent_id, trace in traces.items()}
     for sender, trace in traces.items():
         for run in trace.runs[: trace.jumps[0]] if trace.jumps else trace.runs:
             for message in run.sent:
@@ -116,7 +118,7 @@ def _from_traces(traces: dict[int, Trace], problems: list[str]) -> Iterator[_Sen
                 yield _SentMessage(run.t, sender, frozenset(reached), frozenset(lost))
 
 
-class _Receiver:
+class _ReceivingAgent:
     """The messages that an agent handled, and the intervals in which its trace would show every message."""
 
     def __init__(self, trace: Trace) -> None:

@@ -108,7 +108,7 @@ class FittedModel:
     """Log likelihood of the model with one loss for all messages."""
 
 
-class _Row(NamedTuple):
+class _TransmissionCluster(NamedTuple):
     """Transmissions of one cluster over about the same distance."""
 
     log_m: float
@@ -142,7 +142,7 @@ def fit(attempts: Sequence[TransmissionAttempt], *, with_load: bool = True) -> F
     return FittedModel(model, intervals, len(attempts), clusters, likelihood, constant)
 
 
-def _rows(attempts: Iterable[TransmissionAttempt]) -> list[_Row]:
+def _rows(attempts: Iterable[TransmissionAttempt]) -> list[_TransmissionCluster]:
     counts: dict[tuple[int, int, frozenset[int], int], list[int]] = defaultdict(lambda: [0, 0])
     for attempt in attempts:
         step = round(_STEPS_PER_FOLD * math.log(max(attempt.distance_m, MIN_DISTANCE_M)))
@@ -150,12 +150,12 @@ def _rows(attempts: Iterable[TransmissionAttempt]) -> list[_Row]:
         count[0] += 1
         count[1] += attempt.delivered
     return [
-        _Row(step / _STEPS_PER_FOLD, others, attempts_here, delivered, (link, block), link)
+        _TransmissionCluster(step / _STEPS_PER_FOLD, others, attempts_here, delivered, (link, block), link)
         for (step, others, link, block), (attempts_here, delivered) in counts.items()
     ]
 
 
-def _cells(rows: Iterable[_Row]) -> list[_Row]:
+def _cells(rows: Iterable[_TransmissionCluster]) -> list[_TransmissionCluster]:
     """Return the transmissions without their division into clusters, to compute the likelihood."""
     counts: dict[tuple[float, int], list[int]] = defaultdict(lambda: [0, 0])
     for row in rows:
@@ -163,11 +163,12 @@ def _cells(rows: Iterable[_Row]) -> list[_Row]:
         count[0] += row.attempts
         count[1] += row.delivered
     return [
-        _Row(log_m, others, number, delivered, None, None) for (log_m, others), (number, delivered) in counts.items()
+        _TransmissionCluster(log_m, others, number, delivered, None, None)
+        for (log_m, others), (number, delivered) in counts.items()
     ]
 
 
-def _starts(rows: Sequence[_Row], free: Sequence[int]) -> list[Vector]:
+def _starts(rows: Sequence[_TransmissionCluster], free: Sequence[int]) -> list[Vector]:
     distances = sorted(row.log_m for row in rows)
     load = 0.01 if 3 in free else 0.0
     return [
@@ -177,7 +178,7 @@ def _starts(rows: Sequence[_Row], free: Sequence[int]) -> list[Vector]:
     ]
 
 
-def _terms(row: _Row, values: Vector) -> tuple[float, Vector]:
+def _terms(row: _TransmissionCluster, values: Vector) -> tuple[float, Vector]:
     """Return the probability of arrival and its derivatives."""
     spread = math.exp(values[1])
     deviation = (values[0] - row.log_m) / spread
@@ -192,7 +193,7 @@ def _terms(row: _Row, values: Vector) -> tuple[float, Vector]:
     ]
 
 
-def _likelihood(rows: Iterable[_Row], values: Vector) -> float:
+def _likelihood(rows: Iterable[_TransmissionCluster], values: Vector) -> float:
     spread = math.exp(values[1])
     total = 0.0
     for row in rows:
@@ -203,7 +204,7 @@ def _likelihood(rows: Iterable[_Row], values: Vector) -> float:
     return total
 
 
-def _score(rows: Iterable[_Row], values: Vector, free: Sequence[int]) -> tuple[Vector, list[Vector]]:
+def _score(rows: Iterable[_TransmissionCluster], values: Vector, free: Sequence[int]) -> tuple[Vector, list[Vector]]:
     """Return the score vector and the expected information matrix for the free parameters."""
     score = [0.0] * len(free)
     information = [[0.0] * len(free) for _ in free]
@@ -221,7 +222,7 @@ def _score(rows: Iterable[_Row], values: Vector, free: Sequence[int]) -> tuple[V
     return score, information
 
 
-def _maximise(rows: Sequence[_Row], start: Vector, free: Sequence[int]) -> tuple[Vector, float]:
+def _maximise(rows: Sequence[_TransmissionCluster], start: Vector, free: Sequence[int]) -> tuple[Vector, float]:
     """Maximise the likelihood over the free parameters by Fisher scoring within their limits."""
     values = [*start]
     likelihood = _likelihood(rows, values)
@@ -257,7 +258,7 @@ def _maximise(rows: Sequence[_Row], start: Vector, free: Sequence[int]) -> tuple
 
 
 def _cluster_scales(
-    rows: Sequence[_Row], values: Vector, free: Sequence[int]
+    rows: Sequence[_TransmissionCluster], values: Vector, free: Sequence[int]
 ) -> tuple[dict[int, tuple[float, float]], dict[int, float], int]:
     """Return the standard errors of the parameters with and without clusters, the degrees of freedom, and the number of
     clusters.
@@ -270,9 +271,9 @@ def _cluster_scales(
     number = 0
     if inverse is None:
         return scales, freedom, number
-    key: Callable[[_Row], Hashable]
+    key: Callable[[_TransmissionCluster], Hashable]
     for key in (lambda row: row.block, lambda row: row.link):
-        clusters: dict[Hashable, list[_Row]] = defaultdict(list)
+        clusters: dict[Hashable, list[_TransmissionCluster]] = defaultdict(list)
         for row in rows:
             clusters[key(row)].append(row)
         number = number or len(clusters)
@@ -301,7 +302,7 @@ def _cluster_scales(
 
 
 def _intervals(
-    rows: Sequence[_Row],
+    rows: Sequence[_TransmissionCluster],
     values: Vector,
     likelihood: float,
     free: Sequence[int],
@@ -330,7 +331,7 @@ def _intervals(
 
 
 def _profile(
-    rows: Sequence[_Row], values: Vector, least: float, free: Sequence[int], parameter: int
+    rows: Sequence[_TransmissionCluster], values: Vector, least: float, free: Sequence[int], parameter: int
 ) -> tuple[float, float]:
     """Return the values of a parameter at which its profile likelihood falls to `least`."""
     others = [each for each in free if each != parameter]

@@ -102,7 +102,7 @@ class Calibration:
         return self.signal.exponent if self.signal else LogDistance.exponent
 
     def sentences(self) -> Iterator[str]:
-        """Yield sentences about the result."""
+        """Yield sentences about the result of the calibration."""
         delivered = sum(attempt.delivered for attempt in self.attempts)
         yield (
             f"{delivered} of {len(self.attempts)} messages over {len(self.links)} links arrived, from {self.source} "
@@ -169,7 +169,9 @@ class Calibration:
         }
 
     def scenario(self, name: str, preset: str | None = None) -> dict[str, Any]:
-        """Return a scenario with the fitted network. It has no flight plans, because only the network is fitted."""
+        """Return a scenario with the fitted network. The scenario has no flight plans, because only the network is
+        fitted.
+        """
         document = {
             "name": name,
             "agents": self.roster,
@@ -180,7 +182,7 @@ class Calibration:
         return document
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as a JSON object."""
+        """Return the result of the calibration as a JSON object."""
         return {
             "messages": len(self.attempts),
             "delivered": sum(attempt.delivered for attempt in self.attempts),

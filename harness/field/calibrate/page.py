@@ -24,7 +24,7 @@ _MAX_MAP_POINTS = 20_000
 
 
 def draw(calibration: Calibration, name: str) -> str:
-    """Return the page as HTML."""
+    """Return the page about a calibration as HTML."""
     return html.render(
         _TEMPLATE,
         styles=[map_svg.STYLE + html.PAGE_STYLE],

@@ -133,7 +133,7 @@ def collect_exports(paths: Iterable[Path], keys: "PublicKeys | None" = None) -> 
     `keys` are public keys that the user trusts. Without them, signatures are verified with the keys in the directories.
     Raises FieldError if a path does not exist, and ExportError if no export is usable.
     """
-    reader, read_exports, left_out = _Reader(), list[ReadExport](), list[str]()
+    reader, read_exports, left_out = _ExportReader(), list[ReadExport](), list[str]()
     skipped, context_files, flight_logs = list[UnusedPart](), list[ComparedFile](), list[FlightLog]()
     paths = list(paths)
     for path in files_of(paths, skipped):
@@ -215,7 +215,7 @@ def _add_context(collected: CollectedExports, compared_files: Iterable[ComparedF
 
 
 class NotAnExportError(ExportError):
-    """An error: the file has a different format."""
+    """An error: a file is not a chain export of a known format."""
 
 
 def _largest_mission(read_exports: Iterable[ReadExport]) -> str:
@@ -288,7 +288,7 @@ class _PartialExport(Export):
     completed: list[str] = Field(default=[])
 
 
-class _Reader:
+class _ExportReader:
     """A reader of exports that stores equal blocks once."""
 
     def __init__(self) -> None:
@@ -396,7 +396,7 @@ def _content(path: Path, named_by_user: bool) -> bytes:
 
 
 def _recover(path: Path, data: bytes, problems: list[str]) -> Export:
-    """Return the undamaged parts of an export. A sentence about each error is added to `problems`."""
+    """Return the undamaged parts of an export, and add a sentence about each error to `problems`."""
     if _FORMAT not in data:
         raise NotAnExportError(f"{path}: not a chain export")
     text = data.decode("utf-8", errors="replace")

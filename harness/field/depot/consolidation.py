@@ -40,7 +40,7 @@ _HEADER = struct_of(EVENT_FIELDS)
 
 @dataclass(frozen=True)
 class RecordedBlock:
-    """A block of the merged record. Its events are decoded when they are needed."""
+    """A block of the merged record. The events of the block are decoded when they are needed."""
 
     line: Block
     event_data: bytes
@@ -54,7 +54,7 @@ class RecordedBlock:
 
 
 @dataclass
-class Consolidation:
+class MergedRecord:
     """The merged record of a mission. `names` contains the names of all blocks by hash."""
 
     collected: CollectedExports
@@ -80,8 +80,8 @@ class Consolidation:
 
 
 @gc_paused()
-def consolidate(collected: CollectedExports, depot: "Depot | None" = None) -> Consolidation:
-    """Merge exports into one record, and return it.
+def consolidate(collected: CollectedExports, depot: "Depot | None" = None) -> MergedRecord:
+    """Merge the exports of a mission into one record, and return this record.
 
     `depot` decrypts event data. Raises ExportError if its key does not fit the mission.
     """
@@ -117,7 +117,7 @@ def consolidate(collected: CollectedExports, depot: "Depot | None" = None) -> Co
     )
     without_export = [agent_id for agent_id in roster if agent_id not in collected.latest]
     lost = _lost_blocks(collected, blocks, names, without_export)
-    return Consolidation(
+    return MergedRecord(
         collected,
         _header(collected, roster, recorded_blocks, len(mutual), len(lost)),
         _forks(chains, names),

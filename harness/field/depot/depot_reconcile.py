@@ -16,7 +16,7 @@ from typing import Any
 from harness.archive.exports import SUFFIX, Export, ExportedBlock, ExportMaker
 from harness.errors import MachineError
 from harness.field.depot.collected_exports import CollectedExports
-from harness.field.depot.consolidation import Consolidation
+from harness.field.depot.consolidation import MergedRecord
 from harness.field.depot.record_lines import ReconcileResult, Vehicle
 from harness.play.mission import reconcile_finally
 from harness.play.simulation.restored_swarm import RestoredSwarm
@@ -35,14 +35,14 @@ LIMIT_S = 1e7
 
 
 @dataclass(frozen=True)
-class Reconciliation:
+class ReconciledExports:
     """The exports after the reconcile, by agent, and the line for the merged record."""
 
     exports: dict[int, Export]
     line: ReconcileResult
 
 
-def reconcile(record: Consolidation, report_progress: Callable[[str], None] = lambda words: None) -> Reconciliation:
+def reconcile(record: MergedRecord, report_progress: Callable[[str], None] = lambda words: None) -> ReconciledExports:
     """Reconcile the exports of a record with each other. `report_progress` is called with texts about the progress."""
     collected = record.collected
     stored = _stored(collected)
@@ -67,7 +67,7 @@ def reconcile(record: Consolidation, report_progress: Callable[[str], None] = la
         for incarnation in swarm.living()
         if incarnation.state is not None
     }
-    return Reconciliation(exports, _line(record, exports, rounds))
+    return ReconciledExports(exports, _line(record, exports, rounds))
 
 
 async def _play(swarm: RestoredSwarm, agents_with_deque: Iterable[int]) -> int:
@@ -90,7 +90,7 @@ async def _reconcile(swarm: RestoredSwarm) -> int:
     return 0 if final_reconcile is None else final_reconcile.rounds
 
 
-def write(reconciliation: Reconciliation, directory: Path) -> None:
+def write(reconciliation: ReconciledExports, directory: Path) -> None:
     """Write the exports after the reconcile. Raises MachineError if that fails."""
     try:
         for agent_id, export in reconciliation.exports.items():
@@ -99,7 +99,7 @@ def write(reconciliation: Reconciliation, directory: Path) -> None:
         raise MachineError(f"{directory} cannot be written: {error.strerror}") from None
 
 
-def _scenario(record: Consolidation) -> Scenario:
+def _scenario(record: MergedRecord) -> Scenario:
     """Return a scenario without events and faults."""
     document: dict[str, Any] = {
         "name": "final reconcile",
@@ -112,7 +112,7 @@ def _scenario(record: Consolidation) -> Scenario:
 
 
 def _signatures(collected: CollectedExports) -> dict[bytes, bytes]:
-    """Return the signatures in the exports, by block hash. They are not verified here."""
+    """Return the signatures in the exports, by block hash, without their verification."""
     return {
         bytes.fromhex(block.block_hash): base64.b64decode(block.signature)
         for read_export in collected.read_exports
@@ -155,7 +155,7 @@ def _block(block: ExportedBlock, shared_blocks: dict[str, Block]) -> Block:
     return shared_blocks[block.block_hash]
 
 
-def _line(record: Consolidation, exports: Mapping[int, Export], rounds: int) -> ReconcileResult:
+def _line(record: MergedRecord, exports: Mapping[int, Export], rounds: int) -> ReconcileResult:
     names = record.names
     before = {
         agent_id: {block.block_hash for block in export.blocks()}

@@ -76,7 +76,7 @@ class MissionDifference:
 
 
 @dataclass
-class Comparison:
+class MissionComparison:
     """The compared files, and their differences."""
 
     files: list[ComparedFile]
@@ -118,12 +118,12 @@ class Comparison:
         }
 
 
-def compare(paths: Iterable[Path]) -> Comparison:
+def compare(paths: Iterable[Path]) -> MissionComparison:
     """Compare these files, and the files in these directories.
 
     Raises RunDirectoryError if a path does not exist, or a directory has no files to compare.
     """
-    comparison = Comparison([], [])
+    comparison = MissionComparison([], [])
     for path, named in _files(paths):
         try:
             comparison.files.append(read(path))

@@ -9,7 +9,7 @@ from binascii import b2a_base64
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
-from harness.field.depot.consolidation import Consolidation, RecordedBlock, events_in
+from harness.field.depot.consolidation import MergedRecord, RecordedBlock, events_in
 from harness.field.depot.record_lines import Fork, ForkBranch, MissingItem, ReconcileResult, RecordLine
 from harness.field.flight_logs import Position
 from harness.field.flight_logs._matching import MatchedLog, match_logs
@@ -25,7 +25,7 @@ COLUMNS = (
 )
 
 
-def lines(record: Consolidation, reconciled: ReconcileResult | None = None) -> Iterator[str]:
+def lines(record: MergedRecord, reconciled: ReconcileResult | None = None) -> Iterator[str]:
     """Yield the lines of the merged record, including line ends."""
     yield _line(record.header)
     yield from map(_line, record.forks)
@@ -56,7 +56,7 @@ def _event_lines(block: RecordedBlock) -> str:
     )
 
 
-def table(record: Consolidation) -> str:
+def table(record: MergedRecord) -> str:
     """Return a CSV table with a row for each event, in the order of the record.
 
     Data is hexadecimal, and times are UTC.
@@ -82,7 +82,7 @@ def table(record: Consolidation) -> str:
     return out.getvalue()
 
 
-def flight_logs(record: Consolidation) -> list[MatchedLog]:
+def flight_logs(record: MergedRecord) -> list[MatchedLog]:
     """Return the flight logs of vehicles, with the agents that flew on them."""
     if not record.collected.flight_logs:
         return []  # the events of all blocks need not be decoded
@@ -105,7 +105,7 @@ def _fix(position: Position) -> tuple[int, RoundedPosition]:
     return at_us, RoundedPosition(*place)
 
 
-def tracks(record: Consolidation) -> list[EventTrack]:
+def tracks(record: MergedRecord) -> list[EventTrack]:
     """Return the path of each agent that logged positions, by agent ID. There is none if the events are not
     telemetry.
     """
@@ -121,9 +121,7 @@ MAX_FORKS = 5
 MAX_NAMES = 8
 
 
-def in_words(
-    record: Consolidation, reconciled: ReconcileResult | None = None, *, opened: bool = False
-) -> Iterator[str]:
+def in_words(record: MergedRecord, reconciled: ReconcileResult | None = None, *, opened: bool = False) -> Iterator[str]:
     """Yield sentences about the exports, diverged chains, blocks on one vehicle only, lost blocks, and the reconcile.
 
     `opened` is true if the depot's key was given.
@@ -207,7 +205,7 @@ def agents(ids: Sequence[int]) -> str:
     return ", ".join(ranges([*ids]))
 
 
-def _single_copies(record: Consolidation) -> Iterator[str]:
+def _single_copies(record: MergedRecord) -> Iterator[str]:
     """Yield a sentence for each vehicle whose loss would have lost blocks."""
     if len(record.collected.latest) < 2:
         return

@@ -59,7 +59,7 @@ def _consistent(before_us: int, after_us: int) -> bool:
     return -_BACK_US <= after_us - before_us <= _AHEAD_US
 
 
-class Budget:
+class RecordBudget:
     """The number of records that may still be stored from a file."""
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class Budget:
 class RecordCollector:
     """A collector for the records of one source, such as a vehicle."""
 
-    def __init__(self, budget: Budget) -> None:
+    def __init__(self, budget: RecordBudget) -> None:
         self._budget = budget
         self._records: dict[type[Any], list[Any]] = {}
         self._converted: dict[type[Any], int] = {}
@@ -82,7 +82,7 @@ class RecordCollector:
         self._last_state: dict[type[Any], Hashable] = {}
 
     def add(self, record: FlightRecord) -> bool:
-        """Store a record. Its time is converted later. Return False if the limit is reached."""
+        """Store a record, whose time is converted later. Return False if the limit is reached."""
         kept = self._budget.take()
         if kept:
             self._records.setdefault(type(record), []).append(record)
@@ -120,7 +120,7 @@ class RecordCollector:
     def end_segment(self) -> None:
         """Convert the times of all records since the last call to UTC."""
         to_utc = (
-            _Line(
+            _PiecewiseLinearClock(
                 [
                     (round(median(at for at, _ in times)), round(median(utc for _, utc in times)))
                     for _, times in sorted(self._times.items())
@@ -143,9 +143,9 @@ class RecordCollector:
         return self._records.get(kind, [])
 
 
-class _Line:
-    """Straight lines through points (time on the log's clock, UTC). They continue before the first and after the last
-    point.
+class _PiecewiseLinearClock:
+    """Straight lines through points (time on the log's clock, UTC). The lines continue before the first and after the
+    last point.
     """
 
     def __init__(self, points: list[tuple[int, int]]) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO, NamedTuple
 
 from harness.field.flight_logs import _gps_time
-from harness.field.flight_logs._collecting import Budget, LogClock, RecordCollector
+from harness.field.flight_logs._collecting import LogClock, RecordBudget, RecordCollector
 from harness.field.flight_logs._limits import DamagedBytes, is_place
 from harness.field.flight_logs._records import (
     ArmingChange,
@@ -59,7 +59,7 @@ _FIRMWARE = {"ArduPlane": 1, "ArduCopter": 2, "ArduRover": 10, "Rover": 10}
 Values = dict[str, Any]
 
 
-class _Definition(NamedTuple):
+class _MessageDefinition(NamedTuple):
     name: str
     columns: list[str]
     layout: struct.Struct
@@ -74,10 +74,10 @@ class _Definition(NamedTuple):
 
 
 class DataFlashReader:
-    """A reader of one DataFlash file. Its method `read` stores the records in collectors."""
+    """A reader of one DataFlash file. The method `read` stores the records in collectors."""
 
     def __init__(self) -> None:
-        budget = Budget()
+        budget = RecordBudget()
         self.budget = budget
         self.vehicle = RecordCollector(budget)
         self.gps_positions = RecordCollector(budget)
@@ -91,7 +91,7 @@ class DataFlashReader:
         self._primary_core: int | None = None
 
     def read(self, stream: BinaryIO) -> None:
-        """Read the whole stream."""
+        """Read the whole DataFlash file."""
         for definition, buffer, at in self._messages(stream):
             values = definition.values(buffer, at)
             at_us = values.get("TimeUS")
@@ -111,11 +111,11 @@ class DataFlashReader:
         self.vehicle.end_segment()
         self.gps_positions.end_segment()
 
-    def _messages(self, stream: BinaryIO) -> Iterator[tuple[_Definition, bytes, int]]:
+    def _messages(self, stream: BinaryIO) -> Iterator[tuple[_MessageDefinition, bytes, int]]:
         """Yield the messages to decode, each as its definition, the buffer, and the position of its first column."""
         lengths = [0] * 256
         lengths[FMT] = _FMT_BYTES
-        definitions: dict[int, _Definition] = {}
+        definitions: dict[int, _MessageDefinition] = {}
         defined = messages = 0
         buffer, at, offset, at_end = b"", 0, 0, False
         while True:
@@ -159,7 +159,7 @@ class DataFlashReader:
                 yield definition, buffer, at + _HEADER_BYTES
             at = after
 
-    def _define(self, buffer: bytes, at: int, lengths: list[int], definitions: dict[int, _Definition]) -> None:
+    def _define(self, buffer: bytes, at: int, lengths: list[int], definitions: dict[int, _MessageDefinition]) -> None:
         kind, length, name_bytes, codes_bytes, columns_bytes = _FMT_FIELDS.unpack_from(buffer, at)
         if kind == FMT or length < _HEADER_BYTES:
             return
@@ -171,7 +171,7 @@ class DataFlashReader:
             return
         layout = struct.Struct("<" + "".join(_COLUMN_TYPES[code][0] for code in codes))
         if layout.size + _HEADER_BYTES == length:
-            definitions[kind] = _Definition(name, columns, layout, [_COLUMN_TYPES[code][1] for code in codes])
+            definitions[kind] = _MessageDefinition(name, columns, layout, [_COLUMN_TYPES[code][1] for code in codes])
 
     def _position(self, at_us: int, values: Values) -> None:
         if is_place(values["Lat"], values["Lng"], values["Alt"]):

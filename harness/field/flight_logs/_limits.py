@@ -35,7 +35,7 @@ class DamagedBytes:
         return True
 
     def sentences(self) -> list[str]:
-        """Return a sentence for each kind of damage."""
+        """Return a sentence for each kind of damage in a flight log."""
         sentences = []
         if self.skipped_bytes:
             sentences.append(

@@ -116,7 +116,7 @@ def _match(log: FlightLog, vehicle: VehicleLog, agents: Mapping[int, Fixes]) -> 
 
 
 @dataclass(frozen=True)
-class _Vote:
+class _ClockDifference:
     """A difference between two clocks, with the number of positions that support it. `of_utc` is true if the log has
     UTC by GPS.
     """
@@ -135,7 +135,7 @@ class _Vote:
         return self.agreeing >= _MIN_VOTES and self.share >= _MIN_SHARE
 
 
-def _vote(positions: Sequence[Position], fixes: Fixes) -> _Vote | None:
+def _vote(positions: Sequence[Position], fixes: Fixes) -> _ClockDifference | None:
     of_utc = any(position.utc_us is not None for position in positions)
     cells: dict[tuple[int, int], list[tuple[int, Position]]] = defaultdict(list)
     for position in positions:
@@ -166,7 +166,7 @@ def _vote(positions: Sequence[Position], fixes: Fixes) -> _Vote | None:
         for each in differences
         if (close := [value for value in each if abs(round(value / _BIN_US) - best) <= 1])
     ]
-    return _Vote(median(agreeing), len(agreeing), len(differences), of_utc)
+    return _ClockDifference(median(agreeing), len(agreeing), len(differences), of_utc)
 
 
 def _visits(near: list[tuple[int, Position]], fix: LoggedPosition) -> Iterator[int]:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from harness.archive.bounded_file import BoundedFile
 from harness.errors import FieldError
-from harness.field.flight_logs._collecting import MAX_RECORDS, Budget, LogClock, RecordCollector
+from harness.field.flight_logs._collecting import MAX_RECORDS, LogClock, RecordBudget, RecordCollector
 from harness.field.flight_logs._dataflash import FMT, MAGIC, DataFlashReader
 from harness.field.flight_logs._records import (
     ArmingChange,
@@ -117,7 +117,7 @@ def _vehicle_log(collector: RecordCollector, vehicle: int | None, mav_type: int 
     )
 
 
-def _problems(problems: list[str], damage: "DamagedBytes", clock: LogClock, budget: Budget) -> list[str]:
+def _problems(problems: list[str], damage: "DamagedBytes", clock: LogClock, budget: RecordBudget) -> list[str]:
     sentences = [*problems, *damage.sentences()]
     if budget.left < 0:
         sentences.append(f"only the first {MAX_RECORDS:,} records are kept")

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from harness.field.flight_logs import _gps_time
-from harness.field.flight_logs._collecting import Budget, LogClock, RecordCollector
+from harness.field.flight_logs._collecting import LogClock, RecordBudget, RecordCollector
 from harness.field.flight_logs._limits import DamagedBytes, is_place
 from harness.field.flight_logs._records import (
     ArmingChange,
@@ -43,17 +43,17 @@ Values = dict[str, Any]
 class SystemLog:
     """The records of one sender (MAVLink system) in a telemetry log."""
 
-    def __init__(self, budget: Budget) -> None:
+    def __init__(self, budget: RecordBudget) -> None:
         self.collector = RecordCollector(budget)
         self.mav_type: int | None = None
         self.is_vehicle = False
 
 
 class TelemetryReader:
-    """A reader of one telemetry log. Its method `read` stores the records in collectors."""
+    """A reader of one telemetry log. The method `read` stores the records in collectors."""
 
     def __init__(self) -> None:
-        self.budget = Budget()
+        self.budget = RecordBudget()
         self.systems: dict[int, SystemLog] = {}
         self.radio = RecordCollector(self.budget)
         self.clock = LogClock()
@@ -62,7 +62,7 @@ class TelemetryReader:
         self._jumps = 0
 
     def read(self, stream: BinaryIO) -> None:
-        """Read the whole stream."""
+        """Read the whole telemetry log."""
         for at_us, system_id, component, message, payload in self._frames(stream):
             handler = _HANDLERS.get(message)
             is_radio = message == mavlink.MAVLINK_MSG_ID_RADIO_STATUS

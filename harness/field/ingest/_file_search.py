@@ -73,7 +73,7 @@ def is_incarnation_copy(path: Path) -> bool:
 def _walk(
     path: Path, left_out: list[UnusedPart], *, named: bool = False, depth: int = 0, in_run: bool = False
 ) -> Iterator[Path]:
-    """Yield the files in a path.
+    """Yield the files below a path.
 
     Links inside a directory are not followed, because their targets are often unrelated.
     """

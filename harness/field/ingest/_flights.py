@@ -26,7 +26,7 @@ from ucp.events import LoggableEvent
 from ucp.trigger import TimerTrigger
 
 
-class _Mission(NamedTuple):
+class _MissionInHeader(NamedTuple):
     """The mission in a trace header: the inception data in base64 if present, the roster, and the start time."""
 
     initial_data: str | None
@@ -36,9 +36,11 @@ class _Mission(NamedTuple):
 
 @dataclass
 class _FlightRecords:
-    """The records of one flight so far. `hashes` contains the hashes of its blocks and chains in hexadecimal."""
+    """The records of one flight that were read until now. `hashes` contains the hexadecimal hashes of the blocks and
+    chains in them.
+    """
 
-    mission: _Mission
+    mission: _MissionInHeader
     incarnations: dict[int, list[TraceIncarnation]] = field(default_factory=lambda: defaultdict(list))
     exports: dict[int, tuple[Path, Export]] = field(default_factory=dict)
     captures: dict[int, Path] = field(default_factory=dict)
@@ -102,7 +104,7 @@ def _by_mission(
     incarnations: Iterable[TraceIncarnation], left_out: list[UnusedPart]
 ) -> tuple[list[_FlightRecords], list[TraceIncarnation]]:
     """Return the records of each mission with the same start time, and the traces without a header."""
-    by_header: dict[tuple[_Mission, int], list[TraceIncarnation]] = defaultdict(list)
+    by_header: dict[tuple[_MissionInHeader, int], list[TraceIncarnation]] = defaultdict(list)
     without_header: list[TraceIncarnation] = []
     last: TraceIncarnation | None = None
     for incarnation in incarnations:
@@ -121,22 +123,22 @@ def _by_mission(
         else:
             by_header[_mission_of(incarnation.header), incarnation.header.agent_id].append(incarnation)
         last = incarnation
-    groups: dict[_Mission, list[_FlightRecords]] = defaultdict(list)
+    groups: dict[_MissionInHeader, list[_FlightRecords]] = defaultdict(list)
     for (mission, agent_id), of_agent in by_header.items():
         _assign_to_flights(groups[mission], mission, agent_id, [*split_into_flights(of_agent, left_out)])
     separate = [records for of_mission in groups.values() for records in of_mission]
     return _merged(separate), without_header
 
 
-def _mission_of(header: Header) -> _Mission:
+def _mission_of(header: Header) -> _MissionInHeader:
     epoch: object = header.clock.get("epoch_us")
     if not isinstance(epoch, int) or isinstance(epoch, bool) or not 0 <= epoch < 2**63:
         epoch = None
-    return _Mission(header.initial_data, tuple(sorted(set(header.roster))), epoch)
+    return _MissionInHeader(header.initial_data, tuple(sorted(set(header.roster))), epoch)
 
 
 def _assign_to_flights(
-    groups: list[_FlightRecords], mission: _Mission, agent_id: int, flights: list[list[TraceIncarnation]]
+    groups: list[_FlightRecords], mission: _MissionInHeader, agent_id: int, flights: list[list[TraceIncarnation]]
 ) -> None:
     """Assign the flights of one agent to the flights of the others, by the number of shared directories.
 
@@ -258,8 +260,8 @@ MAX_DRIFT = 0.05
 
 
 def _drift(incarnation: TraceIncarnation) -> float:
-    """Return the drift of an agent's clock, from the timer that expired earliest relative to its duration. It is 0
-    without timers.
+    """Return the drift of an agent's clock, computed from the timer that expired earliest relative to its duration.
+    Without timers, the drift is 0.
     """
     started: dict[str, tuple[float, float]] = {}
     drifts = []
@@ -302,7 +304,7 @@ def _add_export(groups: list[_FlightRecords], path: Path, export: Export, left_o
     if best is not None and best.mission.initial_data is None and not best.hashes & hashes:
         best = None if best.hashes and hashes else best
     if best is None:
-        best = _FlightRecords(_Mission(inception.block_data, (), None))
+        best = _FlightRecords(_MissionInHeader(inception.block_data, (), None))
         groups.append(best)
     best.hashes |= hashes | {block.chain_hash for block in export.chain if block.chain_hash}
     best.directories.add(path.parent)
@@ -353,7 +355,7 @@ def _add_capture(groups: list[_FlightRecords], capture: CaptureSummary) -> None:
         default=None,
     )
     if best is None:
-        best = _FlightRecords(_Mission(None, (), capture.epoch_us))
+        best = _FlightRecords(_MissionInHeader(None, (), capture.epoch_us))
         groups.append(best)
     best.hashes |= capture.hashes
     best.directories.add(capture.source.parent)
@@ -375,7 +377,7 @@ def _add_logged(groups: list[_FlightRecords], path: Path, agent_id: int, event: 
     candidates = [each for each in groups if not each.mission.roster or agent_id in each.mission.roster]
     best = max(candidates, key=lambda each: (under_way(each), path.parent in each.directories, each.size), default=None)
     if best is None:
-        best = _FlightRecords(_Mission(None, (), None))
+        best = _FlightRecords(_MissionInHeader(None, (), None))
         groups.append(best)
     best.logged[agent_id].append(event)
 

@@ -71,7 +71,7 @@ class RecordSorter:
         self._left_out = left_out
 
     def result(self) -> IngestResult:
-        """Return the flights in all files so far."""
+        """Return the flights in all files that were added."""
         remarks: list[FileRemark] = []
         flights = group_by_flight(self.incarnations, self.exports, self.captures, self.logged, self._left_out, remarks)
         assign_flight_logs(flights, self.flight_logs, self._left_out, remarks)

@@ -99,7 +99,7 @@ class TraceIncarnation:
         self.gaps.append(Gap(position, lines, lost_bytes))
 
     def put_in_order(self) -> Iterator[UnusedPart]:
-        """Repair the order of lines, and drop repeated ones. Yield a sentence for each place."""
+        """Repair the order of lines, and drop repeated ones. Yield a sentence for each repaired place."""
         order, places = in_order(self.runs)
         if not places:
             return
@@ -140,7 +140,7 @@ def read_incarnations(path: Path, left_out: list[UnusedPart]) -> list[TraceIncar
 
 
 @dataclass
-class _Damage:
+class _DamagedLines:
     first: int
     last: int
     why: str
@@ -150,7 +150,8 @@ class _Damage:
 
 
 class TraceReader:
-    """Reads the lines of a trace in any condition. `incarnations` contains the parts between restarts so far.
+    """Reads the lines of a trace in any condition. `incarnations` contains the parts of the trace between restarts, as
+    far as it was read.
 
     `gave_up` is true if further lines are not needed, because a limit is exceeded.
     """
@@ -165,7 +166,7 @@ class TraceReader:
         self.incarnations: list[TraceIncarnation] = []
         self.gave_up = False
         self._read_bytes = self._lines = self._runs = self._lost = 0
-        self._damaged: list[_Damage] = []
+        self._damaged: list[_DamagedLines] = []
         self._cut_off: int | None = None
 
     def add_line(self, number: int, line: bytes, finish: bool = True) -> None:
@@ -179,7 +180,7 @@ class TraceReader:
             if not self.gave_up:
                 limit = f"{MAX_RUNS} handler runs, {MAX_INCARNATIONS} lives of agents, or {MAX_DAMAGED} damaged lines"
                 what = f"it and all later lines are not read: a trace has at most {limit}"
-                self._damaged = [*self._damaged[:_MAX_LISTED], _Damage(number, number, what)]
+                self._damaged = [*self._damaged[:_MAX_LISTED], _DamagedLines(number, number, what)]
             self.gave_up = True
             return
         if number == 1:
@@ -231,7 +232,7 @@ class TraceReader:
         if self._damaged and (self._damaged[-1].continues(number, why) or len(self._damaged) > MAX_PLACES):
             self._damaged[-1].last = number
         else:
-            self._damaged.append(_Damage(number, number, why))
+            self._damaged.append(_DamagedLines(number, number, why))
 
     def add_unknown_gap(self) -> None:
         """Record that lines may be lost at this place."""
@@ -292,7 +293,7 @@ def _entry(line: bytes) -> Header | Entry | None:
 
 
 def _parse(line: bytes) -> Header | Entry | None:
-    """Return the entry in a line, or None if it is incomplete. Its time is not checked."""
+    """Return the entry in a line without a check of its time, or None if the entry is incomplete."""
     if not any(word in line for word in _MARKERS):
         return None
     try:

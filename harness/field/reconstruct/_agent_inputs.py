@@ -55,7 +55,7 @@ Cause = EventLogged | DatagramReceived | TimerExpired | ReconcileRequested | Boo
 
 
 @dataclass(slots=True)
-class Input:
+class RecordedInput:
     """One input of an agent. `at_s` is the time on the agent's clock, and `line` the line of its trace (from 1).
 
     `runs` are the handler runs that it caused, including those of local events. If the record `is_partial`, some of
@@ -79,15 +79,15 @@ class MissingInputs(Protocol):
 
 def inputs_by_incarnation(
     trace: Trace, header: CheckedHeader, missing: MissingInputs
-) -> tuple[list[list[Input]], str | None]:
+) -> tuple[list[list[RecordedInput]], str | None]:
     """Return the inputs between restarts, and the reason why later inputs are unusable, or None.
 
     The reason names the line.
     """
-    reader = _Reader(header, missing)
-    incarnations: list[list[Input]] = []
+    reader = _InputReader(header, missing)
+    incarnations: list[list[RecordedInput]] = []
     for handler_runs in trace.incarnations():
-        inputs: list[Input] = []
+        inputs: list[RecordedInput] = []
         incarnations.append(inputs)
         try:
             for new_input in reader.inputs(handler_runs):
@@ -97,14 +97,14 @@ def inputs_by_incarnation(
     return incarnations, None
 
 
-class _Reader:
+class _InputReader:
     def __init__(self, header: CheckedHeader, missing: MissingInputs) -> None:
         self._header = header
         self._missing = missing
         self._events: Iterator[LoggableEvent] | None = None
 
-    def inputs(self, handler_runs: Iterator[tuple[int, HandlerRun]]) -> Iterator[Input]:
-        current: Input | None = None
+    def inputs(self, handler_runs: Iterator[tuple[int, HandlerRun]]) -> Iterator[RecordedInput]:
+        current: RecordedInput | None = None
         last_s = float("-inf")
         for line, run in handler_runs:
             unknown = unknown_names([run])
@@ -120,7 +120,7 @@ class _Reader:
             if not math.isfinite(run.t):
                 raise UnusableInputError(f"line {line}: {run.handler} ran at no time")
             last_s = max(last_s, self._header.local(run.t))
-            current = Input(last_s, line, self._cause(line, run), [run])
+            current = RecordedInput(last_s, line, self._cause(line, run), [run])
         if current is not None:
             yield current
 

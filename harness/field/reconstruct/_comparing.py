@@ -8,7 +8,7 @@ from harness.archive.traces import Trace
 from harness.checker.judgement import agents
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.field.ingest import Flight
-from harness.field.reconstruct._agent_inputs import Input, inputs_by_incarnation
+from harness.field.reconstruct._agent_inputs import RecordedInput, inputs_by_incarnation
 from harness.field.reconstruct._inferring import infer
 from harness.field.reconstruct._judged_trace import JudgedTrace
 from harness.field.reconstruct._other_records import OtherRecords
@@ -115,7 +115,7 @@ def _in_words(step: PlayedStep | None) -> str:
 EARLY_TIMERS = "timers of agent {agent_id} expired too early by its clock, as if the clock had been set back"
 
 
-RecordedInputs = Sequence[Sequence[Input]]
+RecordedInputs = Sequence[Sequence[RecordedInput]]
 """The recorded inputs of each incarnation."""
 
 
@@ -135,7 +135,7 @@ class SoloSimulations:
 
     @property
     def remarks(self) -> list[str]:
-        """Sentences about assumptions and findings."""
+        """Sentences about assumptions and findings of the reconstruction."""
         if not self._by_captures:
             return self._remarks
         which = agents(self._by_captures)

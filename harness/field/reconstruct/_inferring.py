@@ -20,8 +20,8 @@ from harness.field.reconstruct._agent_inputs import (
     Cause,
     DatagramReceived,
     EventLogged,
-    Input,
     ReconcileRequested,
+    RecordedInput,
     TimerExpired,
 )
 from harness.play.simulation.air import NEVER
@@ -65,12 +65,12 @@ class InferredInputs:
     datagram.
     """
 
-    incarnations: list[list[Input]] = field(default_factory=list)
+    incarnations: list[list[RecordedInput]] = field(default_factory=list)
     problem: str | None = None
 
     @property
     def explained(self) -> int:
-        """The number of guessed inputs."""
+        """The number of guessed inputs that explain sent datagrams."""
         return sum(map(len, self.incarnations))
 
 
@@ -84,7 +84,7 @@ class _IncarnationRecord:
     is_last: bool
 
     def since(self, at_s: float) -> "_IncarnationRecord":
-        """Return the records after a restart at `at_s`."""
+        """Return the records of the agent after its restart at `at_s`."""
         received = [sighting for sighting in self.received if sighting.at_s >= at_s]
         logged_events = [timed for timed in self.logged_events if timed[0] >= at_s]
         return _IncarnationRecord(received, self.sent, logged_events, self.is_last)
@@ -128,7 +128,7 @@ def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent])
 
 
 def _last_seen(received: Sequence[CapturedDatagram], last_s: float, restart_s: float) -> float:
-    """Return a time until which the agent certainly ran. It would have answered the next query."""
+    """Return a time until which the agent certainly ran. A running agent would have answered the next query."""
     later = (sighting for sighting in received if last_s < sighting.at_s)
     questions = (sighting.at_s for sighting in later if isinstance(decode(sighting.datagram).message, ANSWERED_QUERIES))
     return min(next(questions, restart_s), restart_s)
@@ -214,7 +214,7 @@ class _InputSequence:
         start_s: float,
         pauses: Sequence[Pause],
     ) -> None:
-        self.inputs: list[Input] = []
+        self.inputs: list[RecordedInput] = []
         self.problem: str | None = None
         self.choices: list[int] = []
         """Number of other possible orders for each timer."""
@@ -352,7 +352,7 @@ class _InputSequence:
                 return
             self._explained += 1
         if runs:
-            self.inputs.append(Input(now, 0, cause, runs))
+            self.inputs.append(RecordedInput(now, 0, cause, runs))
 
     def _detect_pause(self, since_s: float) -> None:
         """Record a pause if the agent sent nothing for a long time although it should have."""

@@ -6,9 +6,9 @@ from pathlib import Path
 from harness.checker.recorded_inputs import stored_blocks
 from harness.checker.steps.deviation import StepDeviation
 from harness.field.ingest import Flight
-from harness.field.reconstruct._agent_inputs import BootedFromDisk, Input
+from harness.field.reconstruct._agent_inputs import BootedFromDisk, RecordedInput
 from harness.field.reconstruct._bridging import KnownState
-from harness.field.replay import Record, RecordPlayer
+from harness.field.replay import RecordedTrace, RecordPlayer
 from harness.field.replay._record_search import IngestedRecords
 from harness.field.replay.replay_names import ReplayNames
 from ucp.block import Block
@@ -24,7 +24,7 @@ class JudgedTrace:
     def __init__(self, flight: Flight, agent_id: int) -> None:
         """Compare the trace. Raises FieldError if the trace does not contain inputs."""
         trace = flight.traces[agent_id]
-        record = Record(Path(f"agent {agent_id}"), "", trace, IngestedRecords(flight), [])
+        record = RecordedTrace(Path(f"agent {agent_id}"), "", trace, IngestedRecords(flight), [])
         player = RecordPlayer(record)
         self._known: dict[int, KnownState] = {}
         """Handler run, by identity, after which the state is known again -> the state."""
@@ -49,10 +49,12 @@ class JudgedTrace:
 
     @property
     def first_finding(self) -> str | None:
-        """The first deviation as a sentence, or None."""
+        """The first deviation from the reference implementation as a sentence, or None."""
         return self.deviations[0].sentence(self._names.of) if self.deviations else None
 
-    def with_known_states(self, incarnations: Sequence[Sequence[Input]]) -> list[list[Input | KnownState]]:
+    def with_known_states(
+        self, incarnations: Sequence[Sequence[RecordedInput]]
+    ) -> list[list[RecordedInput | KnownState]]:
         """Return the inputs that can be simulated, with a known state in place of lost inputs."""
         parts = [[*self._parts(inputs)] for inputs in incarnations]
         for before, after in zip(parts, incarnations[1:], strict=False):
@@ -62,13 +64,13 @@ class JudgedTrace:
             parts[-1].append(last)
         return parts
 
-    def _parts(self, inputs: Sequence[Input]) -> Iterator[Input | KnownState]:
+    def _parts(self, inputs: Sequence[RecordedInput]) -> Iterator[RecordedInput | KnownState]:
         for number, recorded in enumerate(inputs):
             if id(recorded.runs[0]) in self._played:
                 kept = [run for run in recorded.runs if id(run) in self._played]
                 is_last = number + 1 == len(inputs) or id(inputs[number + 1].runs[0]) not in self._played
                 is_partial = is_last or len(kept) < len(recorded.runs)
-                yield Input(recorded.at_s, recorded.line, recorded.cause, kept, is_partial)
+                yield RecordedInput(recorded.at_s, recorded.line, recorded.cause, kept, is_partial)
             yield from (self._known[id(run)] for run in recorded.runs if id(run) in self._known)
 
     def _state_at_export(self) -> KnownState | None:
@@ -81,7 +83,7 @@ class JudgedTrace:
         return KnownState(chain, None, why)
 
 
-def _disk(boot: Input) -> KnownState | None:
+def _disk(boot: RecordedInput) -> KnownState | None:
     """Return the recorded content of the disk at a restart, or None if some of its blocks were not committed yet."""
     run = boot.runs[0]
     try:

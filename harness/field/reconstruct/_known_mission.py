@@ -1,4 +1,4 @@
-"""Find the mission and the settings of a flight. They are recorded, or guessed from the sent messages.
+"""Find the mission and the settings of a flight, which are recorded or guessed from the sent messages.
 
 Some settings are visible in messages and blocks: whether votes name a chain, and the size of a full block. For the
 others, each value is tried alone, and the one that explains the most messages is assumed.
@@ -99,7 +99,7 @@ NO_INPUTS = "the records hold no inputs of agents: add traces (*.trace.jsonl), o
 
 
 @dataclass(frozen=True)
-class Mission:
+class MissionConfiguration:
     """The configuration that all agents of a flight share."""
 
     name: str
@@ -110,7 +110,7 @@ class Mission:
 
 def known_mission(
     flight: Flight, other_records: OtherRecords, name: str, remarks: list[str]
-) -> tuple[Mission, dict[int, CheckedHeader]]:
+) -> tuple[MissionConfiguration, dict[int, CheckedHeader]]:
     """Return the mission, and the trace header of each agent with enough records.
 
     Raises FieldError if no agent has enough.
@@ -141,7 +141,7 @@ def known_mission(
         raise FieldError("; ".join([*other_records.problems[:1], NO_INPUTS]))
     common_initial_data = Counter(header.initial_data for header in headers.values()).most_common(1)[0][0]
     data = common_initial_data if initial_data is None else base64.b64decode(initial_data)
-    return Mission(name, tuple(sorted(roster)), data, settings), headers
+    return MissionConfiguration(name, tuple(sorted(roster)), data, settings), headers
 
 
 def _in_words(settings: Settings) -> str:

@@ -69,11 +69,11 @@ class OtherRecords:
         return [*self._datagrams.get((sender, sequence), ())]
 
     def senders(self) -> set[int]:
-        """Return the IDs of all senders."""
+        """Return the agent IDs of all senders in the records."""
         return {sender for sender, _ in self._datagrams}
 
     def all_datagrams(self) -> Iterator[bytes]:
-        """Yield each datagram once."""
+        """Yield each different datagram of the flight once."""
         for datagrams in self._datagrams.values():
             yield from datagrams
 

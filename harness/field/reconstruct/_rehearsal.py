@@ -20,8 +20,8 @@ from harness.field.reconstruct._agent_inputs import (
     BootedFromDisk,
     DatagramReceived,
     EventLogged,
-    Input,
     ReconcileRequested,
+    RecordedInput,
     TimerExpired,
 )
 from harness.field.reconstruct._bridging import InferredInputPath, KnownState
@@ -72,7 +72,7 @@ class PlayedInput:
     """
 
     incarnation: int
-    input: Input
+    input: RecordedInput
     sent: list[bytes]
     matters: bool
     expired: TimerStart | None = None
@@ -98,7 +98,7 @@ class SoloSimulation:
     """True if the record ends before all effects of its last input. The input is played completely."""
     matches_exactly: bool = True
     """True if branches and tallies are equal to the recorded ones, too."""
-    ignored: list[Input] = field(default_factory=list)
+    ignored: list[RecordedInput] = field(default_factory=list)
     """Messages that the agent ignored although they should have had an effect. They are not played."""
     inferred: int = 0
     """Number of inputs that were inferred in place of lost lines."""
@@ -114,7 +114,7 @@ class ToleratedDeviations:
     ignoring: bool = False
 
 
-Incarnations = Sequence[Sequence[Input | KnownState]]
+Incarnations = Sequence[Sequence[RecordedInput | KnownState]]
 """The inputs of each incarnation. A known state stands for lost inputs, which lead to this state."""
 
 
@@ -179,7 +179,7 @@ class _IncarnationSimulation:
         timers.update(self.agent.state)
 
     def running_at_end(self) -> list[TimerStart]:
-        """Return the timers that are still running."""
+        """Return the timers that still run at the end of the record."""
         return [*self._running_timers.values()]
 
     def bridge(self, known: KnownState) -> bool:
@@ -191,7 +191,7 @@ class _IncarnationSimulation:
             deadlines = [timer.deadline for timer in state.timers if timer.deadline is not None]
             at_s = max(state.now, min(deadlines, default=0.0)) if isinstance(cause, TimerExpired) else state.now
             expired = self._timers.running.get(cause.name) if isinstance(cause, TimerExpired) else None
-            inferred = Input(at_s, 0, cause)
+            inferred = RecordedInput(at_s, 0, cause)
             if self._feed(inferred, None) is not None:
                 return False
             inferred.runs = [entry for entry in self.agent.trace() if isinstance(entry, HandlerRun)]
@@ -205,7 +205,7 @@ class _IncarnationSimulation:
         return bridge.reached
 
     def play(
-        self, index: int, recorded_input: Input, stored: StoredState | None, *, is_last: bool
+        self, index: int, recorded_input: RecordedInput, stored: StoredState | None, *, is_last: bool
     ) -> ProtocolDeviation | None:
         """Simulate an input. Return the deviation if the result differs from the record, otherwise None."""
         expired = (
@@ -242,7 +242,7 @@ class _IncarnationSimulation:
         self._rehearsal.played.append(played)
         return None
 
-    def _sent(self, recorded_input: Input) -> list[bytes]:
+    def _sent(self, recorded_input: RecordedInput) -> list[bytes]:
         """Return the sent datagrams as recorded. If the record lacks them, return those of the simulated agent."""
         encoded = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
         recorded = [sent.datagram for run in recorded_input.runs for sent in run.sent]
@@ -261,7 +261,7 @@ class _IncarnationSimulation:
             played.expired = before.pop(ended.number)
         played.stopped = [started for number, started in before.items() if number not in self._running_timers]
 
-    def _feed(self, recorded_input: Input, stored: StoredState | None) -> str | None:
+    def _feed(self, recorded_input: RecordedInput, stored: StoredState | None) -> str | None:
         """Give an input to the simulated agent. Return the reason if the input is impossible, otherwise None."""
         agent, now = self.agent, recorded_input.at_s
         match recorded_input.cause:
@@ -298,7 +298,7 @@ class _IncarnationSimulation:
             return False
         return MATTERS[type(message)](agent.state, sender, message)
 
-    def _ignores(self, recorded_input: Input) -> bool:
+    def _ignores(self, recorded_input: RecordedInput) -> bool:
         """Return true if a message had no effect although it should have had one."""
         if not isinstance(recorded_input.cause, DatagramReceived) or any(
             run.changes or run.sent for run in recorded_input.runs

@@ -96,14 +96,14 @@ class Timetable:
 
 def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, float] = {}) -> Timetable:
     """Return the inputs on one time axis. `ahead_s` relates the clocks of agents to GPS time."""
-    senders = _Senders(rehearsals)
+    senders = _DatagramsBySender(rehearsals)
     clocks = estimate(rehearsals, senders.deliveries(), ahead_s)
     clocks = _from_zero(clocks, rehearsals)
-    return _Planner(rehearsals, senders, clocks).plan()
+    return _TimetablePlanner(rehearsals, senders, clocks).plan()
 
 
 def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSimulation]) -> dict[int, ClockLine]:
-    """Return the clocks relative to mission time.
+    """Return the clocks of all agents relative to mission time.
 
     Mission second 0 is the time at which the first clock shows 0. If the first input is earlier, or much later, mission
     second 0 is directly before it.
@@ -120,7 +120,7 @@ def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSim
     return rounded
 
 
-class _Senders:
+class _DatagramsBySender:
     """The datagrams that each simulated agent sent, and their receivers among the simulated agents."""
 
     def __init__(self, rehearsals: Mapping[int, SoloSimulation]) -> None:
@@ -157,9 +157,9 @@ class _Senders:
         return found
 
 
-class _Planner:
+class _TimetablePlanner:
     def __init__(
-        self, rehearsals: Mapping[int, SoloSimulation], senders: _Senders, clocks: dict[int, ClockLine]
+        self, rehearsals: Mapping[int, SoloSimulation], senders: _DatagramsBySender, clocks: dict[int, ClockLine]
     ) -> None:
         self._rehearsals = rehearsals
         self._senders = senders

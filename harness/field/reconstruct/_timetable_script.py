@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
 from harness.field.reconstruct._agent_inputs import DatagramReceived, EventLogged, ReconcileRequested
-from harness.field.reconstruct._known_mission import Mission
+from harness.field.reconstruct._known_mission import MissionConfiguration
 from harness.field.reconstruct._rehearsal import SoloSimulation
 from harness.field.reconstruct._timetable import DIGITS, MIN_GAP_S, IncarnationTimes, TimedInput, Timetable
 from harness.scenario.scenario_file import Document
@@ -25,7 +25,11 @@ MIN_PAUSE_S = 0.5
 
 
 def scenario_document(
-    mission: Mission, table: Timetable, rehearsals: Mapping[int, SoloSimulation], lost: Collection[int], sealed: Sealed
+    mission: MissionConfiguration,
+    table: Timetable,
+    rehearsals: Mapping[int, SoloSimulation],
+    lost: Collection[int],
+    sealed: Sealed,
 ) -> Document:
     """Return the scenario as a document. An agent without simulated inputs does not take part in it.
 
@@ -148,7 +152,7 @@ def _with_text_keys(reached: Mapping[int, float]) -> Document:
 
 
 def _source(datagram: bytes) -> int:
-    """Return the sender that the datagram names."""
+    """Return the agent ID in the datagram's sender field."""
     try:
         return decode(datagram).sender
     except MalformedDatagramError:
@@ -161,7 +165,7 @@ def _fates(
     incarnations: Mapping[int, Sequence[IncarnationTimes]],
     strays: _StrayDatagrams,
 ) -> Iterator[Document]:
-    """Yield the arrivals of all datagrams.
+    """Yield the scripted deliveries of all datagrams that arrive.
 
     All others are lost. Datagrams that no agent can send to the receiver become strays.
     """

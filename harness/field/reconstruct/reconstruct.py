@@ -81,7 +81,7 @@ class Reconstruction:
 
     @property
     def sentence(self) -> str:
-        """The result in one sentence."""
+        """The result of the reconstruction in one sentence."""
         reproduced, all_of_them = len(self.reproduced), len(self.agents)
         if not self.problems:
             chains = "the chain" if reproduced == 1 else f"all {reproduced} chains"

@@ -6,8 +6,8 @@ difference. `_resumption` finds the place where an agent can be followed again a
 steps of the other agents at the same time. `prompt` is the interactive command line.
 """
 
-from harness.field.replay._agent_record import Record
+from harness.field.replay._agent_record import RecordedTrace
 from harness.field.replay._player import PERHAPS, RecordPlayer, ReplayResult
 from harness.field.replay._record_search import open_record, open_records
 
-__all__ = ["PERHAPS", "Record", "RecordPlayer", "ReplayResult", "open_record", "open_records"]
+__all__ = ["PERHAPS", "RecordPlayer", "RecordedTrace", "ReplayResult", "open_record", "open_records"]

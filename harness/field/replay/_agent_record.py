@@ -58,7 +58,7 @@ class FlightRecords(Protocol):
         """Return the capture of the agent's vehicle. None without one, or if it is not needed."""
 
 
-class Record:
+class RecordedTrace:
     """The trace of one agent. `path` is its file, and `argument` is its name on the command line.
 
     Raises FieldError if no part of it can be played.
@@ -196,7 +196,8 @@ class Record:
         return exported_s if exported_s >= self.end_s else None
 
     def ends_open(self, follower: StepComparer) -> str | None:
-        """Return a sentence about the end of the record, if the agent left no export and others went on.
+        """Return a sentence about the end of the record, if the agent left no export and other agents continued after
+        it.
 
         Without any export, the mission may have ended at different times, and only a due timer proves an early end.
         `follower` is in the state after the last line.

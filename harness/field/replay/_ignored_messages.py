@@ -14,7 +14,7 @@ from typing import Protocol
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.deviation import StepDeviation
 from harness.field._vehicle_captures import CapturedDatagram
-from harness.field.replay._agent_record import Record, RecordEntry
+from harness.field.replay._agent_record import RecordedTrace, RecordEntry
 from ucp.messages import MalformedDatagramError, Message, decode
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
@@ -26,7 +26,7 @@ MAX_TRIED = 200
 
 
 class PlayedAgent(Protocol):
-    """A player of the record at some position."""
+    """A player of an agent's record at some position in this record."""
 
     @property
     def lost(self) -> str | None: ...
@@ -36,7 +36,7 @@ class PlayedAgent(Protocol):
     def handler_of(self, message: Message) -> str: ...
 
 
-def ignored_messages(record: Record, play_to: Callable[[int], PlayedAgent]) -> tuple[int, StepDeviation] | None:
+def ignored_messages(record: RecordedTrace, play_to: Callable[[int], PlayedAgent]) -> tuple[int, StepDeviation] | None:
     """Return the first message that the agent ignored, with its position. None if it ignored at most a few.
 
     `play_to` plays the entries up to a position.
@@ -64,7 +64,7 @@ def ignored_messages(record: Record, play_to: Callable[[int], PlayedAgent]) -> t
     return position, StepDeviation(record.agent_id, entry.line, sighting.at_s, handler, what)
 
 
-def _without_line(record: Record) -> Iterator[tuple[int, CapturedDatagram]]:
+def _without_line(record: RecordedTrace) -> Iterator[tuple[int, CapturedDatagram]]:
     """Yield the messages that arrived between two lines of an incarnation and have no line, with the next position."""
     known = {(run.sender, run.sequence) for entry in record.entries if (run := _received(entry)) is not None}
     times = [entry.content.t for entry in record.entries]

@@ -9,7 +9,7 @@ from rich.text import Text
 
 from harness.archive.traces import Trace
 from harness.field.reconstruct._clock_offsets import ClockLine, estimate
-from harness.field.replay._agent_record import Record
+from harness.field.replay._agent_record import RecordedTrace
 from harness.field.replay._peer_messages import PeerMessages
 from harness.field.replay._player import RecordPlayer
 from harness.present.text import shown
@@ -24,13 +24,13 @@ STEPS_SHOWN = 2
 
 
 class OtherAgents:
-    """The records of the other agents. They are read when they are first used.
+    """The records of the other agents, each of which is read when it is first used.
 
     The agents of a run share one clock. Agents in the field have separate clocks, whose offsets follow from the
     messages between two agents.
     """
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: RecordedTrace) -> None:
         self._record = record
 
     @cached_property
@@ -66,13 +66,13 @@ class OtherAgents:
 class _OtherAgent:
     """Another agent. `clock` relates its clock to that of the replayed agent."""
 
-    def __init__(self, record: Record, trace: Trace) -> None:
+    def __init__(self, record: RecordedTrace, trace: Trace) -> None:
         self._messages = PeerMessages(record, trace)
         self.runs = self._messages.runs
         self.clock = ClockLine() if record.flight.record is not None else self._estimated(record, trace)
         self._times = [*accumulate((self.clock.at(run.t) for _, run in self.runs), max)]
 
-    def _estimated(self, record: Record, trace: Trace) -> ClockLine:
+    def _estimated(self, record: RecordedTrace, trace: Trace) -> ClockLine:
         own, other = record.agent_id, trace.header.agent_id
         deliveries = [message.delivery for message in self._messages]
         if not deliveries:
@@ -87,7 +87,7 @@ class _OtherAgent:
         return range(max(first, middle - STEPS_SHOWN), min(until, middle + STEPS_SHOWN))
 
     def state_text(self, now: float, top: str) -> str:
-        """Return a text about its state at this moment."""
+        """Return a text about the state of another agent at this moment."""
         number = bisect_right(self._times, now) - 1
         if number < 0:
             return "nothing yet"

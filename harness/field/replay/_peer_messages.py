@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from harness.archive.traces import Trace
-from harness.field.replay._agent_record import Record
+from harness.field.replay._agent_record import RecordedTrace
 from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
@@ -30,7 +30,7 @@ class PeerMessage(NamedTuple):
 class PeerMessages:
     """The messages between two agents. `runs` contains the handler runs of the other agent with line numbers."""
 
-    def __init__(self, record: Record, other_trace: Trace) -> None:
+    def __init__(self, record: RecordedTrace, other_trace: Trace) -> None:
         self.runs = [numbered for numbered_runs in other_trace.incarnations() for numbered in numbered_runs]
         self._record = record
         self._agents = record.agent_id, other_trace.header.agent_id

@@ -18,7 +18,7 @@ from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import OptionalTraceFields, StepComparer
 from harness.checker.steps.implementation import REFERENCE, CoreImplementation
 from harness.checker.steps.single_line import LINES_AFTER, damage_that_explains
-from harness.field.replay._agent_record import Record, RecordEntry
+from harness.field.replay._agent_record import RecordedTrace, RecordEntry
 from harness.field.replay._ignored_messages import ignored_messages
 from harness.field.replay._resumption import ClockChangeDetector, ResumptionSearch
 from harness.field.replay.replay_names import RecordedBlocks
@@ -73,7 +73,7 @@ class ReplayResult:
 
 
 @dataclass(frozen=True)
-class _Checkpoint:
+class _PlayerCheckpoint:
     follower: StepComparer
     incarnation: int
     result: ReplayResult
@@ -87,7 +87,7 @@ class RecordPlayer:
     """
 
     def __init__(
-        self, record: Record, until_s: float | None = None, implementation: CoreImplementation = REFERENCE
+        self, record: RecordedTrace, until_s: float | None = None, implementation: CoreImplementation = REFERENCE
     ) -> None:
         self.record = record
         self._implementation = implementation
@@ -103,11 +103,11 @@ class RecordPlayer:
         self.resumed_at: int | None = None
         """The position after the last entry at which the state became known again. None if there was none."""
         self._follower, self._incarnation = self._new_follower(), 1
-        self._checkpoints = {0: _Checkpoint(self._follower.copy(), 1, self.result.copy())}
+        self._checkpoints = {0: _PlayerCheckpoint(self._follower.copy(), 1, self.result.copy())}
 
     @property
     def state(self) -> State:
-        """The current state of the agent."""
+        """The state of the agent after the last played entry."""
         return self._follower.state
 
     @property
@@ -117,7 +117,7 @@ class RecordPlayer:
 
     @property
     def entry(self) -> RecordEntry | None:
-        """The entry that was played last, or None."""
+        """The trace entry that was played last, or None."""
         return self.entries[self.position - 1] if self.position else None
 
     @property
@@ -155,7 +155,9 @@ class RecordPlayer:
             self.result.add(self.position + 1, [deviation])
         self.position += 1
         if self.position % CHECKPOINT_STEPS == 0 and self.position not in self._checkpoints:
-            self._checkpoints[self.position] = _Checkpoint(self._follower.copy(), self._incarnation, self.result.copy())
+            self._checkpoints[self.position] = _PlayerCheckpoint(
+                self._follower.copy(), self._incarnation, self.result.copy()
+            )
         return entry
 
     def to(self, position: int, *, replay: bool = False) -> None:
@@ -199,7 +201,7 @@ class RecordPlayer:
             result.unjudged += 1
 
     def at(self, position: int) -> "RecordPlayer":
-        """Go to a position, and return this player."""
+        """Go to a position in the record, and return this player."""
         self.to(position)
         return self
 
@@ -214,7 +216,7 @@ class RecordPlayer:
         return self._follower.copy().has_effect(sender, message, at_s)
 
     def handler_of(self, message: Message) -> str:
-        """Return the name of the handler of a message."""
+        """Return the name of the handler for a message."""
         return str(self._implementation.on_message[type(message)].name)
 
     def _follow(self, entry: RecordEntry, run: HandlerRun) -> None:
@@ -289,7 +291,7 @@ class RecordPlayer:
 class _DoubtingPlayer(RecordPlayer):
     """A player that tries to explain each deviation by damage to a single line."""
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: RecordedTrace) -> None:
         super().__init__(record)
         self.found: dict[int, str | None] = {}
         """The positions of deviations, each with the damage that explains it, or None."""

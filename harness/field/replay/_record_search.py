@@ -18,7 +18,7 @@ from harness.checker.evidence import check_variant
 from harness.errors import CaptureError, FieldError, RunDirectoryError
 from harness.field._vehicle_captures import AgentCapture, read_capture
 from harness.field.ingest import Flight, IngestResult, ingest_files
-from harness.field.replay._agent_record import Record
+from harness.field.replay._agent_record import RecordedTrace
 from harness.gc_pause import gc_paused
 from ucp.plain_file import open_plain_file
 
@@ -106,7 +106,7 @@ def _capture(flight: Flight, agent_id: int) -> AgentCapture | None:
         return None
 
 
-def open_record(path: Path, agent_id: int | None = None) -> Record:
+def open_record(path: Path, agent_id: int | None = None) -> RecordedTrace:
     """Return the record in a trace, or of an agent in a directory. Raises FieldError if none can be played."""
     records = open_records(path, agent_id)
     if len(records) > 1:
@@ -115,7 +115,7 @@ def open_record(path: Path, agent_id: int | None = None) -> Record:
     return records[0]
 
 
-def open_records(path: Path, agent_id: int | None = None) -> list[Record]:
+def open_records(path: Path, agent_id: int | None = None) -> list[RecordedTrace]:
     """Return all records in a trace or a directory, or those of one agent. Raises FieldError if none can be played."""
     files = _files_in(path, agent_id) if path.is_dir() else [path]
     directory = path if path.is_dir() else _directory_of(path)
@@ -131,12 +131,12 @@ def open_records(path: Path, agent_id: int | None = None) -> list[Record]:
     for file, trace in zip(files, traces, strict=True):
         argument = _command_argument(path, trace.header.agent_id if path.is_dir() else None)
         records_to_open.append(
-            partial(Record, file, argument, trace, run_records or _DirectoryRecords(trace, file.parent), [])
+            partial(RecordedTrace, file, argument, trace, run_records or _DirectoryRecords(trace, file.parent), [])
         )
     return _playable(records_to_open)
 
 
-def _playable(records: Iterable[Callable[[], Record]]) -> list[Record]:
+def _playable(records: Iterable[Callable[[], RecordedTrace]]) -> list[RecordedTrace]:
     """Return the records that can be played.
 
     The problems of the others are added to the first. Raises FieldError if none can.
@@ -195,7 +195,7 @@ def _belongs_to_another(path: Path, agent_id: int) -> bool:
         return False
 
 
-def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) -> list[Record]:
+def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) -> list[RecordedTrace]:
     """Return the records in files of any kind. If too few were found in the part that was read, return none."""
     ingested = ingest_files(sources)
     flights = [flight for flight in ingested.flights if flight.traces]
@@ -225,7 +225,7 @@ def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) ->
             else _DirectoryRecords(trace, file.parent)
         )
         argument = _command_argument(path, agent if path.is_dir() or len(recorded_agents) > 1 else None)
-        records.append(partial(Record, file, argument, trace, flight_records, problems))
+        records.append(partial(RecordedTrace, file, argument, trace, flight_records, problems))
     return _playable(records)
 
 

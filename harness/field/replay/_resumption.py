@@ -16,7 +16,7 @@ from statistics import median
 from harness.archive.traces import Trace
 from harness.checker.recorded_inputs import NotOnRecordError, event_of
 from harness.checker.steps.follower import StepComparer
-from harness.field.replay._agent_record import Record, RecordEntry
+from harness.field.replay._agent_record import RecordedTrace, RecordEntry
 from harness.field.replay._peer_messages import PeerMessages
 from harness.field.replay.replay_names import RecordedBlocks
 from ucp.block import HASH_BYTES, Block, InceptionBlock, next_chain_hash
@@ -31,7 +31,7 @@ _ChainSteps = dict[bytes, tuple[bytes, str]]
 class ResumptionSearch:
     """The chains in all records of the flight, and the agent states that follow from them."""
 
-    def __init__(self, record: Record, blocks: RecordedBlocks) -> None:
+    def __init__(self, record: RecordedTrace, blocks: RecordedBlocks) -> None:
         self._record = record
         self._blocks = blocks
         self._inception = InceptionBlock(record.header.initial_data).chain_hash
@@ -155,9 +155,9 @@ MIN_SHIFT_S = 1.0
 
 
 class ClockChangeDetector:
-    """A detector of changes of the agent's clock. It reads the records of the other agents when it is first used."""
+    """A detector of changes of the agent's clock. Its first use reads the records of the other agents."""
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: RecordedTrace) -> None:
         self._record = record
 
     def shift_near(self, position: int) -> str | None:

@@ -92,7 +92,7 @@ class StepText:
             yield _row("counted", ", ".join(self._counted(key, count) for key, count in run.tally.items()))
 
     def deviation(self, deviation: StepDeviation) -> Text:
-        """Return the line about a deviation. It names the step if that is not the last one."""
+        """Return the line about a deviation. If the deviation is not in the last step, the line names its step."""
         entry = self._player.entry
         own = entry is not None and entry.line == deviation.line and isinstance(entry.content, HandlerRun)
         whose = "" if own else f"of line {deviation.line}, {deviation.handler}: "

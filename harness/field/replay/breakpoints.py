@@ -93,6 +93,6 @@ def source_of(handler: str) -> str:
 
 
 def _decorators(handler: str) -> Iterator[str]:
-    """Yield the lines before `def`. They run only when the module is imported."""
+    """Yield the lines before `def`, which run only when the module is imported."""
     lines, _ = inspect.getsourcelines(HANDLERS[handler].run)
     return takewhile(lambda line: not line.startswith("def "), lines)

@@ -16,7 +16,7 @@ from harness.checker.missing_incarnations import lacking_traces
 from harness.checker.steps.deviation import StepDeviation
 from harness.errors import FieldError
 from harness.field.ingest import Flight
-from harness.field.replay._agent_record import Record
+from harness.field.replay._agent_record import RecordedTrace
 from harness.field.replay._player import RecordPlayer, ReplayResult
 from harness.field.replay._record_search import IngestedRecords
 
@@ -28,7 +28,7 @@ def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
     for agent_id, recorded in flight.traces.items():
         doubtful = dict[int, str]()
         try:
-            record = Record(Path(), "", recorded, IngestedRecords(flight), [])
+            record = RecordedTrace(Path(), "", recorded, IngestedRecords(flight), [])
             results[agent_id] = RecordPlayer(record).to_end()
             doubtful = record.doubtful_runs
         except FieldError as error:

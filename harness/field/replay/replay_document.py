@@ -10,7 +10,7 @@ from rich.text import Text
 
 from harness.checker.judgement import times
 from harness.checker.steps.deviation import StepDeviation
-from harness.field.replay._agent_record import Record
+from harness.field.replay._agent_record import RecordedTrace
 from harness.field.replay._player import ReplayResult
 from harness.field.replay.breakpoints import source_of
 from harness.field.replay.replay_names import ReplayNames
@@ -72,7 +72,7 @@ def verdict(result: ReplayResult) -> Verdict:
     return "as specified" if result.steps else "not judged"
 
 
-def replayed(record: Record, result: ReplayResult, names: ReplayNames) -> ReplayedRecord:
+def replayed(record: RecordedTrace, result: ReplayResult, names: ReplayNames) -> ReplayedRecord:
     deviations = result.deviations
     return ReplayedRecord(
         record=str(record.path),
@@ -104,7 +104,7 @@ HANDLERS_SHOWN = 10
 LOST_SHOWN = 5
 
 
-def header_text(record: Record) -> Text:
+def header_text(record: RecordedTrace) -> Text:
     """Return a line with the agent and the length of its record."""
     incarnations = f", {record.incarnations} lives" if record.incarnations > 1 else ""
     return shown(
@@ -114,7 +114,7 @@ def header_text(record: Record) -> Text:
     )
 
 
-def summary(record: Record, result: ReplayResult, names: ReplayNames) -> Iterator[Text]:
+def summary(record: RecordedTrace, result: ReplayResult, names: ReplayNames) -> Iterator[Text]:
     """Yield text about the first difference in detail, the others by handler, and the reasons why steps were not
     compared.
     """
@@ -134,7 +134,7 @@ def summary(record: Record, result: ReplayResult, names: ReplayNames) -> Iterato
             yield shown(f"  {sentence}", style="yellow")
 
 
-def _differences(record: Record, result: ReplayResult, steps: str, names: ReplayNames) -> Iterator[Text]:
+def _differences(record: RecordedTrace, result: ReplayResult, steps: str, names: ReplayNames) -> Iterator[Text]:
     first = result.first
     assert first is not None, "it deviates"
     count = len(result.deviations)

@@ -7,7 +7,7 @@ from functools import cached_property
 from harness.archive.exports import name_blocks
 from harness.archive.traces import Trace
 from harness.checker.recorded_inputs import BlockIndex, NotOnRecordError, decoded
-from harness.field.replay._agent_record import Record
+from harness.field.replay._agent_record import RecordedTrace
 from ucp.block import Block
 from ucp.messages import BlockResponse, CommitBlock, MalformedDatagramError
 from ucp.trigger import MessageTrigger
@@ -23,9 +23,11 @@ def is_block(text: str) -> bool:
 
 
 class ReplayNames:
-    """The names of blocks by hash, and the hashes by name. They come from exports, or from traces if there are none."""
+    """The names of blocks by hash, and the hashes by name. Names come from exports, or from traces if there are no
+    exports.
+    """
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: RecordedTrace) -> None:
         self._record = record
 
     def of(self, block_hash: str) -> str:
@@ -56,7 +58,7 @@ class ReplayNames:
 class RecordedBlocks(BlockIndex):
     """All blocks in the records of the flight, including those that the replay has not reached yet."""
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: RecordedTrace) -> None:
         super().__init__(())
         self._record = record
         self._unread = self._sources()

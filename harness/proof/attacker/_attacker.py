@@ -24,7 +24,7 @@ MOST_KNOWN = 200_000
 """Maximum number of cached lists of messages. Above it, the cache is emptied."""
 
 
-class _AgentKnowledge(NamedTuple):
+class _KnowledgeFromAgent(NamedTuple):
     """The blocks, hashes and queries that the attacker knows from one agent."""
 
     asked: PendingQuestions
@@ -60,7 +60,7 @@ class Attacker:
         """The blocks that the attacker may make, by block hash."""
         self._own = frozenset(blocks)
         self._times_us = ages.said
-        self._knowledge: dict[int, _AgentKnowledge] = {}
+        self._knowledge: dict[int, _KnowledgeFromAgent] = {}
         self._forgeries: dict[tuple[int, ForgeryMaterial], tuple[int, ...]] = {}
 
     def lies(self, locals_: tuple[int, ...]) -> Iterator[tuple[AgentAction, ...]]:
@@ -96,7 +96,7 @@ class Attacker:
             others = frozenset(look.asked for other, look in looks.items() if other != place)
             yield place, ForgeryMaterial(blocks, named, others - {PendingQuestions()}, self._times_us)
 
-    def _look(self, local: int) -> _AgentKnowledge:
+    def _look(self, local: int) -> _KnowledgeFromAgent:
         look = self._knowledge.get(local)
         if look is None:
             look = self._knowledge[local] = looked_at(self._local.state(local))
@@ -150,9 +150,9 @@ class AttackerKnowledge:
         return list(forgeries(state, self._captured, material))
 
 
-def looked_at(state: AgentState) -> _AgentKnowledge:
+def looked_at(state: AgentState) -> _KnowledgeFromAgent:
     """Return the knowledge that the attacker gains from an agent in this state."""
     committed = frozenset((*state.chain, *state.reconcile_stack))
-    return _AgentKnowledge(
+    return _KnowledgeFromAgent(
         asked(state), committed, frozenset(block.block_hash for block in state.blocks_to_be_committed)
     )

@@ -56,7 +56,7 @@ class ExtraVotes:
         return any(self._leads(after, votes - 1, instants + 1) for after in self._after_a_vote(fork))
 
     def _after_a_vote(self, fork: State) -> Iterator[State]:
-        """Yield the states after a vote of each agent. Agents in equal states are tried once.
+        """Yield the states after a vote of each agent. Of several agents in equal states, only one is tried.
 
         Agents whose chain is rarest come first.
         """

@@ -131,7 +131,7 @@ def show(graph: StateGraph, cycles: Sequence[list[int]], path: Path, name: str) 
 
 
 def _nearest(graph: StateGraph, alike: Sequence[list[int]]) -> list[_CycleExample]:
-    """Return some cycles of one form. The best example is first.
+    """Return some cycles of one form, with the best example first.
 
     Cycles that real clocks allow come first, then those with the fewest coincidences, then those with the fewest blocks
     of fixed time.

@@ -20,13 +20,13 @@ from harness.scenario.faults.fault import PAUSED, Fault
 MAX_DETAIL = 300
 
 
-class _NetworkEntry(NetworkLine):
+class _TimedNetworkLine(NetworkLine):
     detail: Any = ""
     """A description for people."""
     by_hand: bool = False
 
 
-TimedLine = TypeVar("TimedLine", _NetworkEntry, TrackLine)
+TimedLine = TypeVar("TimedLine", _TimedNetworkLine, TrackLine)
 
 
 class _TimedFile(Generic[TimedLine]):
@@ -85,7 +85,7 @@ class NetworkAndVehicles:
         self._network = NetworkReplay(vehicles)
         self._losses: dict[Pair, tuple[float, float]] = {}
         self._parts: tuple[frozenset[int], ...] = ()
-        self._conditions = _TimedFile(directory / NETWORK_FILE, _NetworkEntry, self._play_network_entry)
+        self._conditions = _TimedFile(directory / NETWORK_FILE, _TimedNetworkLine, self._play_network_entry)
         self._tracks = _TimedFile(directory / TRACKS_FILE, TrackLine, self._play_positions)
 
     def read(self, until_s: float, at_most: int) -> bool:
@@ -116,7 +116,7 @@ class NetworkAndVehicles:
         self._conditions.close()
         self._tracks.close()
 
-    def _play_network_entry(self, line: _NetworkEntry) -> None:
+    def _play_network_entry(self, line: _TimedNetworkLine) -> None:
         """Process one entry: a change of the network or a fault of agents.
 
         Raises ValueError, TypeError, AttributeError or KeyError if the line is invalid.

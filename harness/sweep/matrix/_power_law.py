@@ -21,7 +21,7 @@ variables cannot be separated."""
 
 
 class Exponent(BaseModel):
-    """The exponent of a power law with its 95 % confidence interval."""
+    """An exponent with its 95 % confidence interval."""
 
     model_config = ConfigDict(frozen=True)
 

@@ -28,7 +28,7 @@ MAX_DEPTH = 2
 
 def items(bag: Buffer) -> Iterator[Item]:
     topics = BagTopics()
-    reader = _Reader(topics)
+    reader = _McapReader(topics)
     yield from reader.items(bag, len(MAGIC), 0)
     if next(reader.records, None) is None:
         yield UnreadablePart(f"only the first {MAX_RECORDS} records are read")
@@ -37,7 +37,7 @@ def items(bag: Buffer) -> Iterator[Item]:
     yield from topics.pending()
 
 
-class _Reader:
+class _McapReader:
     def __init__(self, topics: BagTopics) -> None:
         self._topics = topics
         self._tries = iter(range(MAX_TRIES))

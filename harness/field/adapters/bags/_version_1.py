@@ -31,14 +31,14 @@ _Record = tuple[dict[str, bytes], bytes, int]
 
 def items(bag: Buffer) -> Iterator[Item]:
     topics = BagTopics()
-    reader = _Reader(topics)
+    reader = _BagVersion1Reader(topics)
     yield from reader.items(bag, len(MAGIC), 0)
     if next(reader.records, None) is None:
         yield UnreadablePart(f"only the first {MAX_RECORDS} records are read")
     yield from topics.pending()
 
 
-class _Reader:
+class _BagVersion1Reader:
     def __init__(self, topics: BagTopics) -> None:
         self._topics = topics
         self._tries = iter(range(MAX_TRIES))

@@ -8,8 +8,8 @@ from typing import Any
 from markupsafe import Markup
 
 from harness.archive.exports import Export
-from harness.field.depot.consolidation import Consolidation
-from harness.field.depot.depot_reconcile import Reconciliation
+from harness.field.depot.consolidation import MergedRecord
+from harness.field.depot.depot_reconcile import ReconciledExports
 from harness.field.depot.page import _holdings, _position_map, _time_chart
 from harness.field.depot.record_lines import Block
 from harness.field.depot.record_outputs import (
@@ -38,7 +38,7 @@ MAX_TREE_BLOCKS = 10_000
 MAX_TITLE = 100
 
 
-def draw(record: Consolidation, reconciliation: Reconciliation | None = None) -> str:
+def draw(record: MergedRecord, reconciliation: ReconciledExports | None = None) -> str:
     """Return the page of a merged record as HTML."""
     header = record.header
     ink = inks(header.roster)
@@ -87,7 +87,7 @@ def draw(record: Consolidation, reconciliation: Reconciliation | None = None) ->
     )
 
 
-def _title(record: Consolidation) -> str:
+def _title(record: MergedRecord) -> str:
     """Return the data of the inception block if they are readable text, otherwise a title with the hash of that
     block.
     """
@@ -97,7 +97,7 @@ def _title(record: Consolidation) -> str:
     return f"Mission {record.header.inception.block_hash[:12]}"
 
 
-def _headline(record: Consolidation) -> tuple[str, str]:
+def _headline(record: MergedRecord) -> tuple[str, str]:
     """Return a short headline, and the name of its style."""
     losses = []
     if record.missing:
@@ -111,7 +111,7 @@ def _headline(record: Consolidation) -> tuple[str, str]:
     return "no known losses", "holds"
 
 
-def _summary(record: Consolidation, when: _time_chart.TimeSpan | None) -> list[str]:
+def _summary(record: MergedRecord, when: _time_chart.TimeSpan | None) -> list[str]:
     header = record.header
     parts = [f"inception block {header.inception.block_hash[:12]}"]
     if when is not None:
@@ -120,7 +120,7 @@ def _summary(record: Consolidation, when: _time_chart.TimeSpan | None) -> list[s
     return parts
 
 
-def _figures(record: Consolidation, single_copies: list[str]) -> list[tuple[str, str]]:
+def _figures(record: MergedRecord, single_copies: list[str]) -> list[tuple[str, str]]:
     header = record.header
     building = sum(block.line.events for block in record.unfinished)
     figures: list[tuple[str, int | str]] = [
@@ -137,7 +137,7 @@ def _figures(record: Consolidation, single_copies: list[str]) -> list[tuple[str,
 
 
 def _trees(
-    record: Consolidation, reconciliation: Reconciliation | None, ink: Mapping[int, AgentColours]
+    record: MergedRecord, reconciliation: ReconciledExports | None, ink: Mapping[int, AgentColours]
 ) -> list[tuple[str, Markup]] | None:
     """Return pictures of the chains before and after the reconcile, or None if there are too many blocks for a
     picture.
@@ -151,11 +151,11 @@ def _trees(
     return drawn
 
 
-def _tree(exports: Mapping[int, Export], record: Consolidation, ink: Mapping[int, AgentColours], key: str) -> Markup:
+def _tree(exports: Mapping[int, Export], record: MergedRecord, ink: Mapping[int, AgentColours], key: str) -> Markup:
     return ChainTreePicture(exports, ink, key, record.names).draw("abridged")
 
 
-def _vehicles(record: Consolidation, ink: Mapping[int, AgentColours]) -> list[dict[str, Any]]:
+def _vehicles(record: MergedRecord, ink: Mapping[int, AgentColours]) -> list[dict[str, Any]]:
     """Return a table row for each export, and for each vehicle without one."""
     rows: list[dict[str, Any]] = [
         {

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from harness.field.depot.consolidation import Consolidation, RecordedBlock
+from harness.field.depot.consolidation import MergedRecord, RecordedBlock
 from harness.present import svg
 from harness.present.svg import n
 
@@ -38,7 +38,7 @@ PLACES = {
 }
 
 
-def draw(record: Consolidation) -> Markup:
+def draw(record: MergedRecord) -> Markup:
     """Draw the columns in groups: blocks in all chains, in some chains, in no chain, and lost blocks."""
     columns = _columns(record)
     groups = [(group, list(members)) for group, members in groupby(columns, key=lambda column: column[0])]
@@ -94,7 +94,7 @@ class _BlockRange(NamedTuple):
     names: str
 
 
-def _columns(record: Consolidation) -> list[Column]:
+def _columns(record: MergedRecord) -> list[Column]:
     columns = [(_group_of(block), block.line.name, _places(block)) for block in record.blocks]
     columns += [("lost", lost.block or "", {}) for lost in record.lost_blocks]
     order = list(GROUPS)

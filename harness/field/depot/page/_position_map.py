@@ -32,7 +32,7 @@ _WIDTH, _HEIGHT = 900, 560
 
 @dataclass(frozen=True)
 class EventMap:
-    """A map, and sentences about events that it omits."""
+    """A map of the positions in events, and sentences about omitted events."""
 
     drawing: Markup
     notes: list[str]
@@ -50,7 +50,7 @@ def draw(
 
     There is at least one position.
     """
-    field = _Field([*tracks, *flown])
+    field = _MetricProjection([*tracks, *flown])
     paths = {track.agent_id: [field.fix(at_us, position) for at_us, position in track.fixes] for track in tracks}
     flown_paths = [[field.fix(at_us, position) for at_us, position in track.fixes] for track in flown]
     far_positions = field.far_positions
@@ -87,7 +87,7 @@ def draw(
     return EventMap(drawing, notes)
 
 
-class _Field:
+class _MetricProjection:
     """Converts positions to metres north and east of the median of all positions."""
 
     def __init__(self, tracks: Sequence[EventTrack]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from markupsafe import Markup
 
-from harness.field.depot.consolidation import Consolidation, RecordedBlock, events_in
+from harness.field.depot.consolidation import MergedRecord, RecordedBlock, events_in
 from harness.present import svg, text
 from harness.present.colours import AgentColours
 from harness.present.svg import n
@@ -35,7 +35,7 @@ class TimeSpan:
     outside: int
 
 
-def time_span_of(record: Consolidation) -> TimeSpan | None:
+def time_span_of(record: MergedRecord) -> TimeSpan | None:
     """Return the interval of nearly all events, or None if there are no events."""
     times = sorted(timestamp_us for block in record.blocks for timestamp_us, *_ in events_in(block.event_data))
     if not times:
@@ -62,7 +62,7 @@ Mark = tuple[int, str]
 
 
 def draw(
-    record: Consolidation,
+    record: MergedRecord,
     time_span: TimeSpan,
     ink: Mapping[int, AgentColours],
     marks: Mapping[int, Sequence[Mark]],
@@ -111,7 +111,7 @@ def _axis(axis: svg.Axis, top: float, bottom: float) -> Markup:
 def _lane(
     agent_id: int,
     blocks: Sequence[RecordedBlock],
-    record: Consolidation,
+    record: MergedRecord,
     time_span: TimeSpan,
     axis: svg.Axis,
     top: float,
@@ -176,7 +176,7 @@ def shade(holders: int, vehicles: int) -> int:
 
 
 def _boxes(
-    blocks: Sequence[RecordedBlock], record: Consolidation, time_span: TimeSpan, axis: svg.Axis, top: float
+    blocks: Sequence[RecordedBlock], record: MergedRecord, time_span: TimeSpan, axis: svg.Axis, top: float
 ) -> Markup:
     """Draw the blocks. Neighbouring blocks with the same shade are drawn as one box."""
     vehicles = len(record.collected.latest)
@@ -216,7 +216,7 @@ def _extent(block: RecordedBlock, time_span: TimeSpan, axis: svg.Axis) -> tuple[
 def _losses(
     agent_id: int,
     blocks: Sequence[RecordedBlock],
-    record: Consolidation,
+    record: MergedRecord,
     time_span: TimeSpan,
     axis: svg.Axis,
     top: float,

@@ -7,7 +7,7 @@ from typing import Any
 
 from harness.archive.exports import Export
 from harness.field.depot.collected_exports import collect_exports
-from harness.field.depot.consolidation import Consolidation, consolidate
+from harness.field.depot.consolidation import MergedRecord, consolidate
 from ucp.agent import Agent
 from ucp.block import Block
 from ucp.events import LoggableEvent
@@ -60,7 +60,7 @@ def write(directory: Path, *documents: Mapping[str, Any]) -> Path:
     return directory
 
 
-def consolidated(directory: Path, *documents: Mapping[str, Any]) -> Consolidation:
+def consolidated(directory: Path, *documents: Mapping[str, Any]) -> MergedRecord:
     return consolidate(collect_exports([write(directory, *documents)]))
 
 
@@ -68,5 +68,5 @@ def write_exports(directory: Path, exports: Mapping[int, Export]) -> Path:
     return write(directory, *(export.model_dump(mode="json", by_alias=True) for export in exports.values()))
 
 
-def names(record: Consolidation) -> list[str]:
+def names(record: MergedRecord) -> list[str]:
     return [block.line.name for block in record.blocks]

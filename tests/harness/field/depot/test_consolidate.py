@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from harness.archive.exports import Export, read_export
 from harness.errors import ExportError, FieldError
 from harness.field.depot.collected_exports import collect_exports
-from harness.field.depot.consolidation import Consolidation, consolidate
+from harness.field.depot.consolidation import MergedRecord, consolidate
 from harness.field.depot.depot_reconcile import reconcile
 from harness.field.depot.record_lines import Block, ConsolidatedLine, Event, Header, MissingItem, ReconcileResult
 from harness.field.depot.record_outputs import in_words, lines
@@ -31,7 +31,7 @@ def read(text: str) -> list[Any]:
     return [ConsolidatedLine.model_validate_json(line).root for line in text.splitlines()]
 
 
-def written(record: Consolidation) -> list[Any]:
+def written(record: MergedRecord) -> list[Any]:
     return read("".join(lines(record)))
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from harness.archive.exports import Export
 from harness.errors import RunDirectoryError
-from harness.field.depot.mission_comparison import Comparison, compare
+from harness.field.depot.mission_comparison import MissionComparison, compare
 from harness.field.depot.mission_files import Manifest, MissionFileError, MissionPlan, write
 from tests.harness.command import harness, sentences
 from tests.harness.virtual import scenario
@@ -38,7 +38,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
     return path
 
 
-def sentences_of(comparison: Comparison) -> list[str]:
+def sentences_of(comparison: MissionComparison) -> list[str]:
     return [str(difference) for difference in comparison.differences]
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from harness.archive.exports import Export
 from harness.field.depot.collected_exports import collect_exports
-from harness.field.depot.consolidation import Consolidation, consolidate
+from harness.field.depot.consolidation import MergedRecord, consolidate
 from harness.field.depot.depot_reconcile import reconcile
 from harness.field.depot.page import draw
 from tests.harness.commands.test_chain_command import fly_vehicles
@@ -22,7 +22,7 @@ WIDE, NARROW = 1280, 390
 
 
 @pytest.fixture(scope="module")
-def consolidated_flight(tmp_path_factory: pytest.TempPathFactory) -> Consolidation:
+def consolidated_flight(tmp_path_factory: pytest.TempPathFactory) -> MergedRecord:
     """Merge the exports of four vehicles. One has no export, and one lost two blocks and holds one on its stack."""
     directory = tmp_path_factory.mktemp("home")
     for path in write_flown(fly_vehicles(4, 700), directory):
@@ -44,7 +44,7 @@ def consolidated_flight(tmp_path_factory: pytest.TempPathFactory) -> Consolidati
     return consolidate(collect_exports([directory]))
 
 
-def test_page_agrees_with_the_record(consolidated_flight: Consolidation) -> None:
+def test_page_agrees_with_the_record(consolidated_flight: MergedRecord) -> None:
     page = Reader(draw(consolidated_flight, reconcile(consolidated_flight)))
     headings = (
         "Collected exports",
@@ -70,7 +70,7 @@ def test_page_agrees_with_the_record(consolidated_flight: Consolidation) -> None
         assert block.line.name in page.text
 
 
-def test_page_loads_no_resources(consolidated_flight: Consolidation) -> None:
+def test_page_loads_no_resources(consolidated_flight: MergedRecord) -> None:
     page = Reader(draw(consolidated_flight))
     tags = [tag for tag, _ in page.elements]
     assert "script" not in tags
@@ -124,7 +124,7 @@ def test_page_stays_small_with_many_columns(tmp_path: Path) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [NARROW, WIDE])
 def test_page_renders_completely_without_console_messages(
-    browser: Browser, consolidated_flight: Consolidation, tmp_path: Path, width: int, scheme: Literal["light", "dark"]
+    browser: Browser, consolidated_flight: MergedRecord, tmp_path: Path, width: int, scheme: Literal["light", "dark"]
 ) -> None:
     page = tmp_path / "mission.html"
     page.write_text(draw(consolidated_flight, reconcile(consolidated_flight)), encoding="utf-8")

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from harness.archive.exports import Export
-from harness.field.depot.consolidation import Consolidation
+from harness.field.depot.consolidation import MergedRecord
 from harness.field.depot.depot_reconcile import reconcile
 from harness.field.depot.record_outputs import lines
 from harness.run.simulate import simulate
@@ -86,7 +86,7 @@ def events_held(exports: dict[int, Export]) -> list[tuple[int, bytes]]:
     return sorted((agent_id, event.encode()) for agent_id, event in held)
 
 
-def events_on_record(record: Consolidation) -> list[tuple[int, bytes]]:
+def events_on_record(record: MergedRecord) -> list[tuple[int, bytes]]:
     return sorted((block.line.agent_id, event.encode()) for block in record.blocks for event in block.events)
 
 
