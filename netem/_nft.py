@@ -232,7 +232,7 @@ def _loss_rules(chain: str, port: str, loss: float) -> list[dict[str, Any]]:
 
 
 def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
-    """Yield each port in a verdict map, with the chain of rules for its packets."""
+    """Yield each port in a verdict map of nftables, with the chain of rules for the packets of this port."""
     for expressions in rules:
         for expression in expressions:
             if "vmap" in expression:
@@ -247,7 +247,7 @@ def _only_mark(rules: list[list[dict[str, Any]]]) -> int | None:
 
 
 def _loss(rules: list[list[dict[str, Any]]]) -> float:
-    """Return the loss rate that these rules cause."""
+    """Return the loss rate that these nftables rules cause."""
     for expressions in rules:
         if any("drop" in expression for expression in expressions):
             matches = [expression["match"] for expression in expressions if "match" in expression]

@@ -89,7 +89,8 @@ class LiveCapture:
         raise self._ended(await self._process.wait())
 
     async def stop(self) -> dict[int, dict[str, int]]:
-        """Finish the files. Return for each vehicle the number of frames, and the number of those that the file lacks.
+        """Finish the capture files. Return for each vehicle the number of frames, and the number of frames missing in
+        its file.
 
         Dropped frames are in no file. Raises LiveCaptureError if the capture failed.
         """

@@ -1,4 +1,4 @@
-"""Take over broadcasts from the virtual switch, and deliver them one by one.
+"""Take broadcasts out of the virtual switch before their delivery, and deliver them one by one.
 
     relay = Relay([1, 2, 3])        in the lab's own network
     relay.open()                    the switch no longer floods broadcasts to these vehicles

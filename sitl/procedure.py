@@ -54,7 +54,7 @@ class PilotProcedure(Protocol):
 
 
 class ArmingPreparation:
-    """The steps before arming, until all of them have stayed complete for READY_FOR_S seconds."""
+    """The steps before arming. The preparation ends when all steps have stayed complete for READY_FOR_S seconds."""
 
     purpose = "get ready"
 

@@ -259,5 +259,5 @@ class ClientChannel:
 
 
 def _seventh(message: Any) -> float:
-    """Return parameter 7 of a command, the altitude. In a COMMAND_INT it is called z."""
+    """Return parameter 7 of a command, the altitude, which is called z in a COMMAND_INT."""
     return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

@@ -37,7 +37,7 @@ class HomeOffset(NamedTuple):
     heading_deg: float | None = None
 
     def of(self, home: Home) -> Home:
-        """Return the place at this offset from `home`. Raises VehicleError if it is not on Earth."""
+        """Return the place at this offset from `home`. Raises VehicleError if the place is not on Earth."""
         if not all(math.isfinite(part) and abs(part) <= MAX_OFFSET_M for part in self[:3]):
             raise PlaceError(f"an offset in metres is at most {MAX_OFFSET_M:g} each way")
         there = home.offset(self.north_m, self.east_m)

@@ -186,7 +186,7 @@ class RunArchive:
         return self._read_traces[0]
 
     def trace_lines(self, agent_id: int) -> Iterator[HandlerRunLine]:
-        """Yield the trace lines with handler runs of an agent. Raises RunDirectoryError at a damaged line."""
+        """Yield the lines with handler runs in the trace of an agent. Raises RunDirectoryError at a damaged line."""
         assert self.directory is not None
         return read_trace_lines(trace_file(agents_directory(self.directory), agent_id))
 

@@ -158,7 +158,7 @@ class RunDirectory:
 
 
 def claim(directory: Path, *inner: Path) -> None:
-    """Create the directory, or use an existing empty one. Then create the directories `inner` in it.
+    """Create the run directory with the directories `inner` in it, or use an existing empty directory.
 
     Raises RunDirectoryError if the directory cannot be made or is not empty.
     """

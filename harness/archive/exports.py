@@ -234,7 +234,7 @@ def read_export(path: Path) -> Export:
 
 
 def json_error(path: Path, error: ValueError) -> ExportError:
-    """Return the error for an export that is not JSON, or exceeds the limits of `parse_json`."""
+    """Return the error for an export that is not JSON or exceeds the limits of `parse_json`."""
     return ExportError(f"{path}: truncated or damaged: {json_problem(error)}; export it again")
 
 

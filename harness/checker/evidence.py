@@ -251,7 +251,7 @@ class Evidence:
 
     @property
     def missing(self) -> list[int]:
-        """The agents without an export. Killed agents are not included."""
+        """The agents without an export. Killed agents do not count."""
         return [agent for agent in self.roster or [] if agent not in self.exports and not self.was_killed(agent)]
 
     def was_killed(self, agent_id: int) -> bool:

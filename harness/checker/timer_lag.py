@@ -50,7 +50,7 @@ def _of_machine(trace: Trace, ended_s: float, late_s: float, lag: MeasuredLag | 
 
 
 def _votes(trace: Trace) -> Iterator[tuple[float, float]]:
-    """Yield the end and the duration of each vote. Votes that a reconcile interrupted are left out."""
+    """Yield the end and the duration of each vote, without the votes that a reconcile interrupted."""
     for life in trace.incarnations():
         began: float | None = None
         for _, run in life:

@@ -128,7 +128,7 @@ def _chain_hashes(model: ReferenceModel) -> list[bytes]:
 
 
 def _chain_below_top(model: ReferenceModel) -> bytes | None:
-    """Return the hash of the chain without its newest block."""
+    """Return the chain hash of the chain without its newest block."""
     hashes = _chain_hashes(model)
     return hashes[-2] if len(hashes) > 1 else None
 
@@ -393,7 +393,7 @@ def _next(candidate: Callable[[ReferenceModel], Block | None]) -> Callable[[Refe
 
 
 def _named_block(model: ReferenceModel) -> Block | None:
-    """Return the block that was named first in the answers of reconcile phase 2."""
+    """Return the first block that an answer of reconcile phase 2 named, or None."""
     named = [candidate for candidate in model.state.reconcile_response_dictionary if candidate != IS_TOP_OF_CHAIN]
     return model.blocks.get(named[0]) if _phase_two(model) and named else None
 

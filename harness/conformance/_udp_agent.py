@@ -284,7 +284,7 @@ class UdpAgent(AgentUnderTest):
         return self._mission_s(self.peer_socket.received[0][0]) if self.peer_socket.received else 0.0
 
     async def _give(self, action: Action) -> list[Any]:
-        """Give the input to the agent. After an event, return the deque in the agent's export."""
+        """Give the input to the agent. After the input of an event, return the deque in the agent's export."""
         match action:
             case PeerDatagram():
                 self.peer_socket.send(action.data)

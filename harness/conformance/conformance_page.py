@@ -57,7 +57,7 @@ def read_agents(path: Path) -> dict[str, list[str]]:
 
 
 def to_html(results: Mapping[str, ConformanceResults | str]) -> str:
-    """Return the HTML page. An agent that could not be tested has a sentence in place of results."""
+    """Return the conformance results as an HTML page. Agents that could not be tested have a sentence instead."""
     tested = {name: result for name, result in results.items() if isinstance(result, ConformanceResults)}
     rows = {name: {row.algorithm: row for row in result.rows()} for name, result in tested.items()}
     numbers = [number for number in (*sorted(TITLES), FURTHER_CHECKS) if any(number in each for each in rows.values())]

@@ -53,8 +53,8 @@ class RunOutcome:
         self.exit_status = error.exit_status
 
     def record(self, change: dict[str, Any]) -> None:
-        """Record a change. A movement of vehicles is recorded only if it changes which of them can receive each
-        other.
+        """Record a change of the network, or a fault. A movement of vehicles is recorded only if it changes which of
+        them can receive each other.
         """
         if change["what"] == RANGE and self.network and _same_connections(change, self.network[-1]):
             return

@@ -49,7 +49,7 @@ def plot(view: Iterable[Markup], pinned: Iterable[Markup], height: float, end_s:
 
 
 def pin(at_s: float, end_s: float, y: float, shape: Markup) -> Markup:
-    """Place a shape at this mission second, independent of the zoom."""
+    """Place a shape at this mission second, and keep its size when the user zooms."""
     return Markup('<svg class="pin" data-at="{}" x="{}%" y="{}">{}</svg>').format(
         format_number(at_s), format_number(100 * at_s / end_s), n(y), shape
     )

@@ -200,7 +200,9 @@ def _halves(order: str, value: bytes) -> int:
 
 
 def _options(order: str, data: bytes) -> dict[int, bytes]:
-    """Return the options by their code. Of several options with the same code, the first counts."""
+    """Return the options of a block in a pcapng file by their code. Of several options with the same code, the first
+    counts.
+    """
     options: dict[int, bytes] = {}
     position, head = 0, struct.Struct(order + "2H")
     while position + head.size <= len(data):

@@ -69,8 +69,8 @@ def _state(export: Export) -> StateSummary:
 
 
 def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
-    """Return the states in which the agent may have been at its export. There are several if handlers ran at the same
-    time.
+    """Return the states in which the agent may have been at its export. Handlers that ran at the same time lead to
+    several states.
     """
     at_s = mission_s(export.exported_at_us, trace.header)
     if at_s is None:

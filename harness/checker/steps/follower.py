@@ -222,7 +222,9 @@ class StepComparer:
         return self._play_lost(self._on_message[type(message)], at_s, sender, message)
 
     def play_lost_expiry(self, timer_name: str, at_s: float) -> bool:
-        """Let a timer expire that has no line in the trace. Return true if it was due and its line could be lost."""
+        """Let a timer expire whose expiry has no line in the trace. Return true if the timer was due and the line could
+        be lost.
+        """
         timer = self._timers[timer_name]
         if timer.deadline is None or timer.deadline > self._header.local(at_s) + self._header.early_s:
             return False
@@ -348,7 +350,7 @@ class StepComparer:
         ]
 
     def _callback_is_lost(self, line: int, run: HandlerRun, due: Iterable[Timer]) -> bool:
-        """Report timers that expired, but that the agent stopped without running their handlers.
+        """Report timers that the agent stopped after their expiry without running their handlers.
 
         The lost callback is the cause of the differences that follow. Returns whether there is one.
         """

@@ -55,7 +55,7 @@ async def _no_export(bench: CaseBench) -> None:
 
 
 async def _commit(agent: BenchAgent, count: int) -> list[Block]:
-    """Let the agent commit blocks of another agent, and return these blocks."""
+    """Make the agent commit blocks of another agent, and return these blocks."""
     blocks, top = [], INCEPTION
     for number in range(count):
         block = Block(PEERS[0], number + 1, b"block %d" % number)

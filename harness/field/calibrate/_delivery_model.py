@@ -205,7 +205,7 @@ def _likelihood(rows: Iterable[_TransmissionCluster], values: Vector) -> float:
 
 
 def _score(rows: Iterable[_TransmissionCluster], values: Vector, free: Sequence[int]) -> tuple[Vector, list[Vector]]:
-    """Return the score vector and the expected information matrix for the free parameters."""
+    """Return the score vector and the expected information matrix of the likelihood, for the free parameters."""
     score = [0.0] * len(free)
     information = [[0.0] * len(free) for _ in free]
     for row in rows:

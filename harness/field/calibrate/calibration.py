@@ -270,7 +270,7 @@ def calibrate(paths: Sequence[Path]) -> Calibration:
 
 def validate(attempts: Sequence[TransmissionAttempt]) -> ModelValidation | None:
     """Fit the model to the beginning of the flight and predict the end. Return None if the beginning does not determine
-    it.
+    the model.
     """
     first_s, last_s = min(each.at_s for each in attempts), max(each.at_s for each in attempts)
     until_s = first_s + TRAINING_SHARE * (last_s - first_s)

@@ -115,7 +115,7 @@ class CollectedExports:
 
     @property
     def claims(self) -> dict[str, str]:
-        """The correct hash of each block with a wrong hash in its file, with that wrong hash.
+        """The correct hash of each block whose hash in its file is wrong, together with this wrong hash.
 
         A block is not wrong if another export has it under its true hash, or if its agent completed it.
         """

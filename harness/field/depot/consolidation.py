@@ -245,7 +245,7 @@ def _holdings(collected: CollectedExports) -> dict[str, list[Holding]]:
 
 
 def _add_unfinished(recorded_blocks: list[RecordedBlock], collected: CollectedExports) -> None:
-    """Add the blocks under construction, either as separate blocks or to a block that begins with the same events."""
+    """Add each unfinished block to a block that begins with the same events, or as a separate block."""
     building = [
         (base64.b64decode(export.current_block.event_data), export)
         for export in (read_export.export for read_export in collected.read_exports)

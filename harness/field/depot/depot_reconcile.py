@@ -71,7 +71,7 @@ def reconcile(record: MergedRecord, report_progress: Callable[[str], None] = lam
 
 
 async def _play(swarm: RestoredSwarm, agents_with_deque: Iterable[int]) -> int:
-    """Simulate the reconcile. Return the number of rounds, in each of which every agent reconciles once."""
+    """Simulate the final reconcile. Return the number of rounds, in each of which every agent reconciles once."""
     first, *_ = timeline_of(swarm.scenario)
     await swarm.begin(first)
     await swarm.until_idle(LIMIT_S)

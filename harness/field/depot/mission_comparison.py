@@ -176,7 +176,7 @@ def read(path: Path) -> ComparedFile:
 
 
 def _beginning(path: Path) -> dict[str, Any]:
-    """Return the JSON object in the file, or in its first line."""
+    """Return the JSON object in the first line of the file, or the one that the whole file consists of."""
     try:
         with open_trace(path) as file:
             first = file.readline(MAX_LINE_BYTES)

@@ -58,7 +58,7 @@ Fixes = Sequence[tuple[int, LoggedPosition]]
 
 @dataclass(frozen=True)
 class MatchedLog:
-    """A vehicle in a flight log, and its agent. `agent_id` is None if it carried none of the known agents.
+    """A vehicle in a flight log, and its agent. `agent_id` is None if the vehicle carried none of the known agents.
 
     `evidence` completes "is of agent 10 by ...", or "matches no agent: ...". `clock_ahead_s` is the time on the agent's
     clock minus GPS time, None if unknown.

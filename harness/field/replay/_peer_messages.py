@@ -44,8 +44,8 @@ class PeerMessages:
                 self._received.setdefault((trigger.message, trigger.sequence), []).append(number)
 
     def runs_that_sent(self, message: object, sequence: object) -> list[int]:
-        """Return the positions of runs that sent a message of this type and number. There is at most one between
-        restarts.
+        """Return the positions of handler runs that sent a message of this type and number. Between two restarts there
+        is at most one.
         """
         return self._sent.get((message, sequence), [])
 

@@ -99,7 +99,7 @@ class StepText:
         return shown(f"  ✘ {whose}{deviation.difference(self._names.of)}", style="bold red")
 
     def side_by_side(self, deviation: StepDeviation) -> Table | Text:
-        """Return a table of the recorded step and the step of the reference. Differences are marked."""
+        """Return a table of the recorded step and the step of the reference, with marked differences."""
         if deviation.run is None or deviation.expected is None:
             return self.deviation(deviation)
         table = Table("", "the agent's record", "the reference", box=None, padding=(0, 2, 0, 0))

@@ -75,8 +75,8 @@ class RecordedBlocks(BlockIndex):
                 self.add(block)
 
     def _sources(self) -> Iterator[Iterator[Block]]:
-        """Yield the blocks from each source of blocks: the trace, the exports, and the traces of the flight. The
-        fastest source is first.
+        """Yield the blocks from the trace, from the exports, and from the traces of the flight. The fastest source is
+        first.
         """
         yield _blocks_of(self._record.trace)
         yield self._of_exports()

@@ -14,7 +14,7 @@ _NAMES = ("mission.json", "control", "log", "trace.jsonl", "chain.json", "store"
 
 
 class OwnFolders:
-    """The folders of the agents of a run. `agents` is the common directory."""
+    """The folders of the agents of a run in containers. `agents` is the directory that contains all of them."""
 
     def __init__(self, agents: Path) -> None:
         self._agents = agents

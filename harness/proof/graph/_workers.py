@@ -314,7 +314,8 @@ class Workers:
     def _answers(
         self, give: Give, states: Sequence[State], check: Check, first: int = 0
     ) -> Iterator[tuple[_WorkerHandle, int, SuccessorBatch | NeededVotes]]:
-        """Yield each answer in the order of the tasks, with its worker and the number of its first state.
+        """Yield the answers of the workers in the order of the tasks, each with its worker and the number of its first
+        state.
 
         `states` may grow meanwhile.
         """

@@ -340,7 +340,9 @@ class ModelSwarm:
         return tuple(running)
 
     def _ended(self, locals_: tuple[int, ...], actions: Sequence[AgentAction]) -> tuple[int, ...]:
-        """Return the numbers of the expired timers in the list of the swarm's timers, counted from 1."""
+        """Return the numbers of the expired timers. Each number is a position in the list of the swarm's timers,
+        counted from 1.
+        """
         ended = [(action.place, action.number) for action in actions if action.what == "timer"]
         running = self._running(locals_)
         return tuple(sorted([running.index(timer) + 1 for timer in ended]))

@@ -13,7 +13,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.traces import Trace, read_trace, why_not_a_trace
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import INTERRUPTED, VIOLATED, WRONG_REQUEST
-from harness.proof.specification._recorded_lives import ChainNumbers, EncodedIncarnation, lives, module
+from harness.proof.specification._recorded_incarnations import ChainNumbers, EncodedIncarnation, lives, module
 from harness.proof.specification._spec_states import readings, unspecified
 from harness.proof.specification._tlc import CheckerError, command, in_tla
 from harness.proof.specification._tlc import checked as looked_at

@@ -89,7 +89,7 @@ class NetworkAndVehicles:
         self._tracks = _TimedFile(directory / TRACKS_FILE, TrackLine, self._play_positions)
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Read up to mission second `until_s`, but at most `at_most` lines of each file.
+        """Read the growing files up to mission second `until_s`, but at most `at_most` lines of each file.
 
         Return true if entries up to `until_s` remain.
         """

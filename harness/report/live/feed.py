@@ -136,7 +136,7 @@ class ChangeFeed:
         return has_vehicles and record.backend is not None and not in_virtual_time(record.backend)
 
     def poll(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
-        """Return the new changes up to a mission second, and true if more remain up to that time."""
+        """Return the new changes up to a mission second, and true if more changes up to that second remain."""
         more = self._surroundings.read(until_s, LINES_AT_ONCE)
         for course in self._courses:
             more |= course.read(until_s, LINES_AT_ONCE)
@@ -166,7 +166,7 @@ class ChangeFeed:
 
     @property
     def over(self) -> bool:
-        """True if run.json contains the result and the verdicts of the run."""
+        """True if run.json contains the verdicts of the run, or states that the run failed."""
         stamp = self._stamp()
         if stamp != self._record_stamp:
             self._record_stamp = stamp

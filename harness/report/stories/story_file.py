@@ -67,7 +67,7 @@ class Story:
         return self.scenario.model_copy(update={"network": network})
 
     def with_answers(self, answers: Sequence[Sequence[str]]) -> str:
-        """Return the text of the file with these reactions, one list of lines for each section."""
+        """Return the text of the story file with these reactions: one list of lines for each section."""
         after = {section.line: answer for section, answer in zip(self.sections, answers, strict=True)}
         lines: list[str] = []
         for number, line in enumerate(self.lines):

@@ -90,7 +90,9 @@ class Shrinker:
                 continue
 
     def fewest(self, items: Sequence[T], with_items: Callable[[Sequence[T]], Document]) -> None:
-        """Remove ever smaller parts of `items` until no part can be removed (ddmin, Zeller 2002)."""
+        """Remove ever smaller parts of `items`, until each further removal would lose the violation (ddmin, Zeller
+        2002).
+        """
         kept = list(items)
         if not kept or self.first([with_items([])]) is not None:
             return

@@ -261,7 +261,7 @@ class ForeignAgent:
         return command_answer
 
     def _give_input(self, line: str, what: str, now: float) -> ForeignAnswer:
-        """Give an input to the agent, and store its outputs. If the agent refuses the input, there are no outputs."""
+        """Give an input to the agent, and store the outputs. An input that the agent refuses has no outputs."""
         answer = self._exchange(line, what, now)
         if self._datagrams_sent.add(len(answer.sent), now) > MAX_SENT_PER_S:
             raise self._failure("crashed", f"sent more than {MAX_SENT_PER_S} datagrams within mission second {now:.0f}")

@@ -286,7 +286,7 @@ class ProgramPool:
         return None
 
     def give_back(self, program: LineProgram) -> None:
-        """Make the program available again. If it still has to write an answer, end it."""
+        """Return the program to the pool. End a program that still has to write an answer."""
         with self._lock:
             self._taken.discard(program)
             if program.owes_an_answer:

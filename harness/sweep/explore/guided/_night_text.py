@@ -18,7 +18,7 @@ CLEAR_LINE = "\r\x1b[2K"
 
 @contextlib.contextmanager
 def watching(console: Console) -> Iterator[NightProgress]:
-    """Yield functions that print the progress.
+    """Yield functions that print the progress of a night.
 
     On a terminal, the progress is one line that is redrawn. Elsewhere it is a line at growing intervals.
     """

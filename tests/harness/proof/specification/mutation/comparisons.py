@@ -19,7 +19,7 @@ from harness.archive.vocabulary import BRANCHES
 from harness.proof.bounds import Bounds
 from harness.proof.graph._exploration import explore
 from harness.proof.model._global_states import ModelSwarm
-from harness.proof.specification import RunTraces, _recorded_lives, _spec_states, _tlc, _validate
+from harness.proof.specification import RunTraces, _recorded_incarnations, _spec_states, _tlc, _validate
 from harness.proof.specification._second_opinion import _config
 from tests.harness.checker.reference import random_inputs
 from tests.harness.checker.reference.random_inputs import LIFE, ROSTER
@@ -215,12 +215,12 @@ class RandomInputs(Inputs):
 @contextmanager
 def _all_tallies() -> Iterator[None]:
     """Compare the tally after each handler run. Other agents need not keep one that counts nothing at the moment."""
-    before = _recorded_lives.COUNTING
-    _recorded_lives.COUNTING = frozenset(branch for branches in BRANCHES.values() for branch in branches)
+    before = _recorded_incarnations.COUNTING
+    _recorded_incarnations.COUNTING = frozenset(branch for branches in BRANCHES.values() for branch in branches)
     try:
         yield
     finally:
-        _recorded_lives.COUNTING = before
+        _recorded_incarnations.COUNTING = before
 
 
 def _settings_words(settings: Mapping[str, Any]) -> list[str]:

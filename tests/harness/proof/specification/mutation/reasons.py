@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from harness.proof.specification import _tlc, _validate
-from harness.proof.specification._recorded_lives import module
+from harness.proof.specification._recorded_incarnations import module
 from harness.proof.specification._second_opinion import _config
 from tests.harness.proof.specification.mutation.comparisons import Inputs, States
 
