@@ -19,7 +19,7 @@ from typing import Any
 
 from harness.errors import HarnessError
 from harness.field.calibrate._delivery_model import DeliveryModel
-from harness.field.calibrate.calibration import Calibration, calibrate, model_of
+from harness.field.calibrate.calibration import CalibrationResult, calibrate, model_of
 from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.scenario import Scenario
@@ -53,14 +53,14 @@ def scenario_of(number: int, agents: int = 5, duration_s: float = 1200.0) -> tup
     return scenario, model_of(LogDistance(**log_distance), loss)
 
 
-def calibrated(number: int, directory: Path, **options: Any) -> tuple[Calibration, DeliveryModel]:
+def calibrated(number: int, directory: Path, **options: Any) -> tuple[CalibrationResult, DeliveryModel]:
     """Simulate a flight and calibrate it. Return the calibration and the true parameters."""
     scenario, truth = scenario_of(number, **options)
     record = run(Scenario.model_validate(scenario), number, directory, SilentProgress(), "sim").directory
     return calibrate([record]), truth
 
 
-def covered(calibration: Calibration, truth: DeliveryModel) -> dict[str, bool]:
+def covered(calibration: CalibrationResult, truth: DeliveryModel) -> dict[str, bool]:
     """Return, for each true parameter, true if its confidence interval contains it. The result is empty without a
     fit.
     """
@@ -70,7 +70,7 @@ def covered(calibration: Calibration, truth: DeliveryModel) -> dict[str, bool]:
     return {name: getattr(truth, name) in intervals[name] for name in ("range_m", "spread", "floor")}
 
 
-def _results(numbers: range) -> Iterator[tuple[int, Calibration, DeliveryModel]]:
+def _results(numbers: range) -> Iterator[tuple[int, CalibrationResult, DeliveryModel]]:
     for number in numbers:
         with TemporaryDirectory() as directory:
             try:

@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager
 
 from netem import _namespaces, addresses
 from netem._fabric_requests import address, bridge, default_route, forwarding, set_up, veth_pair
-from netem._netlink import Netlink, NetlinkRequest
+from netem._netlink import NetlinkRequest, NetlinkSocket
 from netem.errors import LabError
 
 BRIDGE = "air"
@@ -36,7 +36,7 @@ class VirtualSwitch:
     def __init__(self, vehicles: Sequence[int], networks: Mapping[int, int]) -> None:
         self.vehicles = tuple(vehicles)
         self.home = _namespaces.open_network()
-        self.netlink = Netlink()
+        self.netlink = NetlinkSocket()
         self._namespaces = dict(networks)
         _disable_ipv6()
         _bypass_firewall()
@@ -60,7 +60,7 @@ class VirtualSwitch:
         """Return the inode number of each vehicle's network namespace, by vehicle."""
         return {vehicle: os.fstat(namespace).st_ino for vehicle, namespace in self._namespaces.items()}
 
-    def _namespace(self, vehicle: int) -> Netlink:
+    def _namespace(self, vehicle: int) -> NetlinkSocket:
         """Create the network namespace of a vehicle unless it exists. Return a netlink socket inside it."""
         if vehicle in self._namespaces:
             _namespaces.enter_network(self._namespaces[vehicle])
@@ -69,7 +69,7 @@ class VirtualSwitch:
             self._namespaces[vehicle] = _namespaces.open_network()
         try:
             _disable_ipv6()
-            return Netlink()
+            return NetlinkSocket()
         finally:
             _namespaces.enter_network(self.home)
 

@@ -16,8 +16,8 @@ from netem._netlink import (
     RTM_NEWLINK,
     RTM_NEWROUTE,
     RTM_SETLINK,
-    Netlink,
     NetlinkRequest,
+    NetlinkSocket,
 )
 
 _IFINFOMSG = struct.Struct("=BxHiII")  # family, type, index, flags, mask of changed flags
@@ -91,7 +91,7 @@ def default_route(what: str, index: int) -> NetlinkRequest:
     )
 
 
-def forwarding(netlink: Netlink) -> set[int]:
+def forwarding(netlink: NetlinkSocket) -> set[int]:
     """Return the interface numbers of the ports on which the bridge forwards."""
     ports = netlink.dump("list the ports of the bridge", RTM_GETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, 0, 0, 0))
     return {_IFINFOMSG.unpack_from(port)[2] for port in ports if _forwards(port)}

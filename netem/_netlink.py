@@ -50,7 +50,7 @@ class NetlinkRequest:
     flags: int = 0
 
 
-class Netlink:
+class NetlinkSocket:
     """A NETLINK_ROUTE socket in the caller's network namespace."""
 
     def __init__(self) -> None:

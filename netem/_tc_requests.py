@@ -29,8 +29,8 @@ from netem._netlink import (
     RTM_NEWQDISC,
     RTM_NEWTCLASS,
     RTM_NEWTFILTER,
-    Netlink,
     NetlinkRequest,
+    NetlinkSocket,
 )
 from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkConditions
 
@@ -146,7 +146,7 @@ class TrafficControl:
     def reject_group(self, group: int) -> NetlinkRequest:
         return NetlinkRequest("delete filter fw", RTM_DELTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group))
 
-    def read_mark(self, netlink: Netlink) -> tuple[int, int] | None:
+    def read_mark(self, netlink: NetlinkSocket) -> tuple[int, int] | None:
         """Return the kind and group that the kernel assigns to packets that enter at this port."""
         for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_INGRESS, 0)):
             edit = _inside(parse(entry[_TCMSG.size :]), _OPTIONS, 3, 1, 2)
@@ -155,7 +155,7 @@ class TrafficControl:
                 return kind & 0xFFFF, group
         return None
 
-    def accepted_groups(self, netlink: Netlink) -> tuple[set[int], int]:
+    def accepted_groups(self, netlink: NetlinkSocket) -> tuple[set[int], int]:
         """Return the groups whose packets may leave at this port, and the number of dropped packets of other groups."""
         groups = set()
         cut = 0
@@ -169,7 +169,7 @@ class TrafficControl:
         return groups - {RELAYED}, cut
 
     @staticmethod
-    def classes(netlink: Netlink) -> dict[int, dict[int, TrafficClass]]:
+    def classes(netlink: NetlinkSocket) -> dict[int, dict[int, TrafficClass]]:
         """Return the traffic classes of all ports by interface number, from a single request."""
         classes: dict[int, dict[int, TrafficClass]] = {}
         for entry in netlink.dump("list qdiscs", RTM_GETQDISC, bytes(_TCMSG.size)):

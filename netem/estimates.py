@@ -36,7 +36,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Lateness:
+class MachineLateness:
     """The delays of the machine itself in seconds: of packets in a stream, and of timers."""
 
     way_s: Sequence[float]
@@ -52,7 +52,7 @@ class ReceivedStream:
 
     sent_s: Sequence[float]
     arrivals: Sequence[tuple[int, float]]
-    lateness: Lateness
+    lateness: MachineLateness
 
 
 _NOTHING = Estimate(0.0, 0.0, 0.0, 0)

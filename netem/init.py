@@ -37,7 +37,7 @@ _MAX_UNREAD = 64 << 20  # maximum of unread bytes for the orchestrator
 
 
 @dataclass
-class _Connection:
+class _OpeningConnection:
     """A TCP connection that is being opened for the harness."""
 
     request: int
@@ -60,7 +60,7 @@ class LabServer:
         self._receiver = MessageReceiver()
         self._unsent: deque[tuple[bytes, list[socket.socket]]] = deque()
         self._children: dict[int, subprocess.Popen[bytes]] = {}
-        self._connections: dict[int, _Connection] = {}
+        self._connections: dict[int, _OpeningConnection] = {}
         self._fabric: VirtualSwitch | None = None
         self._engine: Engine | None = None
         self._open = True
@@ -208,7 +208,7 @@ class LabServer:
             client = socket.socket()
         client.setblocking(False)
         deadline = time.monotonic() + message["timeout_s"]
-        connection = _Connection(message["id"], client, deadline)
+        connection = _OpeningConnection(message["id"], client, deadline)
         code = client.connect_ex((message["host"], message["port"]))
         if code != EINPROGRESS:
             self._answer_connection(connection, code)
@@ -216,14 +216,14 @@ class LabServer:
         self._connections[client.fileno()] = connection
         self._selector.register(client, selectors.EVENT_WRITE, lambda _: self._connected(connection))
 
-    def _connected(self, connection: _Connection, code: int | None = None) -> None:
+    def _connected(self, connection: _OpeningConnection, code: int | None = None) -> None:
         self._selector.unregister(connection.socket)
         del self._connections[connection.socket.fileno()]
         if code is None:
             code = connection.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         self._answer_connection(connection, code)
 
-    def _answer_connection(self, connection: _Connection, code: int) -> None:
+    def _answer_connection(self, connection: _OpeningConnection, code: int) -> None:
         if code == 0:
             self._send({"id": connection.request, "result": {}}, connection.socket)
         else:

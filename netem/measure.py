@@ -27,7 +27,7 @@ from netem import estimates
 from netem._distributions import SCALE, table
 from netem.conditions import NetworkConditions
 from netem.engine import RESOLUTION
-from netem.estimates import Estimate, Lateness, ReceivedStream
+from netem.estimates import Estimate, MachineLateness, ReceivedStream
 from netem.link import Delay, Distribution, GilbertElliott, LinkConditions
 
 PACKETS = 10_000
@@ -113,7 +113,7 @@ class EngineMeasurement:
 
     engine: str
     rows: tuple[AnswerRow, ...]
-    lateness: Lateness
+    lateness: MachineLateness
 
     @property
     def ok(self) -> bool:
@@ -134,7 +134,7 @@ def measure(
 ) -> EngineMeasurement:
     """Run the measurements, and repeat those with wrong results. Raises the errors of `observe`."""
     rows: list[AnswerRow] = []
-    late: list[Lateness] = []
+    late: list[MachineLateness] = []
     for study in studies:
         streams = observe(study, packets)
         late.append(next(iter(streams.values())).lateness)
@@ -149,7 +149,7 @@ def measure(
     ways, timers = (
         [*chain.from_iterable(values)] for values in zip(*((o.way_s, o.timers_s) for o in late), strict=True)
     )
-    return EngineMeasurement(engine, tuple(rows), Lateness(ways, timers))
+    return EngineMeasurement(engine, tuple(rows), MachineLateness(ways, timers))
 
 
 def _answer(question: MeasuredQuantity, streams: Mapping[tuple[int, int], ReceivedStream]) -> Estimate:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from netem import _probe
 from netem.engine import AppliedConditions
 from netem.errors import LabError
-from netem.estimates import Lateness, ReceivedStream
+from netem.estimates import MachineLateness, ReceivedStream
 from netem.lab import EngineName, Lab, LabProcess
 from netem.measure import DATA_BYTES, REFERENCE, NetworkStudy, Observer
 from netem.medium import Medium
@@ -50,7 +50,7 @@ def in_medium(seed: int) -> Observer:
             for sender in study.senders:
                 for receiver, delay_s in medium.draw(study.vehicles.index(sender), at_s, DATA_BYTES).to_all():
                     received_packets[sender, study.vehicles[receiver]].append((at_s + delay_s, number))
-        never = Lateness([0.0] * packets, [0.0] * packets)
+        never = MachineLateness([0.0] * packets, [0.0] * packets)
         return {
             link: ReceivedStream(sent_s, [(number, at_s) for at_s, number in sorted(arrivals)], never)
             for link, arrivals in received_packets.items()
@@ -124,7 +124,7 @@ async def _observe(
         for receiver in study.receivers:
             if receiver != sender:
                 arrivals = [(packet.number, packet.at_s) for packet in received_packets[sender, receiver]]
-                streams[sender, receiver] = ReceivedStream(sent_s, arrivals, Lateness(way_s, timers_s[sender]))
+                streams[sender, receiver] = ReceivedStream(sent_s, arrivals, MachineLateness(way_s, timers_s[sender]))
     return streams
 
 

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 from netem import addresses
 from netem._fabric import BRIDGE
 from netem._fabric_requests import flood_broadcasts
-from netem._netlink import Netlink
+from netem._netlink import NetlinkSocket
 from netem._tc_requests import RELAYED
 from netem.errors import NetlinkError
 
@@ -131,7 +131,7 @@ class Relay:
 
     def _flood(self, on: bool) -> None:
         ports = [(addresses.port(vehicle), index) for index, vehicle in self._ports.items() if vehicle in self._outputs]
-        with contextlib.closing(Netlink()) as netlink:
+        with contextlib.closing(NetlinkSocket()) as netlink:
             netlink.send([flood_broadcasts(port, index, on) for port, index in ports])
 
     def take(self) -> Iterator[ReceivedBroadcast]:

@@ -33,7 +33,7 @@ from dataclasses import dataclass, replace
 from errno import ENOENT
 
 from netem._fabric import VirtualSwitch
-from netem._netlink import Netlink, NetlinkRequest
+from netem._netlink import NetlinkRequest, NetlinkSocket
 from netem._tc_requests import MAX_KIND, TrafficClass, TrafficControl
 from netem.conditions import NetworkConditions
 from netem.engine import AppliedConditions, Engine, ReceiverFigures
@@ -76,7 +76,7 @@ class NetemEngine(Engine):
 
     def __init__(self, fabric: VirtualSwitch) -> None:
         super().__init__(fabric)
-        self._netlink: Netlink = fabric.netlink
+        self._netlink: NetlinkSocket = fabric.netlink
         self._ports = {vehicle: TrafficControl(fabric.port_index(vehicle)) for vehicle in self._vehicles}
         self._removed = {vehicle: _RemovedClassTotals() for vehicle in self._vehicles}
         self._kinds: _Numbers = {}

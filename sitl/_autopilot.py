@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl._failsafes import STATION, WIND, WIND_FROM, Failsafe, Failsafes
-from sitl._kinematics import FallSegment, LocalPlace, MotionState, PlannedMotion, RestSegment, Segment, end_of
+from sitl._kinematics import FallSegment, LocalPlace, MotionSegment, MotionState, PlannedMotion, RestSegment, end_of
 from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl.modes import BOOT_MODES, MODES
 from sitl.vehicle import READY_S, Home, VehicleType
@@ -273,7 +273,7 @@ class Autopilot:
 
     # Movements
 
-    def _begin(self, segments: Sequence[Segment], then: Callable[[], None]) -> None:
+    def _begin(self, segments: Sequence[MotionSegment], then: Callable[[], None]) -> None:
         """Begin a movement, and call `then` at its end."""
         self._course, self._then, self._goal = PlannedMotion(self.now_s, segments), then, None
 

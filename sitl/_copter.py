@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import NEAR_M, LocalPlace, MotionState, RestSegment, Segment, StraightLine, end_of
+from sitl._kinematics import NEAR_M, LocalPlace, MotionSegment, MotionState, RestSegment, StraightLine, end_of
 
 CRUISE_MS = 10.0  # WPNAV_SPEED
 CLIMB_MS = 2.5  # WPNAV_SPEED_UP
@@ -19,7 +19,7 @@ SPIN_UP_S = 3.0  # from arming to the first movement, measured
 
 
 @dataclass(frozen=True)
-class Copter:
+class CopterMotion:
     """The motion of a copter: it stops at each place, and flies straight to the next one.
 
     It waits `turning_s` before it leaves a place, and `settling_s` before it descends. The default values were measured
@@ -31,14 +31,14 @@ class Copter:
 
     cruise_ms = CRUISE_MS
 
-    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
+    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
         top = LocalPlace(start.north_m, start.east_m, max(start.up_m, altitude_m))
         spin_up = [RestSegment(start, SPIN_UP_S)] if start.up_m < NEAR_M else []
         return [*spin_up, StraightLine(start, top, CLIMB_MS, VERTICAL_ACCEL_MS2)]
 
     def go_to(
         self, start: MotionState, place: LocalPlace, speed_ms: float, before: LocalPlace | None = None
-    ) -> Sequence[Segment]:
+    ) -> Sequence[MotionSegment]:
         level_m = math.dist(start.point[:2], place[:2])
         climb_m = place.up_m - start.up_m
         length_m = math.hypot(level_m, climb_m)
@@ -54,14 +54,14 @@ class Copter:
 
     def loiter(
         self, start: MotionState, place: LocalPlace, speed_ms: float, seconds: float, after: LocalPlace | None = None
-    ) -> Sequence[Segment]:
+    ) -> Sequence[MotionSegment]:
         there = self.go_to(start, place, speed_ms)
         return [*there, RestSegment(end_of(there), seconds)]
 
-    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[Segment]:
+    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[MotionSegment]:
         there = self.go_to(start, place._replace(up_m=start.up_m), CRUISE_MS)
         above = end_of(there)
-        segments: list[Segment] = [*there, RestSegment(above, self.settling_s)]
+        segments: list[MotionSegment] = [*there, RestSegment(above, self.settling_s)]
         if above.up_m > LAND_SLOWLY_M:
             low = place._replace(up_m=LAND_SLOWLY_M)
             segments.append(StraightLine(above, low, DESCENT_MS, VERTICAL_ACCEL_MS2, to_ms=LANDING_MS))
@@ -69,7 +69,7 @@ class Copter:
         segments.append(StraightLine(end_of(segments), ground, LANDING_MS, VERTICAL_ACCEL_MS2, LANDING_MS, LANDING_MS))
         return [*segments, RestSegment(end_of(segments), 0.0)]
 
-    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
+    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
         """Take off, and stay above that place."""
         climb = self.take_off(start, altitude_m)
         return [*climb, RestSegment(end_of(climb), math.inf)]

@@ -50,7 +50,7 @@ class MotionState:
         return MotionState(self.north_m, self.east_m, self.up_m, yaw_rad=self.yaw_rad)
 
 
-class Segment(Protocol):
+class MotionSegment(Protocol):
     """One segment of a motion."""
 
     @property
@@ -148,7 +148,7 @@ class CircularArc:
 class ClimbingSegment:
     """A level segment, with a climb or descent at `rate_ms` to the altitude `up_m`."""
 
-    def __init__(self, level: Segment, up_m: float, rate_ms: float) -> None:
+    def __init__(self, level: MotionSegment, up_m: float, rate_ms: float) -> None:
         self._level, self._up_m = level, up_m
         self._from_m = level.at(0.0).up_m
         self._rate_ms = math.copysign(rate_ms, up_m - self._from_m)
@@ -189,7 +189,7 @@ class FallSegment:
 class PlannedMotion:
     """A sequence of segments that begins at `begin_s`. Times are seconds of any one clock."""
 
-    def __init__(self, begin_s: float, segments: Sequence[Segment]) -> None:
+    def __init__(self, begin_s: float, segments: Sequence[MotionSegment]) -> None:
         """Create a motion from at least one segment. Only the last segment may be infinite."""
         self._segments = segments
         *self._begin_s, self.end_s = itertools.accumulate((part.duration_s for part in segments), initial=begin_s)
@@ -217,6 +217,6 @@ class MotionInterval:
         return self._course.at(self._begin_s + since_s)
 
 
-def end_of(segments: Sequence[Segment]) -> MotionState:
+def end_of(segments: Sequence[MotionSegment]) -> MotionState:
     """Return the motion at the end of the last segment."""
     return segments[-1].at(segments[-1].duration_s)

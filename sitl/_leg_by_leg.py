@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from sitl._kinematics import MotionInterval, MotionState, PlannedMotion, Segment, end_of
+from sitl._kinematics import MotionInterval, MotionSegment, MotionState, PlannedMotion, end_of
 from sitl._models import AT_ONCE
 from sitl._route import CLIMBED, Waypoint, is_near, limit_s, to_go_m
 from sitl.vehicle import VehicleType
@@ -16,13 +16,13 @@ FAST = 4.0  # limit of a vehicle's speed as a multiple of the commanded one
 
 def leg_by_leg(
     waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState
-) -> tuple[list[Segment], Segment]:
+) -> tuple[list[MotionSegment], MotionSegment]:
     """Return the segments up to the last completed waypoint, and the motion after them without further commands.
 
     A waypoint that takes longer than the pilot's time limit is the last one.
     """
     model, motion, goal = AT_ONCE[vehicle_type], start, None
-    flown: list[Segment] = []
+    flown: list[MotionSegment] = []
     course, now_s = PlannedMotion(0.0, model.ascent(start, waypoints[0].place.up_m)), 0.0
     for index, waypoint in enumerate(waypoints):
         if waypoint.kind == "land":

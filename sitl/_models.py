@@ -7,10 +7,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from sitl._copter import Copter
-from sitl._kinematics import LocalPlace, MotionState, Segment
-from sitl._plane import Plane
-from sitl._rover import TURN_RATE_RADS, Rover
+from sitl._copter import CopterMotion
+from sitl._kinematics import LocalPlace, MotionSegment, MotionState
+from sitl._plane import PlaneMotion
+from sitl._rover import TURN_RATE_RADS, RoverMotion
 from sitl.vehicle import VehicleType
 
 
@@ -24,34 +24,34 @@ class MotionModel(Protocol):
     def cruise_ms(self) -> float:
         """The default speed in metres per second."""
 
-    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[Segment]: ...
+    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]: ...
 
     def go_to(
         self, start: MotionState, place: LocalPlace, speed_ms: float, before: LocalPlace | None = None
-    ) -> Sequence[Segment]:
+    ) -> Sequence[MotionSegment]:
         """Go to a place. A plane first returns to the straight line from its previous place `before`."""
 
     def loiter(
         self, start: MotionState, place: LocalPlace, speed_ms: float, seconds: float, after: LocalPlace | None = None
-    ) -> Sequence[Segment]:
+    ) -> Sequence[MotionSegment]:
         """Go to `place` and stay there for `seconds`, which may be infinite.
 
         A plane continues its circle until it heads for `after`, its next place.
         """
 
-    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[Segment]:
+    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[MotionSegment]:
         """Land at `place`, and stop there. `before` is used as in `go_to`."""
 
-    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
+    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
         """Take off without a mission, and then continue with the default behaviour without end."""
 
 
-MODELS: dict[VehicleType, MotionModel] = {"copter": Copter(), "plane": Plane(), "rover": Rover()}
+MODELS: dict[VehicleType, MotionModel] = {"copter": CopterMotion(), "plane": PlaneMotion(), "rover": RoverMotion()}
 """Motion in missions, in AUTO mode."""
 
 AT_ONCE: dict[VehicleType, MotionModel] = {
-    "copter": Copter(turning_s=1.2, settling_s=0.0),
-    "plane": Plane(),
-    "rover": Rover(start_s=0.0, corner_rads=TURN_RATE_RADS),
+    "copter": CopterMotion(turning_s=1.2, settling_s=0.0),
+    "plane": PlaneMotion(),
+    "rover": RoverMotion(start_s=0.0, corner_rads=TURN_RATE_RADS),
 }
 """Motion outside of missions: in GUIDED mode, and during a commanded landing."""

@@ -17,9 +17,9 @@ from sitl._kinematics import (
     CircularArc,
     ClimbingSegment,
     LocalPlace,
+    MotionSegment,
     MotionState,
     RestSegment,
-    Segment,
     StraightLine,
     end_of,
 )
@@ -57,17 +57,17 @@ ROLL_OUT_M, PAST_M = 60.0, 9.0  # how far before its place it touches down, and 
 ROLL_OUT_ACCEL_MS2 = LANDING_MS**2 / (2 * (ROLL_OUT_M + PAST_M))
 
 
-class Plane:
+class PlaneMotion:
     """The motion of a plane: it passes the places of a plan, and circles where it must stay."""
 
     cruise_ms = CRUISE_MS
 
-    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
+    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
         run, path = _lift_off(start, altitude_m, altitude_m)
         path.straight(LEVEL_OFF_M)
         return [*run, *path.segments]
 
-    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
+    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
         """Take off as in mode TAKEOFF: fly to the left side of a circle ahead, and circle without end."""
         run, path = _lift_off(start, altitude_m, min(LEVEL_M, altitude_m))
         place = _ahead(start, AHEAD_M)._replace(up_m=altitude_m)
@@ -78,12 +78,12 @@ class Plane:
 
     def go_to(
         self, start: MotionState, place: LocalPlace, speed_ms: float, before: LocalPlace | None = None
-    ) -> Sequence[Segment]:
+    ) -> Sequence[MotionSegment]:
         return _back_and_on(start, place, before, speed_ms * OVER_GROUND, CLIMB_MS, REACHED_M)
 
     def loiter(
         self, start: MotionState, place: LocalPlace, speed_ms: float, seconds: float, after: LocalPlace | None = None
-    ) -> Sequence[Segment]:
+    ) -> Sequence[MotionSegment]:
         """Circle clockwise around the place for `seconds`, counted from the turn onto the circle.
 
         From inside, the plane crosses the circle straight. From outside, it flies towards the place and passes it on
@@ -104,7 +104,7 @@ class Plane:
             path.arc(place[:2], _until_heading_for(after, place, end_of(path.segments)))
         return path.segments
 
-    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[Segment]:
+    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[MotionSegment]:
         """Glide straight to the ground before the place, and roll to a stop.
 
         A plane that is too high circles down first.
@@ -140,7 +140,7 @@ def loiter_radius_m(speed_ms: float) -> float:
     return LOITER_RADIUS_M + LOITER_RADIUS_M_PER_MS * (speed_ms - CRUISE_MS)
 
 
-def _duration_s(segments: Sequence[Segment]) -> float:
+def _duration_s(segments: Sequence[MotionSegment]) -> float:
     return sum(part.duration_s for part in segments)
 
 
@@ -148,7 +148,7 @@ class _PlanePath:
     """A path under construction at one speed, with a climb or descent to one altitude."""
 
     def __init__(self, start: MotionState, speed_ms: float, up_m: float, rate_ms: float) -> None:
-        self.segments: list[Segment] = []
+        self.segments: list[MotionSegment] = []
         self.speed_ms = speed_ms
         self._end, self._up_m, self._rate_ms = start, up_m, rate_ms
 
@@ -186,13 +186,15 @@ class _PlanePath:
         """Return the bearing of a place from the end of the path."""
         return _bearing_rad(self._end.point, place)
 
-    def _add(self, level: Segment) -> None:
+    def _add(self, level: MotionSegment) -> None:
         self.segments.append(ClimbingSegment(level, self._up_m, self._rate_ms))
         if math.isfinite(level.duration_s):
             self._end = end_of(self.segments)
 
 
-def _lift_off(start: MotionState, altitude_m: float, straight_to_m: float) -> tuple[Sequence[Segment], _PlanePath]:
+def _lift_off(
+    start: MotionState, altitude_m: float, straight_to_m: float
+) -> tuple[Sequence[MotionSegment], _PlanePath]:
     """Return the motion on the ground before take-off, and a path that climbs to `altitude_m`."""
     run = StraightLine(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
     path = _PlanePath(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
@@ -202,7 +204,7 @@ def _lift_off(start: MotionState, altitude_m: float, straight_to_m: float) -> tu
 
 def _back_and_on(
     start: MotionState, place: LocalPlace, before: LocalPlace | None, speed_ms: float, rate_ms: float, reached_m: float
-) -> Sequence[Segment]:
+) -> Sequence[MotionSegment]:
     """Return to the line from `before` to `place`, and follow it until the distance to `place` is `reached_m`."""
     aim = None if before is None else _back_on_line(start.point, before, place)
     if before is None or aim is None:
@@ -217,7 +219,7 @@ def _back_and_on(
 
 def _fly_by(
     start: MotionState, place: LocalPlace, speed_ms: float, rate_ms: float, reached_m: float
-) -> Sequence[Segment]:
+) -> Sequence[MotionSegment]:
     path = _PlanePath(start, speed_ms, place.up_m, rate_ms)
     path.fly_by(place, reached_m)
     return path.segments

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import LocalPlace, MotionState, RestSegment, Segment, StraightLine, end_of
+from sitl._kinematics import LocalPlace, MotionSegment, MotionState, RestSegment, StraightLine, end_of
 
 CRUISE_MS = 5.0  # CRUISE_SPEED
 ACCEL_MS2 = 1.0  # ATC_ACCEL_MAX
@@ -15,7 +15,7 @@ CORNER_MS = 0.5  # it does not stop completely at a corner
 
 
 @dataclass(frozen=True)
-class Rover:
+class RoverMotion:
     """The motion of a rover: straight lines on level ground, with almost a stop at each place.
 
     A standing rover waits `start_s` before it moves. At corners it turns at `corner_rads`, in radians per second. The
@@ -27,13 +27,13 @@ class Rover:
 
     cruise_ms = CRUISE_MS
 
-    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
+    def take_off(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
         """Stay, because a rover cannot take off."""
         return [RestSegment(start, 0.0)]
 
     def go_to(
         self, start: MotionState, place: LocalPlace, speed_ms: float, before: LocalPlace | None = None
-    ) -> Sequence[Segment]:
+    ) -> Sequence[MotionSegment]:
         end = place._replace(up_m=start.up_m)
         passes_ms = min(CORNER_MS, math.sqrt(2 * ACCEL_MS2 * math.dist(start.point, end)))
         there = StraightLine(start, end, speed_ms, ACCEL_MS2, to_ms=min(passes_ms, speed_ms))
@@ -46,13 +46,13 @@ class Rover:
 
     def loiter(
         self, start: MotionState, place: LocalPlace, speed_ms: float, seconds: float, after: LocalPlace | None = None
-    ) -> Sequence[Segment]:
+    ) -> Sequence[MotionSegment]:
         there = self.go_to(start, place, speed_ms)
         return [*there, RestSegment(end_of(there), seconds)]
 
-    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[Segment]:
+    def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[MotionSegment]:
         """Stay, because a rover is always on the ground."""
         return [RestSegment(start, 0.0)]
 
-    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[Segment]:
+    def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
         return [RestSegment(start, math.inf)]

@@ -84,14 +84,14 @@ class Embedded:
         )
 
 
-class _Parser(argparse.ArgumentParser):
+class _OptionParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print one sentence instead of the usage text."""
         self.exit(2, f"{self.prog}: {message}\n")
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = _Parser(prog="sitl.embedded", description="A small MAVLink vehicle that flies without ArduPilot.")
+    parser = _OptionParser(prog="sitl.embedded", description="A small MAVLink vehicle that flies without ArduPilot.")
     parser.add_argument("--type", choices=VEHICLE_TYPES, default="copter")
     parser.add_argument("--sysid", type=int, required=True, help="MAVLink system ID, 1 to 255")
     parser.add_argument("--home", required=True, metavar="LAT,LON,ALT,HDG", help="degrees, metres above sea level")

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl._kinematics import MotionState, PlannedMotion, RestSegment, Segment, end_of
+from sitl._kinematics import MotionSegment, MotionState, PlannedMotion, RestSegment, end_of
 from sitl._leg_by_leg import leg_by_leg
 from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl._route import Waypoint, landing_begins, route
@@ -54,7 +54,7 @@ def track(
     stands. Raises PlanError if the type cannot fly the plan.
     """
     start = MotionState(yaw_rad=math.radians(heading_deg))
-    segments: Sequence[Segment]
+    segments: Sequence[MotionSegment]
     if plan is None:
         segments = AT_ONCE[vehicle_type].ascent(start, takeoff_altitude_m)
     else:
@@ -63,10 +63,10 @@ def track(
     return VehicleTrack(PlannedMotion(begin_s, segments), home_offset)
 
 
-def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState) -> Sequence[Segment]:
+def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState) -> Sequence[MotionSegment]:
     """Return the segments for the waypoints in AUTO mode, and for the unlimited stay after the last one."""
     model, last = MODELS[vehicle_type], waypoints[-1]
-    segments: list[Segment] = [RestSegment(start, 0.0)]
+    segments: list[MotionSegment] = [RestSegment(start, 0.0)]
     for before, waypoint, after in zip((None, *waypoints), waypoints, (*waypoints[1:], None), strict=False):
         segments += _manoeuvre(model, waypoint, end_of(segments), before, after)
     if last.kind != "land":
@@ -74,7 +74,7 @@ def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mo
     return segments
 
 
-def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState) -> Sequence[Segment]:
+def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState) -> Sequence[MotionSegment]:
     """Return the segments in GUIDED mode. The landing of a plane is always a mission."""
     begins = landing_begins(waypoints, vehicle_type)
     led, staying = leg_by_leg(waypoints[:begins], vehicle_type, start)
@@ -85,7 +85,7 @@ def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mot
 
 def _manoeuvre(
     model: MotionModel, waypoint: Waypoint, start: MotionState, before: Waypoint | None, after: Waypoint | None
-) -> Sequence[Segment]:
+) -> Sequence[MotionSegment]:
     """Return the segments for one waypoint from the current motion, with regard to its neighbours."""
     led = before.place if before is not None and before.kind in ("go_to", "loiter") else None
     match waypoint.kind:

@@ -15,7 +15,7 @@ from itertools import count
 Callback = Callable[[], object]
 
 
-class Timer:
+class ScheduledCall:
     """A scheduled call of a function. `cancel` prevents it."""
 
     __slots__ = ("callback",)
@@ -40,7 +40,7 @@ class Loop:
         self.on_error = on_error
         self._selector = selector or selectors.DefaultSelector()
         self._callbacks: dict[socket.socket, tuple[Callback | None, Callback | None]] = {}
-        self._timers: list[tuple[float, int, Timer]] = []
+        self._timers: list[tuple[float, int, ScheduledCall]] = []
         self._order = count()
         self._running = True
         self._wakeup_sender: socket.socket | None = None
@@ -57,9 +57,9 @@ class Loop:
         if events:
             self._callbacks[sock] = readable, writable
 
-    def call_later(self, delay_s: float, callback: Callback) -> Timer:
+    def call_later(self, delay_s: float, callback: Callback) -> ScheduledCall:
         """Call a function after `delay_s` seconds of wall time. A negative delay counts as 0."""
-        timer = Timer(callback)
+        timer = ScheduledCall(callback)
         heapq.heappush(self._timers, (time.monotonic() + max(0.0, delay_s), next(self._order), timer))
         return timer
 

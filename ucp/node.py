@@ -26,7 +26,7 @@ from ucp.control import CommandError, ControlServer, UnsupportedCommandError
 from ucp.events import EVENT_HEADER_BYTES, LoggableEvent, RandomEvents
 from ucp.export import export_chain
 from ucp.features import UNSUPPORTED
-from ucp.loop import Loop, Timer
+from ucp.loop import Loop, ScheduledCall
 from ucp.messages import MalformedDatagramError
 from ucp.mission import Mission, MissionError, UnsupportedMissionError, is_epoch, load_mission
 from ucp.store import Store, StoreError
@@ -75,7 +75,7 @@ class Node:
         self._socket = _broadcast_socket(mission)
         self._loop = Loop() if loop is None else loop
         self._loop.on_error = self._log_exception
-        self._timer: Timer | None = None
+        self._timer: ScheduledCall | None = None
         self._close_source: Callable[[], object] = lambda: None
         self._control = ControlServer(
             directory / f"{mission.agent_id}.control",

@@ -41,7 +41,7 @@ from harness.archive.traces import (
     read_trace_lines,
     why_not_a_trace,
 )
-from harness.archive.tracks import TRACKS_FILE, Tracks, read_tracks
+from harness.archive.tracks import TRACKS_FILE, VehicleTracks, read_tracks
 from harness.errors import RunDirectoryError
 from ucp.trace import HandlerRun
 
@@ -334,7 +334,7 @@ class RunArchive:
         """Yield mission seconds with the loss rates (0 to 1) of links: first of all links, then of changed ones."""
         return read_link_losses(self._in_directory(NETWORK_FILE), vehicles)
 
-    def tracks(self, vehicles: Collection[int]) -> Tracks:
+    def tracks(self, vehicles: Collection[int]) -> VehicleTracks:
         """Return the positions of the vehicles over time."""
         return read_tracks(self._in_directory(TRACKS_FILE), vehicles)
 

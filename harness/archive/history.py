@@ -46,7 +46,7 @@ REASONS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Vote:
+class AgentVote:
     """The vote of an agent on its own block, with times in mission seconds.
 
     `outcome` is the branch of Algorithm 5, or CUT_SHORT.
@@ -70,7 +70,7 @@ class ReconcilePhase:
 
 
 @dataclass(frozen=True, slots=True)
-class Reconcile:
+class AgentReconcile:
     """A reconcile of an agent, with times in mission seconds.
 
     `phases` follow each other without a gap. `done` is false if the reconcile was cut short.
@@ -116,12 +116,12 @@ class ActivityStart(NamedTuple):
     detail: str
 
 
-HistoryEvent = ActivityStart | Vote | Reconcile | Phase2Tie | BlockCommit
+HistoryEvent = ActivityStart | AgentVote | AgentReconcile | Phase2Tie | BlockCommit
 """A change of an agent's history that one handler run causes."""
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class BroadcastMessage:
     """A broadcast message with its receivers.
 
     `seq` is the sequence number of its sender. `receipts` has the agent and the mission second of each handler run that
@@ -137,14 +137,14 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
-class History:
+class MissionHistory:
     """The history of all agents, by agent and in order of time. `messages` is None if they were not requested."""
 
-    votes: list[Vote]
-    reconciles: list[Reconcile]
+    votes: list[AgentVote]
+    reconciles: list[AgentReconcile]
     commits: list[BlockCommit]
     ties: list[Phase2Tie]
-    messages: list[Message] | None
+    messages: list[BroadcastMessage] | None
 
 
 def has_possible_time(run: HandlerRun) -> bool:
@@ -159,14 +159,14 @@ def incarnations(trace: Trace) -> list[list[HandlerRun]]:
 
 def history_of(
     traces: Mapping[int, Trace], faults: Iterable[FaultRecord], end_s: float, *, whole: bool = True
-) -> History:
+) -> MissionHistory:
     """Return the history of a run that ended at mission second `end_s`. With `whole=False`, messages are left out."""
     ends: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
         if fault.kind.ends_incarnation:
             for agent in fault.agents or ():
                 ends[agent].append(fault.at_s)
-    history = History([], [], [], [], [] if whole else None)
+    history = MissionHistory([], [], [], [], [] if whole else None)
     for agent, trace in sorted(traces.items()):
         every = [runs for runs in incarnations(trace) if runs]
         for runs, later in zip_longest(every, every[1:]):
@@ -178,12 +178,12 @@ def history_of(
     return replace(history, messages=_messages(traces)) if whole else history
 
 
-def _append(history: History, steps: Iterable[HistoryEvent]) -> None:
+def _append(history: MissionHistory, steps: Iterable[HistoryEvent]) -> None:
     for step in steps:
         match step:
-            case Vote():
+            case AgentVote():
                 history.votes.append(step)
-            case Reconcile():
+            case AgentReconcile():
                 history.reconciles.append(step)
             case Phase2Tie():
                 history.ties.append(step)
@@ -229,11 +229,11 @@ class HistoryReader:
         yield from self._end_vote(at_s, CUT_SHORT)
         yield from self._end_reconcile(at_s, done=False)
 
-    def _end_vote(self, at_s: float, outcome: str) -> Iterator[Vote]:
+    def _end_vote(self, at_s: float, outcome: str) -> Iterator[AgentVote]:
         if self._vote is not None:
             block, since_s = self._vote
             self._vote = None
-            yield Vote(self._agent, block, since_s, max(at_s, since_s), outcome)
+            yield AgentVote(self._agent, block, since_s, max(at_s, since_s), outcome)
 
     def _continue_reconcile(self, run: HandlerRun) -> Iterator[HistoryEvent]:
         """Yield the parts of the history that a handler run during a reconcile begins or ends."""
@@ -256,26 +256,26 @@ class HistoryReader:
                 self._phases.append(ReconcilePhase(name, since_s, at_s, rounds))
             self._phase = None
 
-    def _end_reconcile(self, at_s: float, *, done: bool) -> Iterator[Reconcile]:
+    def _end_reconcile(self, at_s: float, *, done: bool) -> Iterator[AgentReconcile]:
         self._end_phase(at_s)
         if self._reconcile is not None:
             reason, since_s = self._reconcile
             phases, self._reconcile, self._phases = self._phases, None, []
-            yield Reconcile(self._agent, since_s, max(at_s, since_s), reason, phases, done)
+            yield AgentReconcile(self._agent, since_s, max(at_s, since_s), reason, phases, done)
 
 
-def _messages(traces: Mapping[int, Trace]) -> list[Message]:
+def _messages(traces: Mapping[int, Trace]) -> list[BroadcastMessage]:
     """Return all messages with their receivers.
 
     Sequence numbers begin again with each incarnation. A receipt therefore belongs to the latest message with its
     number that was sent before it.
     """
-    sent: dict[tuple[object, object], list[Message]] = defaultdict(list)
+    sent: dict[tuple[object, object], list[BroadcastMessage]] = defaultdict(list)
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:
             if has_possible_time(run):
                 for broadcast in run.sent:
-                    message = Message(agent, run.t, broadcast.message, broadcast.block, seq=broadcast.seq)
+                    message = BroadcastMessage(agent, run.t, broadcast.message, broadcast.block, seq=broadcast.seq)
                     sent[agent, broadcast.seq].append(message)
     for agent, trace in sorted(traces.items()):
         for run in trace.runs:

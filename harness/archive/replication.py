@@ -15,7 +15,7 @@ from ucp.trace import HandlerRun
 
 
 @dataclass(frozen=True, slots=True)
-class Replication:
+class ReplicationFigures:
     """The figures from mission second `at_s` on: chain lengths in blocks, the number of different chains, and copies
     per block.
 
@@ -30,7 +30,7 @@ class Replication:
     copies_mean: float | None
 
 
-def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -> list[Replication]:
+def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -> list[ReplicationFigures]:
     """Return the replication figures at mission second 0 and after each change."""
     steps: list[tuple[float, int, int, FaultRecord | HandlerRun]] = []
     for fault in faults:
@@ -127,13 +127,13 @@ class _LivingChains:
             self._copies_of_completed += difference
         self._copies[block] += difference
 
-    def replication(self, at_s: float) -> Replication:
+    def replication(self, at_s: float) -> ReplicationFigures:
         paths = list(self._paths.values())
         first_path: list[tuple[int, str]] = paths[0] if paths else []
         while self._mutual < len(first_path) and self._sharing[first_path[self._mutual][0]] == len(paths):
             self._mutual += 1
         completed = len(self._completed)
-        return Replication(
+        return ReplicationFigures(
             at_s,
             self._mutual,
             max(map(len, paths), default=0),

@@ -35,7 +35,7 @@ Version = Literal["ucp-trace/1", "ucp-trace/2"]
 Record = TypeVar("Record")
 
 
-class Header(BaseModel):
+class TraceHeader(BaseModel):
     """The header of a trace. `initial_data` is in base64, or None in version 1, which does not record complete inputs.
 
     In a `secured` mission the recorded datagrams are plain. The sent ones were longer, and a datagram that looks valid
@@ -53,7 +53,7 @@ class Header(BaseModel):
     secured: bool | None = None
 
     @model_validator(mode="after")
-    def _complete(self) -> "Header":
+    def _complete(self) -> "TraceHeader":
         if self.has_inputs and self.initial_data is None:
             raise ValueError("initial_data is missing")
         if any(
@@ -74,7 +74,7 @@ class Header(BaseModel):
         return self.schema_ != "ucp-trace/1"
 
 
-class _VersionedHeader(Header):
+class _VersionedHeader(TraceHeader):
     schema_: Version = Field(alias="schema")
 
 
@@ -95,7 +95,7 @@ that matches needs no further validation."""
 
 _LOST = re.compile(rb'\{"lost_lines":(\d{1,9}),"lost_bytes":(\d{1,12})\}')
 
-HEADER: TypeAdapter[Header] = TypeAdapter(_VersionedHeader)
+HEADER: TypeAdapter[TraceHeader] = TypeAdapter(_VersionedHeader)
 HANDLER_RUN = TypeAdapter(HandlerRun)
 ASIDE = TypeAdapter(DroppedDatagram | CommandEntry)
 
@@ -109,7 +109,7 @@ def read_clock(path: Path) -> dict[str, Any]:
         return {}
 
 
-class Gap(NamedTuple):
+class TraceGap(NamedTuple):
     """A place in a trace at which lines are missing or damaged. `position` is the number of handler runs before it.
 
     `lines` and `lost_bytes` count the unreadable lines in the file. The number of lines that were never written is
@@ -130,14 +130,14 @@ class Trace:
     `gaps`. The trace of a run has none, because its reading ends at the first damaged line.
     """
 
-    header: Header
+    header: TraceHeader
     runs: list[HandlerRun] = field(default_factory=list)
     starts: list[int] = field(default_factory=list)
     asides: list[tuple[int, DroppedDatagram | CommandEntry]] = field(default_factory=list)
     problem: str | None = None
     cut_off: bool = False
     """True if the file ends within a line. That line is not read."""
-    gaps: list[Gap] = field(default_factory=list)
+    gaps: list[TraceGap] = field(default_factory=list)
     jumps: list[int] = field(default_factory=list)
     """Positions of runs before which the time goes back, or far ahead. The agent's clock was probably set there."""
     lines: tuple[Sequence[int], Sequence[int]] | None = None
@@ -187,7 +187,7 @@ class Trace:
             else:
                 self.asides.append((len(self.runs), entry))
 
-    def entries(self) -> Iterator[Header | Gap | Entry]:
+    def entries(self) -> Iterator[TraceHeader | TraceGap | Entry]:
         """Yield all entries of the trace in order.
 
         The header is repeated for each incarnation, and a gap stands for missing lines.
@@ -277,7 +277,7 @@ class HeldBlocks:
                     self.not_in_chain.add(block)
 
 
-def parse_line(line: bytes) -> Header | Entry:
+def parse_line(line: bytes) -> TraceHeader | Entry:
     """Return the content of a trace line. Raises ValueError if the line is invalid."""
     if b'"handler"' in line:
         return _validate(HANDLER_RUN, line)
@@ -290,7 +290,7 @@ def _validate(kind: TypeAdapter[Record], line: bytes) -> Record:
     return kind.validate_json(line)
 
 
-def gap_line(gap: Gap) -> str:
+def gap_line(gap: TraceGap) -> str:
     """Return the line that stands for lost lines in an imported trace.
 
     Programs that read only handler runs stop there.
@@ -347,9 +347,9 @@ def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
                 try:
                     entry = parse_line(line) if trace else _validate(HEADER, line)
                     if trace is None:
-                        assert isinstance(entry, Header)
+                        assert isinstance(entry, TraceHeader)
                         trace = Trace(entry)
-                    elif not isinstance(entry, Header):
+                    elif not isinstance(entry, TraceHeader):
                         trace.extend((entry,))
                     elif entry == trace.header:
                         trace.starts.append(len(trace.runs))

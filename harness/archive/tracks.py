@@ -28,7 +28,7 @@ class PositionFix(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Tracks:
+class VehicleTracks:
     """The positions of each vehicle in order of time. There is at least one for each.
 
     `problems` has a sentence for each unreadable part.
@@ -65,7 +65,7 @@ class TrackLine(BaseModel):
     places: dict[int, tuple[Metres, Metres, Metres]]
 
 
-def read_tracks(path: Path | None, vehicles: Collection[int]) -> Tracks:
+def read_tracks(path: Path | None, vehicles: Collection[int]) -> VehicleTracks:
     """Read the positions of `vehicles`. Lines about other vehicles are left out."""
     lines = JsonLines(path, TrackLine)
     fixes: dict[int, list[PositionFix]] = {}
@@ -78,4 +78,4 @@ def read_tracks(path: Path | None, vehicles: Collection[int]) -> Tracks:
             fixes.setdefault(vehicle, []).append(PositionFix(line.at_s, *place))
     for track in fixes.values():
         track.sort(key=attrgetter("at_s"))
-    return Tracks(dict(sorted(fixes.items())), lines.problems())
+    return VehicleTracks(dict(sorted(fixes.items())), lines.problems())

@@ -35,7 +35,7 @@ class TraceObservation:
 
 
 @dataclass(slots=True)
-class Incarnation:
+class ReplayedIncarnation:
     """The replay of an agent between two restarts: the blocks that it held at the end, and all observations.
 
     `chain` is oldest first, `deque` front first, `stack` top last; all are block hashes.
@@ -71,16 +71,16 @@ class Incarnation:
         return next(islice(self.trace.incarnations(), self.number, None))
 
 
-def replay(trace: Trace, inception: str | None) -> list[Incarnation]:
+def replay(trace: Trace, inception: str | None) -> list[ReplayedIncarnation]:
     """Return the replay of each incarnation of an agent, that is, of each part of its trace between restarts."""
     bounds = [0, *trace.starts, len(trace.runs)]
     return [
-        _replay_incarnation(Incarnation(trace, number, trace.runs[start:end]), inception)
+        _replay_incarnation(ReplayedIncarnation(trace, number, trace.runs[start:end]), inception)
         for number, (start, end) in enumerate(pairwise(bounds))
     ]
 
 
-def _replay_incarnation(incarnation: Incarnation, inception: str | None) -> Incarnation:
+def _replay_incarnation(incarnation: ReplayedIncarnation, inception: str | None) -> ReplayedIncarnation:
     held = _HeldBlocks(incarnation, inception)
     checked: StateSummary | None = None
     reconciling, compared, now, sequence = False, True, 0.0, 0
@@ -123,7 +123,7 @@ def _replay_incarnation(incarnation: Incarnation, inception: str | None) -> Inca
 class _HeldBlocks:
     """The blocks that an agent holds. The replay updates them with each handler run."""
 
-    def __init__(self, incarnation: Incarnation, inception: str | None) -> None:
+    def __init__(self, incarnation: ReplayedIncarnation, inception: str | None) -> None:
         self._incarnation = incarnation
         self._copies: dict[str, int] = {}
         self._places = {"chain": incarnation.chain, "deque": incarnation.deque, "stack": incarnation.stack}

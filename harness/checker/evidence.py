@@ -25,9 +25,9 @@ from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, UnknownNames, first_unknown, unknown_names
 from harness.checker._sent_times import sent_at, spread_of
-from harness.checker._trace_replay import Incarnation, replay
+from harness.checker._trace_replay import ReplayedIncarnation, replay
 from harness.checker.judgement import Judgement
-from harness.checker.reference.state import State
+from harness.checker.reference.state import ReferenceState
 from harness.checker.signatures import TrustedKeys, are_signed
 from harness.errors import RunDirectoryError
 from harness.play.rogue.rogue_line import OF_NO_INJECTION
@@ -50,7 +50,7 @@ Sending = tuple[tuple[float, SentMessage], ...]
 Sendings = dict[Any, dict[Any, Sending]]
 """The messages that one agent sent: type -> sequence number -> sendings."""
 
-Watch = Callable[[State, HandlerRun | None], None]
+Watch = Callable[[ReferenceState, HandlerRun | None], None]
 """A function that gets the state of an agent after each handler run, and the run. The run is None at the start of an
 incarnation."""
 
@@ -210,7 +210,7 @@ class Evidence:
         return None
 
     @cached_property
-    def incarnations(self) -> dict[int, list[Incarnation]]:
+    def incarnations(self) -> dict[int, list[ReplayedIncarnation]]:
         """The replayed trace of each agent, divided at its restarts."""
         inception = next((export.inception.chain_hash for export in self.exports.values()), None)
         if inception is None:

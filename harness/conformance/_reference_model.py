@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from harness.checker.reference.reference_agent import ReferenceAgent
+from harness.checker.reference.state import ReferenceState
 from harness.checker.reference.state import Settings as ReferenceSettings
-from harness.checker.reference.state import State
 from ucp.block import Block
 from ucp.events import LoggableEvent
 from ucp.messages import Message, encode
@@ -104,7 +104,7 @@ class ReferenceModel:
         self._sequence = 0
 
     @property
-    def state(self) -> State:
+    def state(self) -> ReferenceState:
         return self.agent.state
 
     def new_block(self, owner: int, *, young: bool) -> Block:

@@ -11,7 +11,7 @@ from heapq import heappop, heappush
 from random import Random
 from typing import Any, Generic, Protocol, TypeVar
 
-from netem.channel import Channel, FrameFate, Radio, Transmission, numbers
+from netem.channel import Channel, EndedTransmission, FrameFate, Radio, numbers
 from netem.radio import Place
 
 Journal = Callable[[dict[str, Any]], None]
@@ -62,7 +62,7 @@ class ChannelTraffic(Generic[Message]):
         if at < self.next_s:
             self.next_s = at
 
-    def advance(self) -> list[tuple[Transmission, Message]]:
+    def advance(self) -> list[tuple[EndedTransmission, Message]]:
         """Advance the channel to the next event, and return the frames whose transmission ends then."""
         now, processed = self.next_s, self._processed
         while processed and processed[0][0] <= now:
@@ -91,7 +91,7 @@ class ChannelTraffic(Generic[Message]):
         identity = {"sender": self._roster[sender], "sequence": message.sequence, "bytes": data_bytes}
         return {"at_s": round(at, 6), **identity}
 
-    def _line_of(self, frame: Transmission, message: Message) -> dict[str, Any]:
+    def _line_of(self, frame: EndedTransmission, message: Message) -> dict[str, Any]:
         lost = {fate.value: [self._roster[number] for number in numbers(bits)] for fate, bits in frame.lost().items()}
         times = {"began_s": round(frame.began_at, 6), "ended_s": round(frame.ended_at, 6)}
         return {**self._line(frame.queued_at, frame.sender, message, frame.data_bytes), **times, "lost": lost}
@@ -116,7 +116,7 @@ class ChannelTotals:
         self._load: list[float] = []
         self._busy_until = 0.0
 
-    def ended(self, frame: Transmission) -> None:
+    def ended(self, frame: EndedTransmission) -> None:
         began_at, ended_at = frame.began_at, frame.ended_at
         self.frames += 1
         self.airtime_s += ended_at - began_at

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from harness.archive.connectivity import Connectivity, quality
-from harness.archive.tracks import Tracks
+from harness.archive.tracks import VehicleTracks
 from harness.present import text
 from harness.present.colours import AgentColours
 from harness.report import map_svg
@@ -55,7 +55,7 @@ class MapSection:
 
 
 def section(
-    tracks: Tracks, network: Connectivity, ink: Mapping[int, AgentColours], types: Mapping[int, VehicleType]
+    tracks: VehicleTracks, network: Connectivity, ink: Mapping[int, AgentColours], types: Mapping[int, VehicleType]
 ) -> MapSection | None:
     """Return the map section, or None if no vehicle moved and no file is damaged. `types` contains the known vehicle
     types.
@@ -65,7 +65,7 @@ def section(
     return _drawn(tracks, network, ink, types)
 
 
-def _moved(tracks: Tracks, vehicle: int) -> bool:
+def _moved(tracks: VehicleTracks, vehicle: int) -> bool:
     fixes = tracks.by_vehicle[vehicle]
     return any(
         max(metres) - min(metres) > MOVES_M
@@ -74,7 +74,7 @@ def _moved(tracks: Tracks, vehicle: int) -> bool:
 
 
 def _drawn(
-    tracks: Tracks, network: Connectivity, ink: Mapping[int, AgentColours], types: Mapping[int, VehicleType]
+    tracks: VehicleTracks, network: Connectivity, ink: Mapping[int, AgentColours], types: Mapping[int, VehicleType]
 ) -> MapSection:
     end_s = max(fixes[-1].at_s for fixes in tracks.by_vehicle.values())
     known = [division for division in divisions(network.states) if division.at_s <= end_s]
@@ -100,7 +100,7 @@ def _drawn(
 
 
 def _notable_moments(
-    known: Sequence[NetworkDivision], network: Connectivity, tracks: Tracks, end_s: float
+    known: Sequence[NetworkDivision], network: Connectivity, tracks: VehicleTracks, end_s: float
 ) -> list[tuple[float, NetworkDivision | None]]:
     """Return up to `MOMENTS` + 1 moments to show, each with the partition of the network at that moment.
 
@@ -123,7 +123,7 @@ def _notable_moments(
 def _moment(
     at_s: float,
     division: NetworkDivision | None,
-    tracks: Tracks,
+    tracks: VehicleTracks,
     network: Connectivity,
     flown: Sequence[FlightPath],
     area_extent: GroundRectangle,
@@ -199,7 +199,7 @@ def _legend_of_moments(moments: Sequence[MapMoment], types: set[VehicleType]) ->
     return entries + [(map_svg.sample(vehicle_type), vehicle_type) for vehicle_type in shapes]
 
 
-def _description(tracks: Tracks, area_extent: GroundRectangle, moments: Sequence[MapMoment]) -> str:
+def _description(tracks: VehicleTracks, area_extent: GroundRectangle, moments: Sequence[MapMoment]) -> str:
     """Return a text that describes the map for readers who cannot see it."""
     count = len(tracks.by_vehicle)
     states = "; ".join(

@@ -6,7 +6,7 @@ from math import ceil
 
 from markupsafe import Markup
 
-from harness.archive.replication import Replication
+from harness.archive.replication import ReplicationFigures
 from harness.archive.run_record import Cycle, FaultRecord
 from harness.checker.recurring_cycles import findings, in_words
 from harness.present import text
@@ -18,7 +18,7 @@ MAX_MOMENTS = 600
 
 _TOP, _BOTTOM = 14, 4  # room above the highest value and below 0
 
-Figure = Callable[[Replication], float | None]
+Figure = Callable[[ReplicationFigures], float | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ _LINE_CLASSES = ("broken", "whole")
 
 
 def draw(
-    spreads: Sequence[Replication], faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], end_s: float
+    spreads: Sequence[ReplicationFigures], faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], end_s: float
 ) -> list[TimelineChart]:
     """Return a chart for each group of figures. `spreads` contains the numbers of copies over time, with at least one
     entry.
@@ -53,14 +53,14 @@ def draw(
     return [_chart(name, figures, moments, behind, end_s) for name, figures in _CHARTS]
 
 
-def thin_states(spreads: Sequence[Replication], end_s: float) -> Sequence[Replication]:
+def thin_states(spreads: Sequence[ReplicationFigures], end_s: float) -> Sequence[ReplicationFigures]:
     """Return those states of a long sequence that are visible when the whole run is shown.
 
     Each interval of one picture column keeps the state with the shortest mutual chain and the last state.
     """
     if len(spreads) <= MAX_MOMENTS:
         return spreads
-    kept: dict[int, tuple[Replication, Replication]] = {}
+    kept: dict[int, tuple[ReplicationFigures, ReplicationFigures]] = {}
     for spread in spreads:
         place = int(spread.at_s / end_s * MAX_MOMENTS / 2)
         worst = min(kept[place][0], spread, key=lambda moment: moment.mutual_chain) if place in kept else spread
@@ -69,7 +69,11 @@ def thin_states(spreads: Sequence[Replication], end_s: float) -> Sequence[Replic
 
 
 def _chart(
-    name: str, figures: Sequence[tuple[str, Figure]], moments: Sequence[Replication], behind: Markup, end_s: float
+    name: str,
+    figures: Sequence[tuple[str, Figure]],
+    moments: Sequence[ReplicationFigures],
+    behind: Markup,
+    end_s: float,
 ) -> TimelineChart:
     highest = max(
         (value for _, figure in figures for moment in moments if (value := figure(moment)) is not None), default=0
@@ -107,7 +111,7 @@ def _chart(
     )
 
 
-def _steps(moments: Sequence[Replication], figure: Figure, per_px: float, end_s: float) -> str:
+def _steps(moments: Sequence[ReplicationFigures], figure: Figure, per_px: float, end_s: float) -> str:
     """Return a step line as an SVG path, which starts at the first known value."""
     path = ""
     last: float | None = None
@@ -120,7 +124,7 @@ def _steps(moments: Sequence[Replication], figure: Figure, per_px: float, end_s:
     return f"{path}H{format_number(end_s)}" if path else ""
 
 
-def _tip(moment: Replication, figures: Sequence[tuple[str, Figure]], name: str) -> str:
+def _tip(moment: ReplicationFigures, figures: Sequence[tuple[str, Figure]], name: str) -> str:
     values = ", ".join(f"{what} {text.value(figure(moment))}" for what, figure in figures)
     return f"from {format_seconds(moment.at_s)}: {name}: {values}"
 

@@ -14,7 +14,15 @@ from typing import TypeVar
 
 from markupsafe import Markup
 
-from harness.archive.history import CUT_SHORT, BlockCommit, History, Phase2Tie, Reconcile, ReconcilePhase, Vote
+from harness.archive.history import (
+    CUT_SHORT,
+    AgentReconcile,
+    AgentVote,
+    BlockCommit,
+    MissionHistory,
+    Phase2Tie,
+    ReconcilePhase,
+)
 from harness.archive.run_record import FaultRecord
 from harness.present.svg import n
 from harness.report._timeline_plot import (
@@ -58,11 +66,11 @@ class TimelinePicture:
     """Sentences about marks that were left out."""
 
 
-Span = TypeVar("Span", Vote, Reconcile)
+Span = TypeVar("Span", AgentVote, AgentReconcile)
 
 
 def draw(
-    history: History,
+    history: MissionHistory,
     faults: Sequence[FaultRecord],
     shades: Sequence[PartitionShade],
     agents: Sequence[int],
@@ -110,7 +118,7 @@ def draw(
 
 
 def _legend(
-    history: History, faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], *, by_phase: bool
+    history: MissionHistory, faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], *, by_phase: bool
 ) -> list[tuple[Markup, str]]:
     """Return a legend of all marks that the picture contains."""
     outcomes = {vote.outcome for vote in history.votes}
@@ -156,7 +164,7 @@ def block_label(block: str, names: Mapping[str, str]) -> str:
     return names.get(block, block[:12])
 
 
-def phases_in_words(reconcile: Reconcile) -> str:
+def phases_in_words(reconcile: AgentReconcile) -> str:
     """Return the phases of a reconcile with their numbers of rounds, in the order in which they began."""
     rounds: dict[str, int] = {}
     for phase in reconcile.phases:
@@ -193,7 +201,7 @@ def _css_class(outcome: str) -> str:
     return {"approved": "approved", "not approved": "refused"}.get(outcome, "undecided")
 
 
-def _vote(vote: Vote, names: Mapping[str, str]) -> Markup:
+def _vote(vote: AgentVote, names: Mapping[str, str]) -> Markup:
     tip = f"agent {vote.agent}: vote on {block_label(vote.block, names)}, {_from_to(vote)}:"
     return Markup('<rect class="vote %s" x="%s" y="3" width="%s" height="%s"><title>%s</title></rect>') % (
         _css_class(vote.outcome),
@@ -204,7 +212,7 @@ def _vote(vote: Vote, names: Mapping[str, str]) -> Markup:
     )
 
 
-def _phases(reconcile: Reconcile, lane_height: int) -> list[Markup]:
+def _phases(reconcile: AgentReconcile, lane_height: int) -> list[Markup]:
     return [
         _reconcile_bar(
             phase,
@@ -217,12 +225,12 @@ def _phases(reconcile: Reconcile, lane_height: int) -> list[Markup]:
     ]
 
 
-def _bar(reconcile: Reconcile, lane_height: int) -> Markup:
+def _bar(reconcile: AgentReconcile, lane_height: int) -> Markup:
     tip = f"agent {reconcile.agent}: reconcile ({reconcile.reason}), {phases_in_words(reconcile)}"
     return _reconcile_bar(reconcile, BAR_HEIGHT, lane_height, tip)
 
 
-def _reconcile_bar(span: ReconcilePhase | Reconcile, height: int, lane_height: int, tip: str) -> Markup:
+def _reconcile_bar(span: ReconcilePhase | AgentReconcile, height: int, lane_height: int, tip: str) -> Markup:
     return Markup('<rect class="reconcile" x="%s" y="%s" width="%s" height="%s"><title>%s</title></rect>') % (
         format_number(span.start_s),
         lane_height - 3 - height,
@@ -232,7 +240,7 @@ def _reconcile_bar(span: ReconcilePhase | Reconcile, height: int, lane_height: i
     )
 
 
-def _from_to(span: Vote | Reconcile | ReconcilePhase) -> str:
+def _from_to(span: AgentVote | AgentReconcile | ReconcilePhase) -> str:
     return f"{format_seconds(span.start_s)} to {format_seconds(span.end_s)}"
 
 

@@ -14,10 +14,10 @@ from markupsafe import Markup
 from harness.archive.connectivity import Connectivity
 from harness.archive.history import (
     LATEST_S,
-    History,
-    Message,
-    Reconcile,
-    Vote,
+    AgentReconcile,
+    AgentVote,
+    BroadcastMessage,
+    MissionHistory,
     end_of_traces,
     history_of,
     possible_faults,
@@ -155,7 +155,7 @@ def _shades(network: Connectivity, end_s: float) -> tuple[list[PartitionShade], 
 
 
 def _messages(
-    messages: Sequence[Message] | None, agents: Sequence[int], names: Mapping[str, str]
+    messages: Sequence[BroadcastMessage] | None, agents: Sequence[int], names: Mapping[str, str]
 ) -> tuple[str, list[str]]:
     """Return the received messages as JSON, and notes about messages that were left out.
 
@@ -184,7 +184,7 @@ def _messages(
     return json.dumps(document, separators=(",", ":")), []
 
 
-Span = TypeVar("Span", Vote, Reconcile)
+Span = TypeVar("Span", AgentVote, AgentReconcile)
 
 
 def _table(spans: Sequence[Span], cycle_chart: Callable[[Span], list[str]]) -> TimelineTable:
@@ -192,7 +192,7 @@ def _table(spans: Sequence[Span], cycle_chart: Callable[[Span], list[str]]) -> T
     return TimelineTable([cycle_chart(span) for span in first], len(spans) - len(first))
 
 
-def _vote_row(vote: Vote, names: Mapping[str, str]) -> list[str]:
+def _vote_row(vote: AgentVote, names: Mapping[str, str]) -> list[str]:
     return [
         format_seconds(vote.start_s),
         str(vote.agent),
@@ -202,7 +202,7 @@ def _vote_row(vote: Vote, names: Mapping[str, str]) -> list[str]:
     ]
 
 
-def _reconcile_row(reconcile: Reconcile) -> list[str]:
+def _reconcile_row(reconcile: AgentReconcile) -> list[str]:
     return [
         format_seconds(reconcile.start_s),
         str(reconcile.agent),
@@ -212,7 +212,7 @@ def _reconcile_row(reconcile: Reconcile) -> list[str]:
     ]
 
 
-def _in_words(history: History, agents: int, end_s: float, unknown: bool) -> str:
+def _in_words(history: MissionHistory, agents: int, end_s: float, unknown: bool) -> str:
     """Return a text that describes the timeline. `unknown` adds that undefined names in traces may hide events."""
     approved = sum(vote.outcome == "approved" for vote in history.votes)
     return (

@@ -13,7 +13,7 @@ from itertools import count
 from operator import attrgetter
 
 from harness.archive.connectivity import Connectivity, Topology
-from harness.archive.tracks import PositionFix, Tracks, between
+from harness.archive.tracks import PositionFix, VehicleTracks, between
 from harness.present import svg
 from harness.report.chain_tree import ranges
 
@@ -159,7 +159,7 @@ def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, mo
 
 
 def flights(
-    vehicle: int, tracks: Tracks, network: Connectivity, all_divisions: Sequence[NetworkDivision], end_s: float
+    vehicle: int, tracks: VehicleTracks, network: Connectivity, all_divisions: Sequence[NetworkDivision], end_s: float
 ) -> Iterator[FlightPath]:
     """Yield the paths of a vehicle, and of the vehicles that replaced it after a loss."""
     wreck: PositionFix | None = None

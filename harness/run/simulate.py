@@ -13,7 +13,7 @@ from harness import checker
 from harness.archive.directory import default_path
 from harness.archive.exports import Export, ExportMaker
 from harness.archive.run_record import JudgedRecord
-from harness.archive.traces import Header, Trace
+from harness.archive.traces import Trace, TraceHeader
 from harness.checker import Evidence, Result
 from harness.checker.evidence import InjectedDatagram, RogueTraffic
 from harness.checker.judgement import Finding, Judgement
@@ -22,7 +22,7 @@ from harness.errors import AgentFailedError, MachineError, RunDirectoryError
 from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.mission import RunOutcome
-from harness.play.simulation.incarnations import Incarnation
+from harness.play.simulation.incarnations import SimulatedIncarnation
 from harness.play.simulation.run_files import header
 from harness.play.simulation.simulation import Simulation
 from harness.play.simulation.virtual_time import SimulationBackend
@@ -106,9 +106,9 @@ def run_to_end(story: Coroutine[Any, Any, Returned]) -> Returned:
     raise AssertionError("the coroutine waits")
 
 
-def _header(incarnation: Incarnation) -> Header:
+def _header(incarnation: SimulatedIncarnation) -> TraceHeader:
     named = header(incarnation)
-    return Header(**{**named, "schema": SCHEMA, "initial_data": in_base64(named["initial_data"])})
+    return TraceHeader(**{**named, "schema": SCHEMA, "initial_data": in_base64(named["initial_data"])})
 
 
 class MemoryRecorder:
@@ -121,7 +121,7 @@ class MemoryRecorder:
         self._kept: dict[int, Export] = {}
         self._injected = RogueTraffic()
 
-    def begin(self, incarnation: Incarnation) -> None:
+    def begin(self, incarnation: SimulatedIncarnation) -> None:
         if not self.tracing:
             return
         trace = self._traces.get(incarnation.agent.agent_id)
@@ -148,10 +148,10 @@ class MemoryRecorder:
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Do nothing, because the checker does not need positions."""
 
-    def keep_chains(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+    def keep_chains(self, at_s: float, incarnations: Iterable[SimulatedIncarnation]) -> None:
         self._kept = self._exports(at_s, incarnations)
 
-    def export(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+    def export(self, at_s: float, incarnations: Iterable[SimulatedIncarnation]) -> None:
         """Do nothing, because the checker reads the chains from the agents."""
 
     def evidence(self, simulation: Simulation) -> Evidence:
@@ -180,10 +180,10 @@ class MemoryRecorder:
             verified=simulation.verified,
         )
 
-    def _exports(self, at_s: float, incarnations: Iterable[Incarnation]) -> dict[int, Export]:
+    def _exports(self, at_s: float, incarnations: Iterable[SimulatedIncarnation]) -> dict[int, Export]:
         return {incarnation.agent.agent_id: self._export(at_s, incarnation) for incarnation in incarnations}
 
-    def _export(self, at_s: float, incarnation: Incarnation) -> Export:
+    def _export(self, at_s: float, incarnation: SimulatedIncarnation) -> Export:
         if incarnation.state is None:
             return Export.model_validate(incarnation.export(at_s))
         at_us = incarnation.timestamp_us(at_s)

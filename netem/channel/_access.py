@@ -9,7 +9,7 @@ import math
 from collections.abc import Collection
 from typing import Protocol
 
-from netem.channel._frame import Frame
+from netem.channel._frame import RadioFrame
 from netem.channel._parameters import LoraRadio, TimeSlotRadio, nanoseconds
 
 NEVER = 1 << 62
@@ -25,13 +25,13 @@ class ChannelAccess(Protocol):
     def take_due(self) -> list[int]:
         """Remove the stations that send at the time `next_due`, and return them."""
 
-    def wait(self, frame: Frame, now: int, active: Collection[Frame]) -> None:
+    def wait(self, frame: RadioFrame, now: int, active: Collection[RadioFrame]) -> None:
         """Choose the time at which the sender of `frame` sends it. `active` contains the frames that are being sent."""
 
-    def begun(self, frames: list[Frame], now: int) -> None:
+    def begun(self, frames: list[RadioFrame], now: int) -> None:
         """Process the beginning of frames that `take_due` returned before."""
 
-    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Collection[Frame]) -> None:
+    def ended(self, frame: RadioFrame, waiting: RadioFrame | None, now: int, active: Collection[RadioFrame]) -> None:
         """Process the end of `frame`. `waiting` is the next frame of its sender."""
 
     def too_long(self, airtime_ns: int) -> bool:
@@ -58,22 +58,22 @@ class DutyCycle:
         self.next_due = min(self._due.values(), default=NEVER)
         return stations
 
-    def wait(self, frame: Frame, now: int, active: Collection[Frame]) -> None:
+    def wait(self, frame: RadioFrame, now: int, active: Collection[RadioFrame]) -> None:
         due = self._due[frame.sender] = self._chosen(frame, max(now, self._silent_until[frame.sender]))
         self.next_due = min(self.next_due, due)
 
-    def begun(self, frames: list[Frame], now: int) -> None:
+    def begun(self, frames: list[RadioFrame], now: int) -> None:
         for frame in frames:
             self._silent_until[frame.sender] = now + math.ceil(frame.airtime_ns / self._duty)
 
-    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Collection[Frame]) -> None:
+    def ended(self, frame: RadioFrame, waiting: RadioFrame | None, now: int, active: Collection[RadioFrame]) -> None:
         if waiting is not None:
             self.wait(waiting, now, active)
 
     def too_long(self, airtime_ns: int) -> bool:
         return False
 
-    def _chosen(self, frame: Frame, earliest: int) -> int:
+    def _chosen(self, frame: RadioFrame, earliest: int) -> int:
         return earliest
 
 
@@ -89,7 +89,7 @@ class TimeSlots(DutyCycle):
     def too_long(self, airtime_ns: int) -> bool:
         return airtime_ns > self._usable
 
-    def _chosen(self, frame: Frame, earliest: int) -> int:
+    def _chosen(self, frame: RadioFrame, earliest: int) -> int:
         into = (earliest - frame.sender * self._turn) % self._round
         fits = into + frame.airtime_ns <= self._usable
         return earliest if fits else earliest - into + self._round

@@ -31,7 +31,7 @@ from random import Random
 
 from netem.channel._access import NEVER, ChannelAccess, DutyCycle, TimeSlots
 from netem.channel._contention import CarrierSense
-from netem.channel._frame import Frame, FrameFate, Transmission
+from netem.channel._frame import EndedTransmission, FrameFate, RadioFrame
 from netem.channel._links import RadioLinks, linear
 from netem.channel._parameters import NANOSECONDS, LoraRadio, Radio, TimeSlotRadio, WifiRadio, nanoseconds
 from netem.radio import Place
@@ -48,12 +48,12 @@ class Channel:
         self._access = _access(radio, vehicles, seed)
         energy_dbm = radio.energy_dbm if isinstance(radio, WifiRadio) else radio.sensitivity_dbm
         self._links = RadioLinks(len(vehicles), radio, energy_dbm, Random(f"{seed}/shadowing"))
-        self._queues: list[deque[Frame]] = [deque() for _ in vehicles]
-        self._active: list[Frame] = []
+        self._queues: list[deque[RadioFrame]] = [deque() for _ in vehicles]
+        self._active: list[RadioFrame] = []
         self._next_end = NEVER
         self._sending = 0
         """Stations that send, as bits."""
-        self._finished: list[Transmission] = []
+        self._finished: list[EndedTransmission] = []
         self._numbers = count()
         self._airtimes: dict[int, int | None] = {}
         """Data bytes -> nanoseconds; None if the radio cannot send a message of this length."""
@@ -79,7 +79,7 @@ class Channel:
         queue = self._queues[sender]
         if len(queue) >= self._radio.queue_frames:
             return FrameFate.QUEUE
-        frame = Frame(next(self._numbers), sender, data_bytes, now_ns, airtime)
+        frame = RadioFrame(next(self._numbers), sender, data_bytes, now_ns, airtime)
         queue.append(frame)
         if len(queue) == 1 and not self._sending >> sender & 1:
             self._access.wait(frame, now_ns, self._active)
@@ -91,7 +91,7 @@ class Channel:
         next_ns = ends if ends < due else due
         return None if next_ns == NEVER else next_ns / NANOSECONDS
 
-    def advance(self, now: float) -> list[Transmission]:
+    def advance(self, now: float) -> list[EndedTransmission]:
         """Play all events up to the time `now`, and return the transmissions that have ended since the last call, in
         order.
         """
@@ -146,7 +146,7 @@ class Channel:
         self._active += frames
         self._access.begun(sensed, now)
 
-    def _overlap(self, frames: list[Frame], now: int) -> list[Frame]:
+    def _overlap(self, frames: list[RadioFrame], now: int) -> list[RadioFrame]:
         """Decide which receivers begin to receive these frames, and which other frames are disturbed.
 
         Return the frames that further stations sense from now on.
@@ -174,7 +174,7 @@ class Channel:
                 frame.disturbed |= frame.receiving & ~_sufficient(frame, totals, suffices)
         return self._sum_energy(air, totals)
 
-    def _sum_energy(self, air: list[Frame], totals: Sequence[float]) -> list[Frame]:
+    def _sum_energy(self, air: list[RadioFrame], totals: Sequence[float]) -> list[RadioFrame]:
         """Let stations sense the total power of all frames, until it falls below their detection level.
 
         Return the frames that further stations sense from now on.
@@ -198,16 +198,16 @@ class Channel:
                     break
         return changed
 
-    def _end(self, frame: Frame, now: int) -> None:
+    def _end(self, frame: RadioFrame, now: int) -> None:
         self._active.remove(frame)
         self._next_end = min([other.ends_ns for other in self._active]) if self._active else NEVER
         self._sending &= ~(1 << frame.sender)
         queue = self._queues[frame.sender]
         self._access.ended(frame, queue[0] if queue else None, now, self._active)
-        self._finished.append(Transmission(frame))
+        self._finished.append(EndedTransmission(frame))
 
 
-def _sufficient(frame: Frame, totals: Sequence[float], ratio: float) -> int:
+def _sufficient(frame: RadioFrame, totals: Sequence[float], ratio: float) -> int:
     """Return the receivers (as bits) at which the power of the frame times `ratio` is at least the total power."""
     receivers = 0
     for number in [number for number, power in enumerate(frame.reach.powers) if power * ratio >= totals[number]]:

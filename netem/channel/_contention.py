@@ -16,7 +16,7 @@ from collections.abc import Collection, Iterable, Sequence
 from random import Random
 
 from netem.channel._access import NEVER
-from netem.channel._frame import Frame
+from netem.channel._frame import RadioFrame
 from netem.channel._parameters import WifiRadio, nanoseconds
 
 _WORD_BITS = 32
@@ -41,7 +41,7 @@ class CarrierSense:
         """When the station begins to count, or began."""
         self._resting: dict[int, int] = {}
         """Station that counts down after its last frame, without a further one -> when it has counted."""
-        self._over: deque[Frame] = deque()
+        self._over: deque[RadioFrame] = deque()
         """Frames that ended less than EIFS ago."""
 
     def take_due(self) -> list[int]:
@@ -50,7 +50,7 @@ class CarrierSense:
             del self._due[station]
         return stations
 
-    def wait(self, frame: Frame, now: int, active: Collection[Frame]) -> None:
+    def wait(self, frame: RadioFrame, now: int, active: Collection[RadioFrame]) -> None:
         station = frame.sender
         self._resting.pop(station, None)
         left = self._counted(station, now)
@@ -63,7 +63,7 @@ class CarrierSense:
         due = self._due[station] = max(now, self._from[station] + self._left[station] * self._slot)
         self.next_due = min(self.next_due, due)
 
-    def begun(self, frames: list[Frame], now: int) -> None:
+    def begun(self, frames: list[RadioFrame], now: int) -> None:
         """Let the stations that sense these frames wait. Stations that are due earlier send nevertheless.
 
         This runs for each frame and each waiting station, so it counts the slots itself.
@@ -105,7 +105,7 @@ class CarrierSense:
                     resting[station] = since + all_left[station] * slot
                     break
 
-    def ended(self, frame: Frame, waiting: Frame | None, now: int, active: Collection[Frame]) -> None:
+    def ended(self, frame: RadioFrame, waiting: RadioFrame | None, now: int, active: Collection[RadioFrame]) -> None:
         if failed := frame.receiving & frame.disturbed:
             self._wait_for_longer(failed, now)
         station = frame.sender
@@ -150,7 +150,7 @@ class CarrierSense:
     def _drawn(self, station: int) -> int:
         return self._draws[station].getrandbits(_WORD_BITS) * self._choices >> _WORD_BITS
 
-    def _busy_until(self, station: int, now: int, active: Iterable[Frame]) -> int:
+    def _busy_until(self, station: int, now: int, active: Iterable[RadioFrame]) -> int:
         """Return the time at which the frames end that the station senses now, or 0 if there are none."""
         began_by = now - self._sense
         return max(

@@ -31,7 +31,7 @@ class FrameFate(StrEnum):
 
 
 @dataclass(slots=True, eq=False)
-class Frame:
+class RadioFrame:
     """A frame. Times are nanoseconds. Sets of receivers are bits, as in `FrameReach`."""
 
     number: int
@@ -66,12 +66,12 @@ class Frame:
         return self.reach.heard & ~self.received & ~self.deaf
 
 
-class Transmission:
+class EndedTransmission:
     """A frame whose transmission has ended, with its result at each receiver."""
 
     __slots__ = ("_frame",)
 
-    def __init__(self, frame: Frame) -> None:
+    def __init__(self, frame: RadioFrame) -> None:
         self._frame = frame
 
     @property

@@ -14,7 +14,7 @@ import pytest
 from netem import estimates
 from netem.conditions import NetworkConditions
 from netem.engine import AppliedConditions, ReceiverFigures
-from netem.estimates import Estimate, Lateness, ReceivedStream
+from netem.estimates import Estimate, MachineLateness, ReceivedStream
 from netem.lab import EngineName, Lab
 from netem.link import Delay, GilbertElliott, LinkConditions
 from netem.measure import EngineMeasurement, MeasuredQuantity, NetworkStudy, measure, studies
@@ -22,12 +22,14 @@ from netem.observers import DisturbedError, PacketArrival, check, in_lab, in_med
 from tests.machine import require
 from tests.netem.conftest import PORT, Air, play
 
-NEVER_LATE = Lateness([0.0] * 10_000, [0.0] * 10)
+NEVER_LATE = MachineLateness([0.0] * 10_000, [0.0] * 10)
 SOME = 3000
 Z = 3.2905267314919255  # of 99.9 %, two-sided
 
 
-def received(arrivals: list[tuple[int, float]], sent_s: list[float], lateness: Lateness = NEVER_LATE) -> ReceivedStream:
+def received(
+    arrivals: list[tuple[int, float]], sent_s: list[float], lateness: MachineLateness = NEVER_LATE
+) -> ReceivedStream:
     return ReceivedStream(sent_s, sorted(arrivals, key=lambda arrival: arrival[1]), lateness)
 
 
@@ -90,13 +92,13 @@ def test_delay_excludes_the_lateness_of_the_machine() -> None:
     way_s = [0.001, 0.004] * 50
     sent_s = [float(number) for number in range(100)]
     arrivals = [(number, sent_s[number] + 0.1 + way_s[number]) for number in range(100)]
-    mean = estimates.delay_mean(received(arrivals, sent_s, Lateness(way_s, [0.002, 0.002])))
+    mean = estimates.delay_mean(received(arrivals, sent_s, MachineLateness(way_s, [0.002, 0.002])))
     assert (mean.measured, mean.high) == pytest.approx((0.1, 0.1))
     assert mean.low == pytest.approx(0.098)  # possible lateness of timers
-    deviation = estimates.delay_deviation(received(arrivals, sent_s, Lateness(way_s, [0.0, 0.0])))
+    deviation = estimates.delay_deviation(received(arrivals, sent_s, MachineLateness(way_s, [0.0, 0.0])))
     assert (deviation.low, deviation.high) == pytest.approx((0, 0), abs=1e-9)
     jittered = [(number, sent_s[number] + (0.09, 0.11)[number % 2]) for number in range(100)]
-    deviation = estimates.delay_deviation(received(jittered, sent_s, Lateness([0.0] * 100, [0.0, 0.004])))
+    deviation = estimates.delay_deviation(received(jittered, sent_s, MachineLateness([0.0] * 100, [0.0, 0.004])))
     assert (deviation.measured, deviation.high) == pytest.approx((0.01, 0.01))
     assert deviation.low == pytest.approx(math.sqrt(0.01**2 - 0.002**2))  # timers may have added theirs
 
@@ -107,7 +109,7 @@ def test_rate_is_measured_in_the_longest_queue() -> None:
     at_s = [0.01, 0.02, 0.03, 0.04, 0.05, 1.01, 1.02]
     found = estimates.rate(received(list(enumerate(at_s)), sent_s), packet_bits=1000)
     assert (found.measured, found.packets) == (pytest.approx(100_000), 5)
-    late = Lateness([0.0, 0.003], [0.001])
+    late = MachineLateness([0.0, 0.003], [0.001])
     found = estimates.rate(received(list(enumerate(at_s)), sent_s, late), packet_bits=1000)
     assert (found.low, found.high) == pytest.approx((4000 / 0.044, 4000 / 0.036))
 

@@ -12,10 +12,10 @@ from sitl._kinematics import (
     ClimbingSegment,
     FallSegment,
     LocalPlace,
+    MotionSegment,
     MotionState,
     PlannedMotion,
     RestSegment,
-    Segment,
     StraightLine,
     end_of,
 )
@@ -135,5 +135,5 @@ def test_plane_passes_close_to_every_place(place: LocalPlace, north: float, east
     start = MotionState(north, east, 50, 22 * math.cos(yaw), 22 * math.sin(yaw), yaw_rad=yaw)
     there = end_of(MODELS["plane"].go_to(start, place, 22))
     assert math.dist(there.point[:2], place[:2]) <= 50 + 1e-3
-    circle: list[Segment] = [*MODELS["plane"].loiter(start, place, 22, 30)]
+    circle: list[MotionSegment] = [*MODELS["plane"].loiter(start, place, 22, 30)]
     assert math.dist(end_of(circle).point[:2], place[:2]) == pytest.approx(LOITER_RADIUS_M)

@@ -27,7 +27,7 @@ from ucp.trace import RecordedBytes
 _DATAGRAM = b"UCP datagram\0"
 
 
-class Request(NamedTuple):
+class AnsweredRequest(NamedTuple):
     """The request that a response answers, identified by its sender, boot and sequence."""
 
     sender: int
@@ -35,7 +35,7 @@ class Request(NamedTuple):
     sequence: int
 
 
-NO_REQUEST = Request(0, bytes(BOOT_BYTES), 0)
+NO_REQUEST = AnsweredRequest(0, bytes(BOOT_BYTES), 0)
 """The value in a response that answers no request. No real request has the sender 0."""
 
 
@@ -46,7 +46,7 @@ class OpenedDatagram(NamedTuple):
     datagram: Datagram
     recorded: RecordedBytes
     """The datagram of version 1 with the same content, as the trace records it."""
-    request: Request | None
+    request: AnsweredRequest | None
     """The request that it answers. None if it is not a response."""
     block_signature: bytes
 
@@ -82,7 +82,7 @@ def parse_body(clear: ClearHeader, body: bytes) -> OpenedDatagram:
     if clear.type in REQUEST_OF:
         if len(body) < REQUEST.size:
             raise MalformedDatagramError("wrong length")
-        request, body = Request(*REQUEST.unpack_from(body)), body[REQUEST.size :]
+        request, body = AnsweredRequest(*REQUEST.unpack_from(body)), body[REQUEST.size :]
     if clear.type in WITH_BLOCK:
         if len(body) < SIGNATURE_BYTES:
             raise MalformedDatagramError("wrong length")

@@ -21,7 +21,7 @@ from ucp.secure._signatures import BlockSignatures
 from ucp.secure.envelope import BOOT_BYTES, CHALLENGE, LAST_SEQUENCE, REQUESTS, REVOCATION, ClearHeader
 from ucp.secure.export_head import head_of
 from ucp.secure.revocation import RevocationError
-from ucp.secure.sealed_datagrams import OpenedDatagram, Request
+from ucp.secure.sealed_datagrams import AnsweredRequest, OpenedDatagram
 from ucp.secure.session import Session
 from ucp.store import SecuredState, StoredState
 from ucp.trace import CommandEntry, RecordedBytes, in_base64
@@ -64,7 +64,7 @@ class SecuredAgent(Agent):
         self.problem: str | None = None
         """The reason why the agent sends no more. None if it sends."""
         self._signatures = BlockSignatures(session, self.state)
-        self._answered_requests: dict[int, Request] = {}
+        self._answered_requests: dict[int, AnsweredRequest] = {}
         """Sequence of a response in the outbox -> the request that it answers."""
         self._exports = 0
         self._now = 0.0
@@ -146,7 +146,7 @@ class SecuredAgent(Agent):
         outbox_length = len(self._core.outbox)
         super().receive_message(sender, sequence, message, now, opened.recorded)
         if clear.type in REQUESTS:
-            request = Request(sender, clear.boot, sequence)
+            request = AnsweredRequest(sender, clear.boot, sequence)
             self._answered_requests.update((answer, request) for answer, _, _ in self._core.outbox[outbox_length:])
         if type(message) in CARRY_A_BLOCK:
             self._signatures.forget_unless_held(message.block)  # type: ignore[union-attr]

@@ -37,9 +37,9 @@ from ucp.secure.envelope import (
 from ucp.secure.sealed_datagrams import (
     CRYPTO_FUNCTIONS,
     NO_REQUEST,
+    AnsweredRequest,
     CryptoFunctions,
     OpenedDatagram,
-    Request,
     decrypted,
     signing_domain,
 )
@@ -50,7 +50,7 @@ REVOCATIONS_PER_S = 50.0
 """Wrong signatures of the authority that a receiver verifies in a mission second."""
 
 
-class _Incarnation:
+class _SenderIncarnation:
     """The newest known incarnation of another sender, with its accepted sequence numbers and its newest requests."""
 
     __slots__ = ("boot", "control", "latest_boot", "requests", "window")
@@ -100,15 +100,15 @@ class Session:
         self.challenges = PendingChallenges()
         self._is_complete: bool | None = None
         """True if this vehicle has received all datagrams of the mission that it accepts. None before the start."""
-        self._held: dict[int, _Incarnation] = {}
+        self._held: dict[int, _SenderIncarnation] = {}
         """Senders that have answered a challenge, before this vehicle trusts them."""
         self._echoed_at: dict[int, float] = {}
-        self._echoes: list[Request] = []
+        self._echoes: list[AnsweredRequest] = []
         """The challenges to answer."""
         self._next_sequence = 0
         """The sequence after the greatest one that this vehicle has sent."""
         self._domain = signing_domain(self.mission)
-        self._incarnations: dict[int, _Incarnation] = {}
+        self._incarnations: dict[int, _SenderIncarnation] = {}
         self._control = 0
         """Sequence of the next control datagram."""
         per_s = wrong_signatures_per_s / len(self.public_keys)
@@ -129,7 +129,12 @@ class Session:
     # To the air
 
     def seal(
-        self, sequence: int, message: Message, request: Request | None, block_signature: bytes | None, revocations: int
+        self,
+        sequence: int,
+        message: Message,
+        request: AnsweredRequest | None,
+        block_signature: bytes | None,
+        revocations: int,
     ) -> bytes:
         """Return the sealed datagram of a message. The caller must use each sequence once, up to LAST_SEQUENCE."""
         self.record_sent(sequence, message)
@@ -220,7 +225,7 @@ class Session:
             raise MalformedDatagramError("replayed")
         body = self._authenticate(datagram, clear, now)
         if incarnation is None or clear.boot != incarnation.boot:
-            incarnation = self._incarnations[clear.sender] = _Incarnation(clear.boot)
+            incarnation = self._incarnations[clear.sender] = _SenderIncarnation(clear.boot)
         incarnation.window.accept(clear.sequence)
         self.epochs.follow(clear.epoch)
         if clear.type in REQUESTS:
@@ -256,12 +261,12 @@ class Session:
             raise MalformedDatagramError("wrong length")
         if is_new:
             if incarnation is None or clear.boot != incarnation.boot:
-                incarnation = self._incarnations[clear.sender] = _Incarnation(clear.boot)
+                incarnation = self._incarnations[clear.sender] = _SenderIncarnation(clear.boot)
             incarnation.control = clear.sequence
         self.epochs.follow(clear.epoch)
         if int.from_bytes(body, "big") in (ALL, self.agent_id):
             self._echoed_at[clear.sender] = now
-            self._echoes.append(Request(clear.sender, clear.boot, clear.sequence))
+            self._echoes.append(AnsweredRequest(clear.sender, clear.boot, clear.sequence))
 
     def receive_echo(self, datagram: bytes, clear: ClearHeader, now: float) -> None:
         """Accept the sender of an echo, if it answers a challenge of this vehicle. Raises MalformedDatagramError."""
@@ -270,7 +275,7 @@ class Session:
         _, body, _ = self._decrypt(datagram, clear)
         if len(body) != REQUEST.size + 4:
             raise MalformedDatagramError("wrong length")
-        request = Request(*REQUEST.unpack_from(body))
+        request = AnsweredRequest(*REQUEST.unpack_from(body))
         is_own = (request.sender, request.boot) == (self.agent_id, self.boot)
         if not is_own or not self.challenges.is_pending(request.sequence, clear.sender):
             raise MalformedDatagramError("answers no request")
@@ -279,7 +284,7 @@ class Session:
         known = self._incarnations.get(clear.sender)
         if known is None or known.boot != clear.boot:
             first, latest_boot = int.from_bytes(body[REQUEST.size :], "big"), known.latest_boot if known else b""
-            self._held[clear.sender] = _Incarnation(clear.boot, first, latest_boot)
+            self._held[clear.sender] = _SenderIncarnation(clear.boot, first, latest_boot)
             self._trust_held(now)
 
     def _trust_held(self, now: float) -> None:
@@ -311,7 +316,7 @@ class Session:
         """Take a token for a wrong signature from the budget of the sender."""
         self._budgets[sender].take()
 
-    def is_newest_request(self, request: Request, code: int) -> bool:
+    def is_newest_request(self, request: AnsweredRequest, code: int) -> bool:
         """Return true if a response of type `code` counts. It does not count if a newer request of its type by the same
         sender is known.
 

@@ -5,7 +5,7 @@ import socket
 from collections.abc import Callable
 from functools import partial
 
-from ucp.loop import Loop, Timer
+from ucp.loop import Loop, ScheduledCall
 
 MAX_READ_BYTES = 65536
 
@@ -36,7 +36,7 @@ class VehicleConnection:
         self._sink = sink
         self._retry_s = _FIRST_RETRY_S
         self._socket: socket.socket | None = None
-        self._retry_timer: Timer | None = None
+        self._retry_timer: ScheduledCall | None = None
         """The timer of the next attempt to connect, or of the next request."""
         self._connect()
 

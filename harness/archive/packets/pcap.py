@@ -47,7 +47,7 @@ class Frame(NamedTuple):
     length: int
 
 
-class _Interface(NamedTuple):
+class _CaptureInterface(NamedTuple):
     link_type: int
     units_per_second: int
     offset_ns: int
@@ -118,7 +118,7 @@ class CaptureFile:
             yield Frame(seconds * 1_000_000_000 + fraction * fraction_ns, 0, network & 0xFFFF, data, length)
 
     def _pcapng(self, file: BinaryIO) -> Iterator[Frame]:
-        interfaces: list[_Interface] = []
+        interfaces: list[_CaptureInterface] = []
         packet = struct.Struct("<5I")
         for offset, order, kind, body in _blocks(file):
             try:
@@ -145,7 +145,7 @@ class CaptureFile:
             except (struct.error, IndexError):
                 raise _damaged(offset) from None
 
-    def _statistics(self, order: str, body: bytes, interfaces: list[_Interface]) -> None:
+    def _statistics(self, order: str, body: bytes, interfaces: list[_CaptureInterface]) -> None:
         number, high, low = struct.unpack_from(order + "3I", body)
         interface, options = interfaces[number], _options(order, body[12:])
         ended = _halves(order, options[_ENDED]) if _ENDED in options else high << 32 | low
@@ -180,13 +180,13 @@ def _blocks(file: BinaryIO) -> Iterator[tuple[int, str, int, bytes]]:
         offset += length
 
 
-def _interface(order: str, body: bytes) -> _Interface:
+def _interface(order: str, body: bytes) -> _CaptureInterface:
     (link_type,) = struct.unpack_from(order + "H", body)
     options = _options(order, body[8:])
     exponent = options.get(_RESOLUTION, b"\x06")[0]
     resolution: int = 2 ** (exponent & 127) if exponent & 128 else 10**exponent
     (offset_s,) = struct.unpack(order + "q", options.get(_OFFSET, bytes(8)))
-    return _Interface(link_type, resolution, offset_s * 1_000_000_000)
+    return _CaptureInterface(link_type, resolution, offset_s * 1_000_000_000)
 
 
 def _direction(order: str, options: bytes) -> int:

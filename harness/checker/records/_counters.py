@@ -6,7 +6,7 @@ from itertools import pairwise
 
 from harness.archive.run_record import AgentRecord, HandlerRuns
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Incarnation
+from harness.checker._trace_replay import ReplayedIncarnation
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
@@ -47,13 +47,15 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
             )
 
 
-def _ran_nothing_since(recorded: AgentRecord, incarnation: Incarnation) -> bool:
+def _ran_nothing_since(recorded: AgentRecord, incarnation: ReplayedIncarnation) -> bool:
     """Return true if the agent ran no handler after it last reported its counters."""
     counted = recorded.handler_runs[-1] if recorded.handler_runs else None
     return counted is None or counted.counted == len(incarnation.runs)
 
 
-def _incarnations(agent_id: int, recorded: AgentRecord, incarnations: list[Incarnation]) -> Iterator[Contradiction]:
+def _incarnations(
+    agent_id: int, recorded: AgentRecord, incarnations: list[ReplayedIncarnation]
+) -> Iterator[Contradiction]:
     expected = 1 + recorded.restarts + recorded.reboots
     if len(incarnations) != expected:
         detail = (
@@ -64,7 +66,7 @@ def _incarnations(agent_id: int, recorded: AgentRecord, incarnations: list[Incar
 
 
 def _handler_runs(
-    agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[Incarnation]
+    agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
     """Yield a contradiction if the trace has fewer or more lines than the number of handler runs that the agent
     counted.
@@ -90,7 +92,7 @@ def _handler_runs(
             yield of_agent(agent_id, detail, "1", short=counted.counted > at_most)
 
 
-def _lines_by(incarnation: Incarnation, counted: HandlerRuns) -> tuple[int, int]:
+def _lines_by(incarnation: ReplayedIncarnation, counted: HandlerRuns) -> tuple[int, int]:
     """Return the smallest and the largest number of trace lines that fit the time at which the agent reported its
     counters.
     """
@@ -104,7 +106,7 @@ def _lines_by(incarnation: Incarnation, counted: HandlerRuns) -> tuple[int, int]
 
 
 def _counted(
-    evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[Incarnation]
+    evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
     """Compare the counters with the sums over all incarnations of the agent, that is, over all its restarts."""
     sent = sum(incarnation.sent for incarnation in incarnations)
@@ -171,7 +173,7 @@ def _dropped(agent_id: int, recorded: AgentRecord, trace: Trace) -> Iterator[Con
             yield of_agent(agent_id, detail, short=True)
 
 
-def _chain_changed_at(incarnation: Incarnation) -> float:
+def _chain_changed_at(incarnation: ReplayedIncarnation) -> float:
     for run in reversed(incarnation.runs):
         if any(operation.startswith("chain") for operation, _ in run.changes):
             return run.t
@@ -210,7 +212,9 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
             yield _of_block(evidence, agent_id, detail, exported[0])
 
 
-def _over_brown_outs(evidence: Evidence, agent_id: int, incarnations: list[Incarnation]) -> Iterator[Contradiction]:
+def _over_brown_outs(
+    evidence: Evidence, agent_id: int, incarnations: list[ReplayedIncarnation]
+) -> Iterator[Contradiction]:
     """Yield completed blocks that an agent lost when it restarted from its disk. One line before the power loss may be
     missing in the trace.
     """

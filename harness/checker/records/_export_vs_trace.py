@@ -10,7 +10,7 @@ from dataclasses import astuple
 
 from harness.archive.exports import Export
 from harness.archive.traces import Trace
-from harness.checker._trace_replay import Incarnation, TraceObservation
+from harness.checker._trace_replay import ReplayedIncarnation, TraceObservation
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import ROUNDED_S, Contradiction, mission_s, of_agent, slack_s
@@ -83,7 +83,7 @@ def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
     return states
 
 
-def _completed_when(export: Export, incarnations: list[Incarnation]) -> list[list[str]]:
+def _completed_when(export: Export, incarnations: list[ReplayedIncarnation]) -> list[list[str]]:
     """Return the completed blocks of each incarnation of the agent (the time between two restarts) up to its export."""
     at_s = mission_s(export.exported_at_us, incarnations[0].trace.header)
     if at_s is None:
@@ -94,7 +94,7 @@ def _completed_when(export: Export, incarnations: list[Incarnation]) -> list[lis
     return [[block for run in runs for operation, block in run.changes if operation == "complete"] for runs in by_then]
 
 
-def _last_state(incarnations: list[Incarnation], export: Export) -> StateSummary:
+def _last_state(incarnations: list[ReplayedIncarnation], export: Export) -> StateSummary:
     runs = incarnations[-1].runs
     return (
         runs[-1].state if runs else StateSummary(0, 0, 0, reconciling=False, idle=True, top=export.inception.chain_hash)
@@ -118,7 +118,7 @@ def _value(value: object) -> str:
     return value[:12] if isinstance(value, str) else str(value).lower()
 
 
-def _contents(agent_id: int, export: Export, incarnation: Incarnation) -> Iterator[Contradiction]:
+def _contents(agent_id: int, export: Export, incarnation: ReplayedIncarnation) -> Iterator[Contradiction]:
     """Yield differences between the blocks of an export and those of the trace, if both have the same lengths and top
     chain hash.
     """
@@ -145,7 +145,7 @@ def compare_with_itself(evidence: Evidence) -> Iterator[Contradiction]:
         yield from _between_incarnations(evidence, agent_id, incarnations)
 
 
-def _in_incarnation(evidence: Evidence, agent_id: int, incarnation: Incarnation) -> Iterator[Contradiction]:
+def _in_incarnation(evidence: Evidence, agent_id: int, incarnation: ReplayedIncarnation) -> Iterator[Contradiction]:
     for observations, touches in (
         (incarnation.impossible, "3"),
         (incarnation.wrong_lengths, "3"),
@@ -165,7 +165,7 @@ def finding(evidence: Evidence, agent_id: int, observation: TraceObservation) ->
 
 
 def _between_incarnations(
-    evidence: Evidence, agent_id: int, incarnations: list[Incarnation]
+    evidence: Evidence, agent_id: int, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
     slack = slack_s(evidence.traces[agent_id])
     now = 0.0

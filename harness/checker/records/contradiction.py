@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from harness.archive.traces import Header, Trace
+from harness.archive.traces import Trace, TraceHeader
 from harness.checker._waiting import SLACK_WALL_S
 from harness.checker.judgement import Finding
 from ucp.clock import MICROSECONDS
@@ -45,7 +45,7 @@ def slack_s(trace: Trace) -> float:
     return SLACK_WALL_S * speedup
 
 
-def mission_s(timestamp_us: int, header: Header) -> float | None:
+def mission_s(timestamp_us: int, header: TraceHeader) -> float | None:
     """Return the mission second at which the agent's clock showed this time, or None if the header does not describe
     the clock.
     """

@@ -4,16 +4,17 @@ Recorded runs of other implementations are judged by this module, so it favours 
 pseudo-code over short code. Its author worked from the thesis and the readings of the thesis, and did not see `ucp`.
 "Reading 4" in a docstring means number 4 of docs/reference/readings.md.
 
-Each algorithm is one function. It reads and changes a `State` and returns the name of the branch that it took. An input
-is a message, an expired timer, a logged event or a command. A handler is atomic: it runs to its end, then the local
-events that it triggered run in order, then the next input follows. Therefore the locks of the thesis are absent
-(reading 15). Nothing here does I/O or reads a clock. Messages collect in `State.outbox`. Each input brings the time.
+Each algorithm is one function. It reads and changes a `ReferenceState` and returns the name of the branch that it took.
+An input is a message, an expired timer, a logged event or a command. A handler is atomic: it runs to its end, then the
+local events that it triggered run in order, then the next input follows. Therefore the locks of the thesis are absent
+(reading 15). Nothing here does I/O or reads a clock. Messages collect in `ReferenceState.outbox`. Each input brings the
+time.
 """
 
 from collections.abc import Callable
 from typing import TypeVar
 
-from harness.checker.reference.state import Handler, State
+from harness.checker.reference.state import Handler, ReferenceState
 from ucp.block import LATEST_US, Block, next_chain_hash
 from ucp.events import LoggableEvent
 from ucp.messages import (
@@ -73,7 +74,7 @@ def _algorithm(
 
 
 @_algorithm(1, local_event="Build Data Block")
-def build_data_block(state: State, event: LoggableEvent) -> str:
+def build_data_block(state: ReferenceState, event: LoggableEvent) -> str:
     """Algorithm 1, Build Data Block (Section 3.6.1): add an event to the current block (reading 1)."""
     state.current_block += event.encode()
     if len(state.current_block) + state.settings.max_event_bytes >= state.settings.max_block_bytes:
@@ -93,7 +94,7 @@ def build_data_block(state: State, event: LoggableEvent) -> str:
 
 
 @_algorithm(2, local_event="Process Next Deque Block", tally="vote_count")
-def process_next_deque_block(state: State) -> str:
+def process_next_deque_block(state: ReferenceState) -> str:
     """Algorithm 2, Process Next Deque Block (Section 3.6.2): propose the front block of the deque (reading 2)."""
     if state.reconcile_in_progress:
         return "reconcile in progress"
@@ -111,7 +112,7 @@ def process_next_deque_block(state: State) -> str:
 
 
 @_algorithm(3, message=BlockAddRequest)
-def receive_request_add_block(state: State, sender: int, message: BlockAddRequest) -> str:
+def receive_request_add_block(state: ReferenceState, sender: int, message: BlockAddRequest) -> str:
     """Algorithm 3, Receive Request Add Block (Section 3.6.2): vote on another agent's proposal (reading 3)."""
     if state.reconcile_in_progress:
         return "reconcile in progress"
@@ -122,7 +123,7 @@ def receive_request_add_block(state: State, sender: int, message: BlockAddReques
 
 
 @_algorithm(4, message=BlockAddResponse, tally="vote_count")
-def receive_vote_add_block(state: State, sender: int, message: BlockAddResponse) -> str:
+def receive_vote_add_block(state: ReferenceState, sender: int, message: BlockAddResponse) -> str:
     """Algorithm 4, Receive Vote Add Block (Section 3.6.2): count a vote on the agent's own proposal (reading 3)."""
     if not state.voting_timer.active:
         return "no vote running"
@@ -139,7 +140,7 @@ def receive_vote_add_block(state: State, sender: int, message: BlockAddResponse)
 
 
 @_algorithm(5, timer="voting")
-def vote_timer_expiration(state: State) -> str:
+def vote_timer_expiration(state: ReferenceState) -> str:
     """Algorithm 5, Vote Timer Expiration (Section 3.6.2): commit the proposed block, vote again or reconcile.
 
     Reading 4 votes again if the chain changed during an approved vote. Reading 5 has the order of the two tests, and
@@ -167,7 +168,7 @@ def vote_timer_expiration(state: State) -> str:
 
 
 @_algorithm(6, message=CommitBlock)
-def receive_commit_block(state: State, sender: int, message: CommitBlock) -> str:
+def receive_commit_block(state: ReferenceState, sender: int, message: CommitBlock) -> str:
     """Algorithm 6, Receive Commit Block (Section 3.6.2): commit another agent's block (reading 6).
 
     Characteristic 3 refuses a block that the agent holds already.
@@ -186,7 +187,7 @@ def receive_commit_block(state: State, sender: int, message: CommitBlock) -> str
 
 
 @_algorithm(7, local_event="Reconcile Begin")
-def reconcile_begin(state: State) -> str:
+def reconcile_begin(state: ReferenceState) -> str:
     """Algorithm 7, Reconcile Begin (Section 3.6.3). An active voting timer continues (reading 10)."""
     if state.reconcile_in_progress:
         return "already in progress"
@@ -198,7 +199,7 @@ def reconcile_begin(state: State) -> str:
 
 
 @_algorithm(8, local_event="Reconcile Phase 1", tally="reconcile_vote_count")
-def reconcile_phase_1(state: State) -> str:
+def reconcile_phase_1(state: ReferenceState) -> str:
     """Algorithm 8, Reconcile Phase 1 (Section 3.6.3): ask which neighbours' chains contain the own top block."""
     state.reconcile_vote_count = {"yes": 0, "no": 0}
     state.reconcile_responders = set()
@@ -208,7 +209,7 @@ def reconcile_phase_1(state: State) -> str:
 
 
 @_algorithm(9, message=ChainContainQuery)
-def receive_request_chain_contain(state: State, sender: int, message: ChainContainQuery) -> str:
+def receive_request_chain_contain(state: ReferenceState, sender: int, message: ChainContainQuery) -> str:
     """Algorithm 9, Receive Request Chain Contain (Section 3.6.3): answer a Chain Contain Query (reading 7)."""
     if state.reconcile_in_progress:
         return "reconcile in progress"
@@ -218,7 +219,7 @@ def receive_request_chain_contain(state: State, sender: int, message: ChainConta
 
 
 @_algorithm(10, message=ChainContainResponse, tally="reconcile_vote_count")
-def receive_phase_1_response(state: State, sender: int, message: ChainContainResponse) -> str:
+def receive_phase_1_response(state: ReferenceState, sender: int, message: ChainContainResponse) -> str:
     """Algorithm 10, Receive Phase 1 Response (Section 3.6.3): count one answer per responder (Section 4.1)."""
     if not state.phase_one_timer.active:
         return "not in phase 1"
@@ -233,7 +234,7 @@ def receive_phase_1_response(state: State, sender: int, message: ChainContainRes
 
 
 @_algorithm(11, timer="phase one")
-def reconcile_phase_1_timer_expiration(state: State) -> str:
+def reconcile_phase_1_timer_expiration(state: ReferenceState) -> str:
     """Algorithm 11, Reconcile Phase 1 Timer Expiration (Section 3.6.3): pop the top block or go to phase 2 (reading 8).
 
     The inception block is never popped (reading 8).
@@ -256,7 +257,7 @@ def reconcile_phase_1_timer_expiration(state: State) -> str:
 
 
 @_algorithm(12, local_event="Reconcile Phase 2", tally="reconcile_response_dictionary")
-def reconcile_phase_2(state: State) -> str:
+def reconcile_phase_2(state: ReferenceState) -> str:
     """Algorithm 12, Reconcile Phase 2 (Section 3.6.3): ask which block follows the top of the agent's own chain
     (reading 9).
     """
@@ -268,7 +269,7 @@ def reconcile_phase_2(state: State) -> str:
 
 
 @_algorithm(13, message=ChainHashSuccessorQuery)
-def receive_request_next_in_sequence(state: State, sender: int, message: ChainHashSuccessorQuery) -> str:
+def receive_request_next_in_sequence(state: ReferenceState, sender: int, message: ChainHashSuccessorQuery) -> str:
     """Algorithm 13, Receive Request Next in Sequence (Section 3.6.3): name the successor (readings 9 and 10).
 
     An agent whose chain does not contain the chain hash has diverged and begins a reconcile.
@@ -287,7 +288,7 @@ def receive_request_next_in_sequence(state: State, sender: int, message: ChainHa
 
 
 @_algorithm(14, message=NextInSequenceResponse, tally="reconcile_response_dictionary")
-def receive_response_next_in_sequence(state: State, sender: int, message: NextInSequenceResponse) -> str:
+def receive_response_next_in_sequence(state: ReferenceState, sender: int, message: NextInSequenceResponse) -> str:
     """Algorithm 14, Receive Response Next in Sequence (Section 3.6.3): count a candidate (reading 9, Section 4.1)."""
     if not state.phase_two_timer.active:
         return "not in phase 2"
@@ -305,7 +306,7 @@ def receive_response_next_in_sequence(state: State, sender: int, message: NextIn
 
 
 @_algorithm(15, timer="phase two", tally="majority_response_block_hash")
-def reconcile_phase_2_timer_expiration(state: State) -> str:
+def reconcile_phase_2_timer_expiration(state: ReferenceState) -> str:
     """Algorithm 15, Reconcile Phase 2 Timer Expiration (Section 3.6.3): choose the majority response (reading 9).
 
     Ties go to the oldest timestamp, then to the lowest hash. "Is Top Of Chain" sorts below every hash. The setting
@@ -334,7 +335,7 @@ def reconcile_phase_2_timer_expiration(state: State) -> str:
 
 
 @_algorithm(16, local_event="Reconcile Phase 3")
-def reconcile_phase_3(state: State) -> str:
+def reconcile_phase_3(state: ReferenceState) -> str:
     """Algorithm 16, Reconcile Phase 3 (Section 3.6.3): get the chosen block.
 
     Reading 11 continues with phase 2 after a block from the own stack. Characteristic 3 gives up a block that the
@@ -358,7 +359,7 @@ def reconcile_phase_3(state: State) -> str:
 
 
 @_algorithm(17, message=RequestForBlock)
-def receive_request_block_for_hash(state: State, sender: int, message: RequestForBlock) -> str:
+def receive_request_block_for_hash(state: ReferenceState, sender: int, message: RequestForBlock) -> str:
     """Algorithm 17, Receive Request Block for Hash (Section 3.6.3): send a block of the local chain."""
     if state.reconcile_in_progress:
         return "reconcile in progress"
@@ -370,7 +371,7 @@ def receive_request_block_for_hash(state: State, sender: int, message: RequestFo
 
 
 @_algorithm(18, message=BlockResponse)
-def receive_response_block_for_hash(state: State, sender: int, message: BlockResponse) -> str:
+def receive_response_block_for_hash(state: ReferenceState, sender: int, message: BlockResponse) -> str:
     """Algorithm 18, Receive Response Block for Hash (Section 3.6.3): commit the requested block (reading 12).
 
     The pause has no effect, because handlers are atomic (reading 12).
@@ -389,7 +390,7 @@ def receive_response_block_for_hash(state: State, sender: int, message: BlockRes
 
 
 @_algorithm(19, timer="phase three")
-def reconcile_phase_3_timer_expiration(state: State) -> str:
+def reconcile_phase_3_timer_expiration(state: ReferenceState) -> str:
     """Algorithm 19, Reconcile Phase 3 Timer Expiration (Section 3.6.3): abandon the chosen block (reading 13)."""
     state.majority_response_block_hash = None
     state.trigger("Reconcile Finalize")
@@ -397,7 +398,7 @@ def reconcile_phase_3_timer_expiration(state: State) -> str:
 
 
 @_algorithm(20, timer="finalize gap", local_event="Reconcile Finalize")
-def reconcile_finalize(state: State) -> str:
+def reconcile_finalize(state: ReferenceState) -> str:
     """Algorithm 20, Reconcile Finalize (Section 3.6.3): commit the remaining blocks of the reconcile stack again.
 
     Reading 14 pauses between two commits; the flag `reconcile_in_progress` stays set meanwhile. The setting
@@ -418,7 +419,7 @@ def reconcile_finalize(state: State) -> str:
     return "done"
 
 
-def tally_of(state: State, handler: Handler) -> Tally | None:
+def tally_of(state: ReferenceState, handler: Handler) -> Tally | None:
     """Return a copy of the votes or candidates that a handler counts, or the candidate that it chose. Hashes are
     hexadecimal.
     """

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
-from harness.checker.reference.state import Handler, Settings, State, Timer
+from harness.checker.reference.state import Handler, ReferenceState, Settings, Timer
 from ucp.events import LoggableEvent
 from ucp.messages import MalformedDatagramError, Message, decode, encode
 from ucp.store import StoredState
@@ -35,7 +35,7 @@ class ReferenceAgent:
     ) -> None:
         self.agent_id = agent_id
         self.roster = frozenset(roster)
-        self.state = State(agent_id, initial_data, settings)
+        self.state = ReferenceState(agent_id, initial_data, settings)
         self._after_each = after_each
         self._outbox: list[tuple[int, Message]] = []
         self._trace: list[HandlerRun] = []

@@ -139,7 +139,7 @@ class Handler:
     tally: str | None = None
 
 
-class State:
+class ReferenceState:
     """The state of one agent: the variables of the pseudo-code, and the recorded effects of the current handler."""
 
     running: Handler

@@ -2,15 +2,15 @@
 deviation.
 
 After a deviation the judge continues from the agent's own state. `AdoptingCore` adds this ability to any core that has
-the attributes of the reference's `State`: to the reference, by which agents are judged, and to the core in use, for a
-debugger and for `bisect` (`harness.checker.steps.core_in_use`).
+the attributes of the reference's `ReferenceState`: to the reference, by which agents are judged, and to the core in
+use, for a debugger and for `bisect` (`harness.checker.steps.core_in_use`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from harness.checker.recorded_inputs import BlockIndex, NotOnRecordError, decoded
-from harness.checker.reference.state import State, Timer
+from harness.checker.reference.state import ReferenceState, Timer
 from ucp.block import HASH_BYTES, Block
 from ucp.messages import (
     BlockAddRequest,
@@ -35,7 +35,7 @@ class StateBeforeStep(NamedTuple):
 
 
 if TYPE_CHECKING:
-    _Core = State
+    _Core = ReferenceState
 else:
     _Core = object
 

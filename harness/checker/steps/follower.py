@@ -22,7 +22,7 @@ from harness.checker.recorded_inputs import (
 )
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_TIMER
-from harness.checker.reference.state import Handler, State, Timer
+from harness.checker.reference.state import Handler, ReferenceState, Timer
 from harness.checker.steps._adopting_core import StateBeforeStep
 from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.implementation import REFERENCE, CoreImplementation
@@ -189,7 +189,7 @@ class StepComparer:
         self._began = True
 
     @property
-    def state(self) -> State:
+    def state(self) -> ReferenceState:
         """The present state of the reference implementation. Callers must not change it."""
         return self._core
 

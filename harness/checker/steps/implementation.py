@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
-from harness.checker.reference.state import Settings, State
+from harness.checker.reference.state import ReferenceState, Settings
 from harness.checker.steps._adopting_core import AdoptingCore
 from harness.checker.steps.trace_header import CheckedHeader
 
 
-class ReferenceCore(AdoptingCore, State):
+class ReferenceCore(AdoptingCore, ReferenceState):
     """The reference implementation, extended so that it can take over the recorded state of an agent."""
 
 

@@ -18,7 +18,7 @@ from copy import copy
 from typing import Protocol
 
 from harness.checker.recorded_inputs import NotOnRecordError, decoded, event_of
-from harness.checker.reference.state import State
+from harness.checker.reference.state import ReferenceState
 from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import LOGS, StepComparer
 from ucp.events import MalformedEventsError, decode_events
@@ -225,7 +225,7 @@ def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecord
                     yield trial
 
 
-def _answers(state: State, run: HandlerRun) -> Iterator[Message]:
+def _answers(state: ReferenceState, run: HandlerRun) -> Iterator[Message]:
     """Yield the possible answers to the query or request that the agent has sent."""
     top = state.chain.top_chain_hash
     if state.voting_timer.active and state.candidate_block is not None:

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from harness.archive.traces import Header
+from harness.archive.traces import TraceHeader
 from harness.checker._waiting import SLACK_WALL_S
 from harness.checker.reference.state import Settings as ReferenceSettings
 from ucp.block import MAX_AGENT_ID
@@ -51,7 +51,7 @@ class CheckedHeader:
         return self.offset_s + self.rate * mission_s
 
 
-def checked(header: Header) -> CheckedHeader:
+def checked(header: TraceHeader) -> CheckedHeader:
     """Return the mission that the header describes. Raises ImpossibleHeaderError if its values are invalid."""
     try:
         initial_data = base64.b64decode(header.initial_data or "", validate=True)
@@ -85,7 +85,7 @@ def _unknown_to_reference(settings: Settings) -> list[str]:
     return sorted(name for name in lacking if getattr(settings, name) != getattr(usual, name))
 
 
-def _clock(header: Header, key: str, default: float) -> float:
+def _clock(header: TraceHeader, key: str, default: float) -> float:
     value: Any = header.clock.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ImpossibleHeaderError(f"the header of its trace has an invalid clock: {key} {str(value)[:20]}")

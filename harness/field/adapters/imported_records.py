@@ -23,7 +23,7 @@ from harness.archive.exports import Export
 from harness.archive.packets.capture_files import DIRECTORY as CAPTURES
 from harness.archive.packets.pcap import PCAPNG_MAGIC
 from harness.archive.trace_files import SUFFIX as TRACE_SUFFIX
-from harness.archive.traces import Gap, Trace, gap_line
+from harness.archive.traces import Trace, TraceGap, gap_line
 from harness.checker.records.contradiction import ROUNDED_S, mission_s
 from harness.errors import MachineError, RunDirectoryError
 from harness.field.adapters.adapter import (
@@ -215,9 +215,9 @@ def _trace_lines(trace: Trace, *, survived_trace: bool) -> Iterator[str]:
     survived, a gap is written instead.
     """
     for entry in trace.entries():
-        yield gap_line(entry) if isinstance(entry, Gap) else entry.to_line()
+        yield gap_line(entry) if isinstance(entry, TraceGap) else entry.to_line()
     if trace.cut_off:
-        yield gap_line(Gap(len(trace.runs), 1, 0)) if survived_trace else INCOMPLETE_LINE
+        yield gap_line(TraceGap(len(trace.runs), 1, 0)) if survived_trace else INCOMPLETE_LINE
 
 
 def _copy_capture(capture: Path, directory: Path, name: str) -> str:

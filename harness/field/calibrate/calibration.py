@@ -83,7 +83,7 @@ class LinkDelivery:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CalibrationResult:
     """The result of the calibration for one flight."""
 
     roster: list[int]
@@ -224,7 +224,7 @@ def _between(interval: ConfidenceInterval, form: str) -> str:
     return f"95 %: {interval.low:{form}} to {interval.high:{form}}"
 
 
-def calibrate(paths: Sequence[Path]) -> Calibration:
+def calibrate(paths: Sequence[Path]) -> CalibrationResult:
     """Fit the radio model to the largest flight in these files.
 
     Raises FieldError if the files have no message whose receivers are known.
@@ -254,7 +254,7 @@ def calibrate(paths: Sequence[Path]) -> Calibration:
         error.details = problems
         raise error
     end_s = max(attempt.at_s for attempt in attempts)
-    return Calibration(
+    return CalibrationResult(
         roster=sorted(vehicles),
         attempts=attempts,
         source=observed.source,

@@ -10,7 +10,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from harness.field.calibrate._delivery_model import TransmissionAttempt
-from harness.field.calibrate.calibration import Calibration, share_of
+from harness.field.calibrate.calibration import CalibrationResult, share_of
 from harness.present import svg
 from harness.present.colours import inks
 from harness.present.svg import FONT, Axis, n
@@ -23,7 +23,7 @@ _PANEL_HEIGHT = 300
 _MAX_MAP_POINTS = 20_000
 
 
-def draw(calibration: Calibration, name: str) -> str:
+def draw(calibration: CalibrationResult, name: str) -> str:
     """Return the page about a calibration as HTML."""
     return html.render(
         _TEMPLATE,
@@ -59,7 +59,7 @@ def _areas(count: int) -> list[svg.ChartArea]:
     return svg.grid(count, count, 60, _PANEL_HEIGHT)
 
 
-def _distance_axis(calibration: Calibration, area: svg.ChartArea) -> Axis:
+def _distance_axis(calibration: CalibrationResult, area: svg.ChartArea) -> Axis:
     distances = [max(attempt.distance_m, 1.0) for attempt in calibration.attempts]
     return svg.log_axis(min(distances), max(max(distances), min(distances) * 1.1), area.across)
 
@@ -74,7 +74,7 @@ def _percents(axis: Axis) -> list[str]:
     return [f"{tick:.0%}" for tick in axis.ticks]
 
 
-def _delivery(calibration: Calibration) -> Markup:
+def _delivery(calibration: CalibrationResult) -> Markup:
     area = _areas(2)[0]
     across, up = _distance_axis(calibration, area), svg.share_axis(area.up)
     parts = [
@@ -93,7 +93,7 @@ def _delivery(calibration: Calibration) -> Markup:
     return Markup("").join(parts)
 
 
-def _residuals(calibration: Calibration) -> Markup:
+def _residuals(calibration: CalibrationResult) -> Markup:
     """Draw the share of messages that arrived minus the expected share. Without a model, a constant share is
     expected.
     """
@@ -116,7 +116,7 @@ def _residuals(calibration: Calibration) -> Markup:
     return Markup("").join(parts)
 
 
-def _predictions(calibration: Calibration) -> Markup:
+def _predictions(calibration: CalibrationResult) -> Markup:
     area = _areas(1)[0]
     across, up = svg.share_axis(area.across), svg.share_axis(area.up)
     parts = [svg.frame("delivered share, over predicted probability", across, up, _percents(across), _percents(up))]
@@ -128,7 +128,7 @@ def _predictions(calibration: Calibration) -> Markup:
     return Markup("").join(parts)
 
 
-def _over_time(calibration: Calibration) -> Markup:
+def _over_time(calibration: CalibrationResult) -> Markup:
     area = _areas(1)[0]
     blocks: dict[float, list[TransmissionAttempt]] = defaultdict(list)
     for attempt in calibration.attempts:
@@ -153,7 +153,7 @@ def _over_time(calibration: Calibration) -> Markup:
     return Markup("").join(parts)
 
 
-def _map(calibration: Calibration) -> Markup:
+def _map(calibration: CalibrationResult) -> Markup:
     """Draw the paths of the vehicles, and a dot for each lost message."""
     tracks = calibration.positions.tracks
     ink = inks(calibration.roster)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from harness.archive.exports import Export
-from harness.archive.traces import Header, Trace
+from harness.archive.traces import Trace, TraceHeader
 from harness.field.ingest._copies import split_into_flights
 from harness.field.ingest._file_owners import CaptureSummary
 from harness.field.ingest._ingest import FileRemark, Flight, UnusedPart
@@ -130,7 +130,7 @@ def _by_mission(
     return _merged(separate), without_header
 
 
-def _mission_of(header: Header) -> _MissionInHeader:
+def _mission_of(header: TraceHeader) -> _MissionInHeader:
     epoch: object = header.clock.get("epoch_us")
     if not isinstance(epoch, int) or isinstance(epoch, bool) or not 0 <= epoch < 2**63:
         epoch = None

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from harness.archive.bounded_file import BoundedFile
 from harness.archive.history import LATEST_S
-from harness.archive.traces import MAX_LINE_BYTES, Gap, Header, parse_gap, parse_line
+from harness.archive.traces import MAX_LINE_BYTES, TraceGap, TraceHeader, parse_gap, parse_line
 from harness.field.ingest._ingest import UnusedPart
 from harness.field.ingest._line_order import in_order
 from ucp.messages import HEADER as DATAGRAM_HEADER
@@ -49,7 +49,7 @@ class TraceIncarnation:
     """The part of a trace between two restarts of its agent. `header` is None if the header line is lost."""
 
     path: Path
-    header: Header | None
+    header: TraceHeader | None
     first_line: int
     agent: int | None = None
     """The agent ID, if the source of the lines determines it."""
@@ -59,7 +59,7 @@ class TraceIncarnation:
     run_lines: list[int] = field(default_factory=list)
     asides: list[tuple[int, DroppedDatagram | CommandEntry]] = field(default_factory=list)
     aside_lines: list[int] = field(default_factory=list)
-    gaps: list[Gap] = field(default_factory=list)
+    gaps: list[TraceGap] = field(default_factory=list)
     jumps: list[int] = field(default_factory=list)
     cut_off: bool = False
 
@@ -96,7 +96,7 @@ class TraceIncarnation:
         if self.gaps and self.gaps[-1].position == position:
             last = self.gaps.pop()
             lines, lost_bytes = lines + last.lines, lost_bytes + last.lost_bytes
-        self.gaps.append(Gap(position, lines, lost_bytes))
+        self.gaps.append(TraceGap(position, lines, lost_bytes))
 
     def put_in_order(self) -> Iterator[UnusedPart]:
         """Repair the order of lines, and drop repeated ones. Yield a sentence for each repaired place."""
@@ -207,8 +207,8 @@ class TraceReader:
         if not finish and self.incarnations and pieces and (self._cut_off or pieces[-1].startswith(b"\0")):
             self.incarnations[-1].cut_off = True
 
-    def _add(self, entry: Header | Entry, number: int) -> None:
-        if isinstance(entry, Header):
+    def _add(self, entry: TraceHeader | Entry, number: int) -> None:
+        if isinstance(entry, TraceHeader):
             self.incarnations.append(self._new_incarnation(entry, number))
             return
         if not self.incarnations:
@@ -217,7 +217,7 @@ class TraceReader:
         self._runs += 1
         self.incarnations[-1].add(entry, number)
 
-    def _new_incarnation(self, header: Header | None, number: int) -> TraceIncarnation:
+    def _new_incarnation(self, header: TraceHeader | None, number: int) -> TraceIncarnation:
         return TraceIncarnation(self.path, header, number, self._agent_id, self._counts)
 
     def _add_damaged(self, number: int, text: bytes, why: str) -> None:
@@ -286,13 +286,13 @@ def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
         yield number, kept, False
 
 
-def _entry(line: bytes) -> Header | Entry | None:
+def _entry(line: bytes) -> TraceHeader | Entry | None:
     """Return the entry in a line, or None if it is incomplete or has an impossible time."""
     entry = _parse(line)
-    return entry if entry is None or isinstance(entry, Header) or 0 <= entry.t <= LATEST_S else None
+    return entry if entry is None or isinstance(entry, TraceHeader) or 0 <= entry.t <= LATEST_S else None
 
 
-def _parse(line: bytes) -> Header | Entry | None:
+def _parse(line: bytes) -> TraceHeader | Entry | None:
     """Return the entry in a line without a check of its time, or None if the entry is incomplete."""
     if not any(word in line for word in _MARKERS):
         return None
@@ -305,15 +305,15 @@ def _parse(line: bytes) -> Header | Entry | None:
     return entry
 
 
-def _texts_in_base64(entry: Header | Entry) -> Iterator[str]:
-    if isinstance(entry, Header):
+def _texts_in_base64(entry: TraceHeader | Entry) -> Iterator[str]:
+    if isinstance(entry, TraceHeader):
         yield entry.initial_data or ""
     elif isinstance(entry, HandlerRun):
         yield from (record.text for record in (entry.input, entry.sealed) if record is not None)
         yield from (sent.datagram.text for sent in entry.sent if sent.datagram is not None)
 
 
-def _recover_tail(text: bytes) -> tuple[int, Header | Entry] | None:
+def _recover_tail(text: bytes) -> tuple[int, TraceHeader | Entry] | None:
     """Return the position and content of a complete entry at the end of a damaged line, or None."""
     start = max(text.rfind(beginning) for beginning in _BEGINNINGS)
     entry = _entry(text[start:]) if start > 0 else None

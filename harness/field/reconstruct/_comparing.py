@@ -20,7 +20,7 @@ from harness.field.reconstruct._rehearsal import (
     rehearse,
     same_sent,
 )
-from harness.field.reconstruct._timetable import Timetable
+from harness.field.reconstruct._timetable import InputTimetable
 from harness.field.replay import PERHAPS
 from harness.play.core_version import edited_files
 from harness.run.simulate import Simulated
@@ -58,7 +58,7 @@ PlayedStep = tuple[float, int | None, HandlerRun]
 
 
 def first_difference(
-    table: Timetable, rehearsals: Mapping[int, SoloSimulation], simulated: Simulated
+    table: InputTimetable, rehearsals: Mapping[int, SoloSimulation], simulated: Simulated
 ) -> FirstDifference | None:
     """Return the earliest difference in mission time, or None if all steps with an effect are equal."""
     differences = []
@@ -70,7 +70,7 @@ def first_difference(
     return min(differences, key=lambda difference: difference.at_s, default=None)
 
 
-def _recorded(table: Timetable, agent_id: int) -> Iterator[PlayedStep]:
+def _recorded(table: InputTimetable, agent_id: int) -> Iterator[PlayedStep]:
     for timed_input in table.inputs[agent_id]:
         for run in timed_input.played.input.runs:
             yield timed_input.at_s, timed_input.played.input.line, run

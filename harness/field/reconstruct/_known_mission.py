@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 
-from harness.archive.traces import Header
+from harness.archive.traces import TraceHeader
 from harness.checker.judgement import agents
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError
@@ -160,5 +160,5 @@ def _initial_data(flight: Flight) -> str | None:
 def _assumed(
     other_records: OtherRecords, agent_id: int, settings: Settings, *, roster: Iterable[int], initial_data: str
 ) -> CheckedHeader:
-    header = Header(agent_id=agent_id, roster=sorted(roster), settings={}, clock={}, initial_data=initial_data)
+    header = TraceHeader(agent_id=agent_id, roster=sorted(roster), settings={}, clock={}, initial_data=initial_data)
     return other_records.with_seal(replace(checked(header), settings=settings))

@@ -61,7 +61,7 @@ class IncarnationTimes:
 
 
 @dataclass
-class Timetable:
+class InputTimetable:
     """The inputs of all agents in mission time. `clocks` relates each agent's clock to mission time.
 
     `contradictions` has a sentence for each record that no order of inputs explains.
@@ -94,7 +94,7 @@ class Timetable:
         return incarnations
 
 
-def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, float] = {}) -> Timetable:
+def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, float] = {}) -> InputTimetable:
     """Return the inputs on one time axis. `ahead_s` relates the clocks of agents to GPS time."""
     senders = _DatagramsBySender(rehearsals)
     clocks = estimate(rehearsals, senders.deliveries(), ahead_s)
@@ -163,7 +163,7 @@ class _TimetablePlanner:
     ) -> None:
         self._rehearsals = rehearsals
         self._senders = senders
-        self._table = Timetable(clocks, sent=senders.sent)
+        self._table = InputTimetable(clocks, sent=senders.sent)
         for agent in rehearsals:
             self._table.inputs[agent], self._table.sent_at_s[agent], self._table.lateness[agent] = [], [], {}
         self._played = {agent: rehearsal.played for agent, rehearsal in rehearsals.items()}
@@ -174,7 +174,7 @@ class _TimetablePlanner:
         self._waiting: dict[tuple[int, int], list[int]] = defaultdict(list)
         self._as_strays: set[tuple[int, int]] = set()
 
-    def plan(self) -> Timetable:
+    def plan(self) -> InputTimetable:
         for agent in self._played:
             self._queue(agent)
         while True:

@@ -10,7 +10,7 @@ from itertools import pairwise
 from harness.field.reconstruct._agent_inputs import DatagramReceived, EventLogged, ReconcileRequested
 from harness.field.reconstruct._known_mission import MissionConfiguration
 from harness.field.reconstruct._rehearsal import SoloSimulation
-from harness.field.reconstruct._timetable import DIGITS, MIN_GAP_S, IncarnationTimes, TimedInput, Timetable
+from harness.field.reconstruct._timetable import DIGITS, MIN_GAP_S, IncarnationTimes, InputTimetable, TimedInput
 from harness.scenario.scenario_file import Document
 from harness.scenario.strict_model import format_pairs
 from ucp.messages import MalformedDatagramError, decode
@@ -26,7 +26,7 @@ MIN_PAUSE_S = 0.5
 
 def scenario_document(
     mission: MissionConfiguration,
-    table: Timetable,
+    table: InputTimetable,
     rehearsals: Mapping[int, SoloSimulation],
     lost: Collection[int],
     sealed: Sealed,
@@ -87,7 +87,7 @@ def _start_times(incarnations: Sequence[IncarnationTimes]) -> list[float]:
     return start_times
 
 
-def _clocks(table: Timetable) -> Document:
+def _clocks(table: InputTimetable) -> Document:
     clocks: Document = {}
     for agent, line in sorted(table.clocks.items()):
         drift = round(line.rate - 1, 9)
@@ -110,7 +110,7 @@ def _quirks(by_agent: Mapping[int, Quirks]) -> Document:
     return {name: {"agents": wrong} for name, wrong in agents.items()}
 
 
-def _events(table: Timetable, sealed: Sealed) -> list[Document]:
+def _events(table: InputTimetable, sealed: Sealed) -> list[Document]:
     events: list[Document] = []
     for agent, inputs in table.inputs.items():
         for timed_input in inputs:
@@ -161,7 +161,7 @@ def _source(datagram: bytes) -> int:
 
 def _fates(
     roster: Iterable[int],
-    table: Timetable,
+    table: InputTimetable,
     incarnations: Mapping[int, Sequence[IncarnationTimes]],
     strays: _StrayDatagrams,
 ) -> Iterator[Document]:
@@ -187,7 +187,7 @@ def _fates(
         yield {"drop": True}
 
 
-def _can_be_sent(timed_input: TimedInput, table: Timetable, start_times: Sequence[float]) -> bool:
+def _can_be_sent(timed_input: TimedInput, table: InputTimetable, start_times: Sequence[float]) -> bool:
     """Return true if the receiver was already running when the datagram was sent."""
     if timed_input.sender is None or timed_input.number is None:
         return False
@@ -196,7 +196,7 @@ def _can_be_sent(timed_input: TimedInput, table: Timetable, start_times: Sequenc
 
 def _entries(
     roster: Iterable[int],
-    table: Timetable,
+    table: InputTimetable,
     rehearsals: Mapping[int, SoloSimulation],
     incarnations: Mapping[int, Sequence[IncarnationTimes]],
     lost: Collection[int],
@@ -222,7 +222,7 @@ def _entries(
             yield round(incarnations[agent][-1].ended_s + HALF_GAP_S, DIGITS), {"switch_off": [agent]}
 
 
-def _pauses(table: Timetable) -> Iterator[tuple[float, Document]]:
+def _pauses(table: InputTimetable) -> Iterator[tuple[float, Document]]:
     """Yield a pause for each agent that did nothing while a timer was long overdue."""
     for agent, inputs in table.inputs.items():
         pause_starts: set[float] = set()

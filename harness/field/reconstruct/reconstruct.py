@@ -16,7 +16,7 @@ from harness.field.reconstruct._comparing import FirstDifference, SoloSimulation
 from harness.field.reconstruct._known_mission import NO_INPUTS, known_mission
 from harness.field.reconstruct._other_records import OtherRecords
 from harness.field.reconstruct._rehearsal import SoloSimulation
-from harness.field.reconstruct._timetable import Timetable, timetable
+from harness.field.reconstruct._timetable import InputTimetable, timetable
 from harness.field.reconstruct._timetable_script import scenario_document
 from harness.run.simulate import MemoryRecorder, Simulated, simulate_in_memory
 from harness.scenario.load import parse
@@ -56,7 +56,7 @@ class Reconstruction:
     remarks: list[str]
     difference: FirstDifference | None
     simulated: Simulated
-    table: Timetable = field(repr=False)
+    table: InputTimetable = field(repr=False)
     wrong_signatures: list[str] = field(default_factory=list)
     """A sentence on each wrong signature in the exports of a secured flight."""
 
@@ -223,7 +223,7 @@ def _export_differs(export: Export, rehearsal: SoloSimulation, flight: Flight) -
     )
 
 
-def _clocks_in_words(table: Timetable) -> Iterator[str]:
+def _clocks_in_words(table: InputTimetable) -> Iterator[str]:
     for agent_id, line in sorted(table.clocks.items()):
         drift = (line.rate - 1) * MICROSECONDS
         if abs(line.offset_s) >= 0.1 or abs(drift) >= 1:

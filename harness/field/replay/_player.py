@@ -12,7 +12,7 @@ from itertools import islice
 
 from harness.archive.vocabulary import IGNORED_KINDS, first_unknown, unknown_names
 from harness.checker.reference.algorithms import ON_TIMER
-from harness.checker.reference.state import State
+from harness.checker.reference.state import ReferenceState
 from harness.checker.steps import end_of_record, wrongly_dropped
 from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import OptionalTraceFields, StepComparer
@@ -106,7 +106,7 @@ class RecordPlayer:
         self._checkpoints = {0: _PlayerCheckpoint(self._follower.copy(), 1, self.result.copy())}
 
     @property
-    def state(self) -> State:
+    def state(self) -> ReferenceState:
         """The state of the agent after the last played entry."""
         return self._follower.state
 

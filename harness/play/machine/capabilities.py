@@ -24,7 +24,7 @@ from sitl.vehicle import VehicleError
 
 
 @dataclass(frozen=True)
-class Requirement:
+class MachineRequirement:
     """A property of the machine that runs need. `way_out` is the user's remedy if it is missing.
 
     Without a `needed` property, no run is possible.
@@ -40,31 +40,33 @@ class Requirement:
         return asdict(self)
 
 
-def examine() -> list[Requirement]:
+def examine() -> list[MachineRequirement]:
     """Return all requirements, and whether they are met. This builds and removes a small virtual network to test the
     kernel.
     """
-    python = Requirement(
+    python = MachineRequirement(
         "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
     )
     lab = [
-        Requirement(requirement.name, requirement.ok, requirement.needed, requirement.detail, requirement.way_out)
+        MachineRequirement(
+            requirement.name, requirement.ok, requirement.needed, requirement.detail, requirement.way_out
+        )
         for requirement in lab_doctor.examine()
     ]
     return [python, *lab, _user_mode_linux(), _docker(), _ardupilot()]
 
 
-def _user_mode_linux() -> Requirement:
+def _user_mode_linux() -> MachineRequirement:
     use = "--kernel uml: all of netem, in a process without privileges"
     if uml.inside():
-        return Requirement("User Mode Linux", True, False, "this is it")
+        return MachineRequirement("User Mode Linux", True, False, "this is it")
     try:
-        return Requirement("User Mode Linux", True, False, f"{uml.examine()}; for {use}")
+        return MachineRequirement("User Mode Linux", True, False, f"{uml.examine()}; for {use}")
     except UmlError as error:
-        return Requirement("User Mode Linux", False, False, str(error), f"it enables {use}")
+        return MachineRequirement("User Mode Linux", False, False, str(error), f"it enables {use}")
 
 
-def _docker() -> Requirement:
+def _docker() -> MachineRequirement:
     from harness.play.containers._container_preflight import require_root
     from harness.play.containers.docker_engine import DockerEngine, DockerError
 
@@ -75,29 +77,31 @@ def _docker() -> Requirement:
         engine.close()
         require_root()
     except DockerError as error:
-        return Requirement("Docker", False, False, str(error), f"it enables {use}")
-    return Requirement("Docker", True, False, f"{version}, for {use}")
+        return MachineRequirement("Docker", False, False, str(error), f"it enables {use}")
+    return MachineRequirement("Docker", True, False, f"{version}, for {use}")
 
 
-def _ardupilot() -> Requirement:
+def _ardupilot() -> MachineRequirement:
     try:
         ardupilot = ArduPilot.find(None, os.environ)
     except VehicleError as error:
-        return Requirement("ArduPilot SITL", False, False, f"{error}", "without it runs use the embedded vehicle")
+        return MachineRequirement(
+            "ArduPilot SITL", False, False, f"{error}", "without it runs use the embedded vehicle"
+        )
     if ardupilot.defaults is None:
         way_out = (
             "put ArduPilot's default parameters, copter.parm, in the same directory: without them the vehicle "
             "may refuse to arm"
         )
-        return Requirement("ArduPilot SITL", False, False, f"{ardupilot.binary}, without copter.parm", way_out)
-    return Requirement("ArduPilot SITL", True, False, str(ardupilot.binary))
+        return MachineRequirement("ArduPilot SITL", False, False, f"{ardupilot.binary}, without copter.parm", way_out)
+    return MachineRequirement("ArduPilot SITL", True, False, str(ardupilot.binary))
 
 
 _SHOWN = {"": (100.0, "%"), "s": (1000.0, "ms"), "bit/s": (0.001, "kbit/s"), "packets": (1.0, "packets")}
 """Unit of `netem.measure` -> factor and name of the printed unit."""
 
 
-def measure_engines(requirements: Iterable[Requirement], say: Callable[[str], None]) -> list[EngineMeasurement]:
+def measure_engines(requirements: Iterable[MachineRequirement], say: Callable[[str], None]) -> list[EngineMeasurement]:
     """Measure the accuracy of each network engine that works here, 10 to 30 seconds each. Raises MachineError if the
     machine is too busy.
     """

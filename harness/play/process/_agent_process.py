@@ -68,7 +68,7 @@ def agent_command(scenario: Scenario, agent_id: int) -> list[str]:
 
 
 @dataclass
-class _Incarnation:
+class _ProcessIncarnation:
     """The files and the status of an agent between a start and the next end of its process."""
 
     directory: Path
@@ -114,7 +114,7 @@ class AgentProcess:
         """State of the agent. After the run, `run.json` records it with `detail`."""
         self.detail: str | None = None
         self._rundir = rundir
-        self._incarnations: list[_Incarnation] = []
+        self._incarnations: list[_ProcessIncarnation] = []
         self._process: LabProgram | None = None
         self._control_lock = asyncio.Lock()
         """Held while the agent answers a status request, so that no fault ends or pauses it meanwhile."""
@@ -193,11 +193,11 @@ class AgentProcess:
         await self._wait_for_first_status(self._process)
         self.outcome = "running"
 
-    def _begin_incarnation(self) -> _Incarnation:
+    def _begin_incarnation(self) -> _ProcessIncarnation:
         directory = self._rundir.agent(self.agent_id, len(self._incarnations) + 1)
         kept = self.outcome == "rebooting"
         store = self._incarnations[-1].store if kept else directory / f"{self.agent_id}.store"
-        self._incarnations.append(_Incarnation(directory, store, reboot=kept))
+        self._incarnations.append(_ProcessIncarnation(directory, store, reboot=kept))
         return self._incarnations[-1]
 
     async def _wait_for_first_status(self, process: LabProgram) -> None:

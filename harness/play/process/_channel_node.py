@@ -30,7 +30,7 @@ from netem.radio import Place
 from netem.relay import ReceivedBroadcast, Relay
 from ucp.clock import MissionClock
 from ucp.control import Command, CommandError, ControlServer
-from ucp.loop import Loop, Timer
+from ucp.loop import Loop, ScheduledCall
 from ucp.messages import (
     HEADER,
     MAGIC,
@@ -77,7 +77,7 @@ class ChannelNode:
         self._roster: tuple[int, ...] = ()
         self._lateness = DeliveryLateness()
         self._answers = AnswerTimeMeter()
-        self._timer: Timer | None = None
+        self._timer: ScheduledCall | None = None
         self._loop = Loop(selector=selectors.SelectSelector())
         self._journal = journal.open("a", encoding="utf-8")
         commands: dict[str, Command] = {

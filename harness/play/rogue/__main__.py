@@ -23,7 +23,7 @@ from harness.scenario.injection import MODELS, Lie
 from netem.frames import udp_broadcast
 from ucp.clock import MissionClock
 from ucp.control import CommandError, ControlServer
-from ucp.loop import Loop, Timer
+from ucp.loop import Loop, ScheduledCall
 from ucp.messages import PORT
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class RogueNode:
     def __init__(self, directory: Path) -> None:
         self._rogue: RogueLogic | None = None
         self._clock = MissionClock(1.0)
-        self._timer: Timer | None = None
+        self._timer: ScheduledCall | None = None
         self._loop = Loop()
         self._receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._receiver.setblocking(False)

@@ -12,7 +12,7 @@ from ucp.messages import CARRY_A_BLOCK, MalformedDatagramError, Message
 from ucp.secure.block_signature import sign_block
 from ucp.secure.bundle import Bundle
 from ucp.secure.opening import DatagramOpener
-from ucp.secure.sealed_datagrams import Request
+from ucp.secure.sealed_datagrams import AnsweredRequest
 from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
 
@@ -33,7 +33,7 @@ class CapturedKeys:
         self._signatures: dict[bytes, bytes] = {}
         """Block hash -> the genuine signature, from received datagrams."""
 
-    def opened(self, datagram: bytes) -> tuple[Message, Request] | None:
+    def opened(self, datagram: bytes) -> tuple[Message, AnsweredRequest] | None:
         """Return the message in a datagram, and the identification that an answer must contain.
 
         Return None if the datagram cannot be decrypted.
@@ -46,10 +46,10 @@ class CapturedKeys:
         message = opened.datagram.message
         if type(message) in CARRY_A_BLOCK:
             self._signatures[message.block.block_hash] = opened.block_signature  # type: ignore[union-attr]
-        return message, Request(clear.sender, clear.boot, clear.sequence)
+        return message, AnsweredRequest(clear.sender, clear.boot, clear.sequence)
 
     def sealed(
-        self, sender: int, sequence: int, message: Message, request: Request | None, now: float, now_us: int
+        self, sender: int, sequence: int, message: Message, request: AnsweredRequest | None, now: float, now_us: int
     ) -> bytes:
         """Return a datagram in the name of `sender` that is as close to genuine as these keys allow. Use each sequence
         number once.

@@ -38,7 +38,7 @@ from ucp.secure.envelope import VERSION as SECURED
 
 if TYPE_CHECKING:
     from harness.play.rogue._captured_bundle import CapturedKeys
-    from ucp.secure.sealed_datagrams import Request
+    from ucp.secure.sealed_datagrams import AnsweredRequest
 
 MAX_REMEMBERED = 10_000
 """Maximum number of datagrams that are kept for replays."""
@@ -81,7 +81,7 @@ class _ReceivedDatagram:
     sender: int
     name: str
     message: Message | None
-    request: "Request | None"
+    request: "AnsweredRequest | None"
     datagram: bytes
 
 
@@ -122,7 +122,7 @@ class RogueLogic:
         self._top_chain_hash: bytes | None = None
         self._votes_name_chain = False
         self._known_blocks = KnownBlocks(initial_data, epoch_us)
-        self._queries: dict[tuple[int, str], Request] = {}
+        self._queries: dict[tuple[int, str], AnsweredRequest] = {}
         """(sender, type of a query) -> identification of the last sealed query, for an answer."""
         self._windows: list[_ActiveInjection] = []
         self._waiting: list[tuple[float, int, RogueDatagram]] = []
@@ -149,7 +149,7 @@ class RogueLogic:
             for window in self._windows:
                 self._react(window, _ReceivedDatagram(sender, name, message, request, datagram), now)
 
-    def _read(self, datagram: bytes, now: float) -> tuple[int, str, Message | None, "Request | None"]:
+    def _read(self, datagram: bytes, now: float) -> tuple[int, str, Message | None, "AnsweredRequest | None"]:
         """Return the sender and the type of a datagram, with its message and identification if it can be decrypted.
 
         Raises MalformedDatagramError.
@@ -279,7 +279,7 @@ class RogueLogic:
         sender: int,
         message: Any,
         now: float,
-        request: "Request | None" = None,
+        request: "AnsweredRequest | None" = None,
         receivers: Sequence[int] | None = None,
     ) -> None:
         sequence = forged_sequence(number, self.sent[number])

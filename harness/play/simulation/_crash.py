@@ -10,13 +10,13 @@ from traceback import extract_tb
 import harness
 import ucp
 from harness.errors import AgentFailedError
-from harness.play.simulation.incarnations import Incarnation
+from harness.play.simulation.incarnations import SimulatedIncarnation
 
 CORE, HARNESS = Path(ucp.__file__).parent, Path(harness.__file__).parent
 MAX_WORDS = 200
 
 
-def core_crash(incarnation: Incarnation | None, error: Exception) -> AgentFailedError | None:
+def core_crash(incarnation: SimulatedIncarnation | None, error: Exception) -> AgentFailedError | None:
     """Return the failure of the agent if its own code raised the exception, otherwise None."""
     frames = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
     ours = [(path, line) for path, line in frames if path.is_relative_to(CORE) or path.is_relative_to(HARNESS)]

@@ -22,7 +22,7 @@ from harness.play.simulation._recurrence import RecurrenceSearch
 from harness.play.simulation._simulated_agent import DiskContents, OwnAgent, VirtualAgent
 from harness.play.simulation.air import DueEvent, MessageInFlight, ScheduledInput, StrayDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, LateTimers, NameOf
-from harness.play.simulation.incarnations import BlockNames, Incarnation, KeyedAgent
+from harness.play.simulation.incarnations import BlockNames, KeyedAgent, SimulatedIncarnation
 from harness.play.simulation.recorded_seals import recorded_seals
 from harness.play.simulation.run_files import Recorder
 from harness.play.variant import variant_in_use
@@ -93,8 +93,8 @@ class EventLoop:
         self._now = 0.0
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
-        self._incarnations: list[list[Incarnation]] = [[] for _ in self.roster]
-        self._alive: list[Incarnation | None] = [None] * (len(self.roster) + 1)
+        self._incarnations: list[list[SimulatedIncarnation]] = [[] for _ in self.roster]
+        self._alive: list[SimulatedIncarnation | None] = [None] * (len(self.roster) + 1)
         """The living incarnation of each agent, or None. The last entry is that of the rogue node, and always None."""
         self._foreign_swarm = self._foreign_agents(programs) if scenario.foreign else None
         self._late = {self._number[agent_id]: LateTimers(text) for agent_id, text in scenario.lateness.items()}
@@ -185,7 +185,7 @@ class EventLoop:
     def _play_to_crash(self, inputs: Iterator[ScheduledInput]) -> AgentFailedError | None:
         """Play the inputs. Return the failure of the first agent that crashes, or None at the end."""
         alive = self._alive
-        incarnation: Incarnation | None = None
+        incarnation: SimulatedIncarnation | None = None
         try:
             for scheduled in inputs:
                 self._now, _, number, what = scheduled
@@ -222,7 +222,7 @@ class EventLoop:
         """Record that an agent crashed, and end the record of this agent. The other agents continue."""
         raise NotImplementedError
 
-    def _handle_message(self, number: int, incarnation: Incarnation, flight: MessageInFlight) -> None:
+    def _handle_message(self, number: int, incarnation: SimulatedIncarnation, flight: MessageInFlight) -> None:
         """Give a message to the agent, if it can affect the agent."""
         sender, message = flight.sender, flight.message
         if self._tracing or incarnation.secured is not None or type(message) in ONLY_COUNTED:
@@ -243,7 +243,9 @@ class EventLoop:
         else:
             agent.receive_datagram(flight.sealed, now)
 
-    def _handle_other_input(self, number: int, incarnation: Incarnation, what: DueEvent | StrayDatagram | None) -> None:
+    def _handle_other_input(
+        self, number: int, incarnation: SimulatedIncarnation, what: DueEvent | StrayDatagram | None
+    ) -> None:
         """Give the agent an input that is not a message of another agent: a timer expiry, an event, or a foreign
         datagram.
         """
@@ -265,7 +267,7 @@ class EventLoop:
             self._schedule_event(number, incarnation)
             self._finish_input(number, incarnation)
 
-    def _end_timer(self, number: int, incarnation: Incarnation) -> None:
+    def _end_timer(self, number: int, incarnation: SimulatedIncarnation) -> None:
         if (
             incarnation.deadline is None
             or incarnation.deadline > self._now
@@ -286,7 +288,7 @@ class EventLoop:
             self._air.close_ended_queries(number, incarnation.state)
         self._finish_input(number, incarnation)
 
-    def _tally_answers(self, number: int, incarnation: Incarnation) -> None:
+    def _tally_answers(self, number: int, incarnation: SimulatedIncarnation) -> None:
         """Give the agent those answers that have arrived and that it only counts.
 
         The loop calls this before the tally is read, and before other inputs if a trace is written, so that the lines
@@ -303,12 +305,12 @@ class EventLoop:
                 if self._tracing:
                     self._write_trace(incarnation, at)
 
-    def _finish_input(self, number: int, incarnation: Incarnation) -> None:
+    def _finish_input(self, number: int, incarnation: SimulatedIncarnation) -> None:
         """Complete an input: send the agent's messages, write its trace, and schedule its next timer expiry."""
         self._send_and_trace(number, incarnation)
         self._schedule_timer(number, incarnation)
 
-    def _send_and_trace(self, number: int, incarnation: Incarnation) -> None:
+    def _send_and_trace(self, number: int, incarnation: SimulatedIncarnation) -> None:
         """Send the agent's messages, and write its trace."""
         if self._tracing:
             self._write_trace(incarnation, self._now)
@@ -328,7 +330,7 @@ class EventLoop:
             elif self._recent_messages is not None:
                 self._recent_messages.append((incarnation.agent.agent_id, sequence, message, self._now))
 
-    def _send_sealed(self, number: int, incarnation: Incarnation, agent: KeyedAgent) -> None:
+    def _send_sealed(self, number: int, incarnation: SimulatedIncarnation, agent: KeyedAgent) -> None:
         """Send the encrypted messages of the agent. A rogue node that starts later does not receive them."""
         for sealed, sequence, message, plain in agent.sealed_to_send():
             if message is None:
@@ -339,12 +341,12 @@ class EventLoop:
             if self._rogue is not None:
                 self._rogue.receive_datagram(sealed, self._now)
 
-    def _send_stray(self, number: int, incarnation: Incarnation, datagram: bytes) -> None:
+    def _send_stray(self, number: int, incarnation: SimulatedIncarnation, datagram: bytes) -> None:
         """Send a datagram that is not a valid message of the agent. The rogue node does not receive it."""
         incarnation.bytes_sent += len(datagram)
         self._air.broadcast_stray(self._now, number, datagram)
 
-    def _schedule_timer(self, number: int, incarnation: Incarnation) -> None:
+    def _schedule_timer(self, number: int, incarnation: SimulatedIncarnation) -> None:
         """Schedule the expiry of the agent's next timer."""
         agent = incarnation.agent
         soonest = agent.next_timer()
@@ -356,7 +358,7 @@ class EventLoop:
         busy_until = agent.silent_until()
         self._air.busy_until[number] = 0.0 if busy_until is None else incarnation.mission_s(busy_until)
 
-    def _timer_end(self, number: int, incarnation: Incarnation, soonest: float) -> float:
+    def _timer_end(self, number: int, incarnation: SimulatedIncarnation, soonest: float) -> float:
         """Return the next mission second at which a timer of the agent expires, or at which the agent must send a
         delayed answer.
 
@@ -374,7 +376,7 @@ class EventLoop:
         ]
         return min(times_s)
 
-    def _end_late_timer(self, number: int, incarnation: Incarnation) -> None:
+    def _end_late_timer(self, number: int, incarnation: SimulatedIncarnation) -> None:
         ends = self._late[number].next(incarnation.mission_s)
         if ends is None or ends[0] > self._now:
             _own_agent(incarnation).release_answers(incarnation.local_s(self._now))
@@ -384,7 +386,7 @@ class EventLoop:
         timer = next(timer for timer in agent.state.timers if timer.name == name)
         agent.end_timer(timer, max(deadline, incarnation.local_s(self._now)))
 
-    def _write_trace(self, incarnation: Incarnation, mission_s: float) -> None:
+    def _write_trace(self, incarnation: SimulatedIncarnation, mission_s: float) -> None:
         """Write the agent's new handler runs to its trace."""
         agent_id, entries = incarnation.agent.agent_id, incarnation.agent.trace()
         searching = self._recent_runs is not None or self._sought is not None
@@ -422,7 +424,7 @@ class EventLoop:
             agent = self._new_own_agent(agent_id, seed, len(incarnations) + 1)
         state = agent.state if isinstance(agent, OwnAgent) else None
         secured = cast(KeyedAgent, agent) if self._keys is not None else None
-        incarnation = Incarnation(agent, source, clock, self._now, state, secured, stored is not None)
+        incarnation = SimulatedIncarnation(agent, source, clock, self._now, state, secured, stored is not None)
         incarnations.append(incarnation)
         self._alive[number] = incarnation
         self._air.started_at[number] = self._now
@@ -448,13 +450,13 @@ class EventLoop:
             tracing=self._tracing,
         )
 
-    def _schedule_event(self, number: int, incarnation: Incarnation) -> None:
+    def _schedule_event(self, number: int, incarnation: SimulatedIncarnation) -> None:
         if self.scenario.events.source != "scripted":
             due, event_id, data = incarnation.source.next()
             current = len(self._incarnations[number])
             self._air.schedule(max(self._now, incarnation.started_at + due), number, (current, event_id, data, None))
 
-    def _resume(self, number: int, incarnation: Incarnation, waiting: list[ScheduledInput]) -> None:
+    def _resume(self, number: int, incarnation: SimulatedIncarnation, waiting: list[ScheduledInput]) -> None:
         """Let the agent handle the inputs that waited during a pause, in the order of a real process: datagrams,
         timers, events.
 
@@ -481,6 +483,6 @@ class EventLoop:
                 self._handle_other_input(number, incarnation, what)
 
 
-def _own_agent(incarnation: Incarnation) -> OwnAgent:
+def _own_agent(incarnation: SimulatedIncarnation) -> OwnAgent:
     assert isinstance(incarnation.agent, OwnAgent), "only agents of the harness show their state"
     return incarnation.agent

@@ -30,7 +30,7 @@ READ_BYTES = 65_536
 
 
 @dataclass
-class _Connection:
+class _StationConnection:
     vehicle: ShownVehicle
     channel: ClientChannel
     sock: socket.socket
@@ -45,7 +45,7 @@ class StationTracks:
     def __init__(self, station: GroundStation) -> None:
         """Create the object without connections. Callers use `open` instead."""
         self._station = station
-        self._connections: dict[int, _Connection] = {}
+        self._connections: dict[int, _StationConnection] = {}
         self._shown_at = 0.0
 
     @classmethod
@@ -62,7 +62,7 @@ class StationTracks:
             vehicle = ShownVehicle(numbers[vehicle_id], home, epoch_us, vehicle_type, tracks[vehicle_id])
             ours, theirs = socket.socketpair()
             ours.setblocking(False)
-            shown._connections[vehicle_id] = _Connection(vehicle, ClientChannel(vehicle), ours)
+            shown._connections[vehicle_id] = _StationConnection(vehicle, ClientChannel(vehicle), ours)
             await station.attach(vehicle_id, vehicle.sysid, theirs)
         return shown
 

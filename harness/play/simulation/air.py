@@ -25,7 +25,7 @@ from typing import Literal
 
 from harness.play._shared_channel import ChannelTraffic
 from harness.play.simulation.fate_script import RIGHT_AFTER_S, FateScript
-from netem.channel import Transmission, numbers
+from netem.channel import EndedTransmission, numbers
 from netem.conditions import NetworkConditions
 from netem.medium import LATENCY, Medium, RandomDraws
 from netem.radio import Place
@@ -299,7 +299,9 @@ class VirtualAir:
                 now,
             )
 
-    def _deliver_frame(self, at: float, transmission: Transmission, message: MessageInFlight | StrayDatagram) -> None:
+    def _deliver_frame(
+        self, at: float, transmission: EndedTransmission, message: MessageInFlight | StrayDatagram
+    ) -> None:
         """Deliver a message whose transmission on the shared channel ends. The network conditions apply to each
         copy.
         """

@@ -26,7 +26,7 @@ class KeyedAgent(Protocol):
 
 
 @dataclass(slots=True)
-class Incarnation:
+class SimulatedIncarnation:
     """An agent in virtual time, from a start or restart to its end."""
 
     agent: VirtualAgent
@@ -95,7 +95,7 @@ class Incarnation:
 class BlockNames:
     """The names of blocks, such as 3.2 for the second block that agent 3 completed."""
 
-    def __init__(self, roster: Sequence[int], incarnations: Sequence[Sequence[Incarnation]]) -> None:
+    def __init__(self, roster: Sequence[int], incarnations: Sequence[Sequence[SimulatedIncarnation]]) -> None:
         self._roster = roster
         self._incarnations = incarnations
         self._names: dict[bytes, str] = {}

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 from harness.archive.directory import RunDirectory
-from harness.play.simulation.incarnations import Incarnation
+from harness.play.simulation.incarnations import SimulatedIncarnation
 from netem.radio import Place
 from ucp.agent_files import TraceFile, write_json_atomically
 from ucp.trace import Entry, header_line
@@ -25,7 +25,7 @@ class DiskRecorder:
         """Number of bytes that the trace of each agent may still grow."""
         self._traces: dict[int, TraceFile] = {}
 
-    def begin(self, incarnation: Incarnation) -> None:
+    def begin(self, incarnation: SimulatedIncarnation) -> None:
         agent_id = incarnation.agent.agent_id
         if agent_id not in self._traces:
             self._traces[agent_id] = TraceFile(self._rundir.agents / f"{agent_id}.trace.jsonl")
@@ -56,11 +56,11 @@ class DiskRecorder:
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         self._rundir.append_tracks(at_s, places)
 
-    def keep_chains(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+    def keep_chains(self, at_s: float, incarnations: Iterable[SimulatedIncarnation]) -> None:
         self.export(at_s, incarnations)
         self._rundir.keep_exports_before_final_reconcile()
 
-    def export(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+    def export(self, at_s: float, incarnations: Iterable[SimulatedIncarnation]) -> None:
         """Write the chain exports of these agents. Raises OSError."""
         for incarnation in incarnations:
             path = self._rundir.agents / f"{incarnation.agent.agent_id}.chain.json"
@@ -75,7 +75,7 @@ class DiskRecorder:
             trace.close()
 
 
-def header(incarnation: Incarnation) -> dict[str, Any]:
+def header(incarnation: SimulatedIncarnation) -> dict[str, Any]:
     """Return the first line of a trace, as keyword arguments of `ucp.trace.header_line`."""
     agent = incarnation.agent
     clock = {"epoch_us": 0, "speedup": 1, **(incarnation.clock.model_dump() if incarnation.clock else {})}
@@ -95,7 +95,7 @@ class Recorder(Protocol):
     tracing: bool
     """True if handler runs are recorded. Otherwise `write` is not called."""
 
-    def begin(self, incarnation: Incarnation) -> None:
+    def begin(self, incarnation: SimulatedIncarnation) -> None:
         """Record the start of an agent."""
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
@@ -115,8 +115,8 @@ class Recorder(Protocol):
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Record the positions of the vehicles."""
 
-    def keep_chains(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+    def keep_chains(self, at_s: float, incarnations: Iterable[SimulatedIncarnation]) -> None:
         """Record the chains of these agents before a final reconcile."""
 
-    def export(self, at_s: float, incarnations: Iterable[Incarnation]) -> None:
+    def export(self, at_s: float, incarnations: Iterable[SimulatedIncarnation]) -> None:
         """Record the current chains of these agents. Raises OSError."""

@@ -23,7 +23,7 @@ from harness.play.simulation._recurrence import CHECK_AFTER_S, AgentAtRest, Recu
 from harness.play.simulation._simulated_agent import DiskContents
 from harness.play.simulation.air import NEVER, StrayDatagram, VirtualAir
 from harness.play.simulation.fate_script import FateScript, NameOf
-from harness.play.simulation.incarnations import Incarnation
+from harness.play.simulation.incarnations import SimulatedIncarnation
 from harness.play.simulation.run_files import Recorder
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, NetworkChange, TimedInjection, disconnected_until, silent_injections
@@ -96,7 +96,7 @@ class Simulation(EventLoop):
         self._pace = pace
         self._disks: dict[int, DiskContents] = {}
         """Agent number -> contents of its disk, for agents that are off and reboot with it."""
-        self._switched_off: dict[int, Incarnation] = {}
+        self._switched_off: dict[int, SimulatedIncarnation] = {}
         self._failures: dict[int, AgentFailedError | AgentLacksError] = {}
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
@@ -391,10 +391,10 @@ class Simulation(EventLoop):
 
     # State of the agents
 
-    def living(self) -> Iterator[Incarnation]:
+    def living(self) -> Iterator[SimulatedIncarnation]:
         return (incarnation for incarnation in self._alive if incarnation is not None)
 
-    def exporting(self) -> Iterator[Incarnation]:
+    def exporting(self) -> Iterator[SimulatedIncarnation]:
         """Yield the agents that leave a chain export, in the order of the roster: those alive, and those that were
         switched off.
         """
@@ -449,7 +449,9 @@ class Simulation(EventLoop):
         version = next((status.version for status in reversed(known) if status), None)
         return {"command": self._foreign_swarm.command_of(agent_id), "version": version}
 
-    def _handler_runs(self, incarnation: Incarnation, status: AgentStatus | None) -> dict[str, int | float] | None:
+    def _handler_runs(
+        self, incarnation: SimulatedIncarnation, status: AgentStatus | None
+    ) -> dict[str, int | float] | None:
         """Return the number of handler runs of the agent. A foreign agent reports this number itself."""
         if status is None:
             return None

@@ -58,7 +58,7 @@ class SecurityGate:
         one.
         """
         from ucp.secure.block_signature import sign_block
-        from ucp.secure.sealed_datagrams import Request
+        from ucp.secure.sealed_datagrams import AnsweredRequest
         from ucp.secure.session import Session
 
         self._sequence += 1
@@ -73,7 +73,7 @@ class SecurityGate:
             block = message.block  # type: ignore[union-attr]
             signer = self._key(block.agent_id if genuine else self._captured)
             signature = sign_block(signer, session.mission, block.block_data())
-        request = Request(self._captured, ATTACKERS_BOOT, self._sequence)
+        request = AnsweredRequest(self._captured, ATTACKERS_BOOT, self._sequence)
         return session.seal(self._sequence, message, request, signature, 0)
 
     def forged(self, message: Message, receiver: int, now: float) -> Iterator[bytes]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from harness.checker.evidence import Evidence, Watch
 from harness.checker.recorded_inputs import decoded
-from harness.checker.reference.state import State
+from harness.checker.reference.state import ReferenceState
 from harness.checker.steps import check
 from harness.play.simulation.simulation import Simulation
 from harness.proof.model._shape import HeldBlockOrder, Shape, shape_of
@@ -72,7 +72,7 @@ class CoverageWatcher:
         self._input: HandlerRun | None = None
         self._answers = False
 
-    def step(self, state: State, run: HandlerRun | None) -> None:
+    def step(self, state: ReferenceState, run: HandlerRun | None) -> None:
         """Record the state of an agent after a handler run. `run` is None when the agent has just started."""
         reached = self.reached
         if run is None:
@@ -95,7 +95,7 @@ class CoverageWatcher:
                 reached.pairs.add(self._held_before.number((self._shape_before, given)))
         self._number_before, self._shape_before, self._held_before = number, shape, held
 
-    def _what_it_holds(self, state: State) -> HeldBlockOrder:
+    def _what_it_holds(self, state: ReferenceState) -> HeldBlockOrder:
         key: tuple[object, ...] = (state.chain.top_chain_hash,)
         if state.blocks_to_be_committed or state.reconcile_stack:
             aside = (*state.blocks_to_be_committed, *state.reconcile_stack)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from harness.checker.reference.algorithms import HANDLERS
 from harness.checker.reference.reference_agent import ReferenceAgent
-from harness.checker.reference.state import Settings, State
+from harness.checker.reference.state import ReferenceState, Settings
 from harness.checker.steps.deviation import differences
 from harness.proof.bounds import Bounds
 from harness.proof.model._known_states import FIRST
@@ -120,7 +120,7 @@ COPIED = (
 """Attributes that the reference's state and an agent's state share, apart from chain, timers and the dictionary."""
 
 
-def _put_into(state: State, before: Snapshot) -> None:
+def _put_into(state: ReferenceState, before: Snapshot) -> None:
     """Set the reference implementation to the state of an agent's snapshot."""
     for name in COPIED:
         value = before[name]
@@ -140,7 +140,7 @@ def _put_into(state: State, before: Snapshot) -> None:
 TIMERS = ("voting_timer", "phase_one_timer", "phase_two_timer", "phase_three_timer", "finalize_timer")
 
 
-def _state(state: State | AgentState) -> tuple[Any, ...]:
+def _state(state: ReferenceState | AgentState) -> tuple[Any, ...]:
     """Return the parts of a state that affect later steps. Vote counts matter only while their timer runs."""
     votes, phase_1, phase_2, phase_3, _ = (timer.active for timer in state.timers)
     return (

@@ -13,7 +13,7 @@ from hashlib import blake2b
 from itertools import chain
 from typing import Any
 
-from harness.checker.reference.state import State
+from harness.checker.reference.state import ReferenceState
 from ucp.block import Block, next_chain_hash
 from ucp.messages import Message
 from ucp.state import AgentState
@@ -36,7 +36,7 @@ class HeldBlockOrder:
 
     __slots__ = ("_blocks", "_heights", "_numbers", "_ordinals", "_shape", "_top")
 
-    def __init__(self, state: AgentState | State) -> None:
+    def __init__(self, state: AgentState | ReferenceState) -> None:
         held = {
             block.block_hash: block.timestamp_us
             for block in chain(state.chain, state.blocks_to_be_committed, state.reconcile_stack)
@@ -109,7 +109,7 @@ class HeldBlockOrder:
         return self.between(value)
 
 
-def shape_of(state: AgentState | State, held: HeldBlockOrder) -> Shape:
+def shape_of(state: AgentState | ReferenceState, held: HeldBlockOrder) -> Shape:
     """Return the shape of a state, apart from the held blocks. Together with the shape of `held`, it identifies the
     state.
     """

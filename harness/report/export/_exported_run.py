@@ -15,10 +15,17 @@ from typing import TYPE_CHECKING
 from harness.archive.archive import RunArchive
 from harness.archive.connectivity import Components, Connectivity, LossRates, Topology
 from harness.archive.exports import name_blocks
-from harness.archive.history import LATEST_S, History, end_of_traces, has_possible_time, history_of, possible_faults
+from harness.archive.history import (
+    LATEST_S,
+    MissionHistory,
+    end_of_traces,
+    has_possible_time,
+    history_of,
+    possible_faults,
+)
 from harness.archive.replication import replication_of
 from harness.archive.run_record import FaultRecord
-from harness.archive.tracks import Tracks
+from harness.archive.tracks import VehicleTracks
 from harness.errors import ExportError, RunDirectoryError
 from harness.report import logbook
 from harness.report.export._logs import log_files, read_log
@@ -95,7 +102,7 @@ class ExportedRun:
         return self.block_names.get(block_hash, block_hash[:12])
 
     @cached_property
-    def history(self) -> History:
+    def history(self) -> MissionHistory:
         """The votes, reconciles and messages of all agents."""
         return history_of(self.archive.traces, self.faults, self.end_s)
 
@@ -108,7 +115,7 @@ class ExportedRun:
         return self.archive.network(self.agents)
 
     @cached_property
-    def tracks(self) -> Tracks:
+    def tracks(self) -> VehicleTracks:
         return self.archive.tracks(self.agents)
 
     @cached_property

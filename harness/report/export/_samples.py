@@ -11,10 +11,10 @@ from datetime import UTC, datetime
 from typing import Any, Literal, NamedTuple
 
 from harness.archive.connectivity import Components, Link
-from harness.archive.history import LATEST_S, Message, Reconcile, Vote
-from harness.archive.replication import Replication
+from harness.archive.history import LATEST_S, AgentReconcile, AgentVote, BroadcastMessage
+from harness.archive.replication import ReplicationFigures
 from harness.archive.run_record import RunRecord
-from harness.archive.traces import Header
+from harness.archive.traces import TraceHeader
 from ucp.trace import HandlerRun
 
 Level = Literal["info", "warning", "error"]
@@ -86,7 +86,7 @@ class MessageSample:
     """A message, at the time at which it was sent."""
 
     at_ns: int
-    message: Message
+    message: BroadcastMessage
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class VoteSample:
     """A vote, at the time at which it ended."""
 
     at_ns: int
-    vote: Vote
+    vote: AgentVote
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +102,7 @@ class ReconcileSample:
     """A reconcile, at the time at which it ended or was interrupted."""
 
     at_ns: int
-    reconcile: Reconcile
+    reconcile: AgentReconcile
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,11 +110,11 @@ class ReplicationSample:
     """The number of copies of the blocks, at the time of a change."""
 
     at_ns: int
-    replication: Replication
+    replication: ReplicationFigures
 
 
 @dataclass(frozen=True, slots=True)
-class Telemetry:
+class TelemetrySample:
     """A MAVLink message of a vehicle, decoded by pymavlink."""
 
     at_ns: int
@@ -142,7 +142,7 @@ Sample = (
     | VoteSample
     | ReconcileSample
     | ReplicationSample
-    | Telemetry
+    | TelemetrySample
     | LogLine
 )
 
@@ -184,7 +184,7 @@ class MissionTime:
         return at_ns if abs(self.mission_s(at_ns)) <= LATEST_S else None
 
 
-def mission_time(headers: Mapping[int, Header], record: RunRecord, problems: list[str]) -> MissionTime:
+def mission_time(headers: Mapping[int, TraceHeader], record: RunRecord, problems: list[str]) -> MissionTime:
     """Return the clock of the mission from the headers of the traces, or otherwise from run.json.
 
     Add a sentence for each invalid clock.
@@ -202,7 +202,7 @@ def mission_time(headers: Mapping[int, Header], record: RunRecord, problems: lis
     return MissionTime(epoch_ns, _speedup(headers, record), epochs)
 
 
-def _speedup(headers: Mapping[int, Header], record: RunRecord) -> float:
+def _speedup(headers: Mapping[int, TraceHeader], record: RunRecord) -> float:
     recorded = [header.clock.get("speedup") for header in headers.values()]
     planned = [record.scenario.speedup] if record.scenario else []
     possible = (

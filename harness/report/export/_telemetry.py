@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pymavlink import mavutil
 
-from harness.report.export._samples import MissionTime, Telemetry
+from harness.report.export._samples import MissionTime, TelemetrySample
 
 NAME = "telemetry.tlog"
 MAX_BYTES = 1024 * 1024 * 1024
@@ -24,7 +24,7 @@ def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
     return [(vehicle, path) for vehicle, _, path in sorted(logs)]
 
 
-def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[str]) -> Iterator[Telemetry]:
+def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[str]) -> Iterator[TelemetrySample]:
     """Yield the messages of a telemetry log. Then add sentences about damaged parts to `problems`."""
     damaged = untimed = 0
     if not path.is_file():
@@ -49,7 +49,7 @@ def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[s
             elif (at_ns := time.of_wall(message._timestamp)) is None:
                 untimed += 1
             elif not kind.startswith("UNKNOWN_"):
-                yield Telemetry(at_ns, vehicle, message)
+                yield TelemetrySample(at_ns, vehicle, message)
     finally:
         log.f.close()
     if damaged:

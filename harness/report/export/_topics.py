@@ -18,7 +18,7 @@ from harness.report.export._samples import (
     ReconcileSample,
     ReplicationSample,
     Sample,
-    Telemetry,
+    TelemetrySample,
     VoteSample,
 )
 from ucp.trace import HandlerRun
@@ -136,7 +136,7 @@ class TopicConverter:
                     "copies_mean": replication.copies_mean,
                 }
                 yield "/swarm/replication", "ucp.Replication", values
-            case Telemetry(vehicle=vehicle, message=message):
+            case TelemetrySample(vehicle=vehicle, message=message):
                 kind = message.get_type()
                 name = f"mavlink.{kind}"
                 if name not in self.schemas:

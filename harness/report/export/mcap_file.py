@@ -15,7 +15,7 @@ from harness.archive.exports import MAX_EXPORT_BYTES, RUN_FILE, export_paths
 from harness.errors import extra
 from harness.report.export._exported_run import ExportedRun
 from harness.report.export._links import FIELD, vehicle_frame
-from harness.report.export._samples import FieldPosition, LogLine, LossSample, Telemetry
+from harness.report.export._samples import FieldPosition, LogLine, LossSample, TelemetrySample
 from harness.report.export._topics import TopicConverter
 from ucp.plain_file import read_plain_file
 
@@ -58,7 +58,7 @@ def _write(recording: ExportedRun, writer: "_McapWriter", progress: Callable[[fl
                 scene.links.losses |= losses
             case LogLine(level=level, source=source, text=text):
                 writer.log(at_ns, _LEVELS[level], source, text)
-            case Telemetry(vehicle=vehicle, message=message) if message.get_type() == "STATUSTEXT":
+            case TelemetrySample(vehicle=vehicle, message=message) if message.get_type() == "STATUSTEXT":
                 severity = _SEVERITIES[min(message.severity, len(_SEVERITIES) - 1)]
                 writer.log(at_ns, severity, f"vehicle {vehicle}", message.text)
         for topic, name, values in topics.of(sample):

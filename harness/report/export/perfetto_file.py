@@ -15,7 +15,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any
 
-from harness.archive.history import Message
+from harness.archive.history import BroadcastMessage
 from harness.errors import extra
 from harness.report.export._exported_run import ExportedRun
 from harness.report.export._samples import (
@@ -81,7 +81,7 @@ def _write(recording: ExportedRun, file: IO[bytes], progress: Callable[[float], 
 class _MessageArrows:
     """The numbers of all arrows. Each pair of a message and a receiver has its own arrow."""
 
-    def __init__(self, messages: Iterable[Message]) -> None:
+    def __init__(self, messages: Iterable[BroadcastMessage]) -> None:
         numbers = count(1)
         self._from: dict[tuple[int, int, float], list[int]] = {}
         self._to: dict[tuple[int, int, int, float], int] = {}

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from harness.archive.history import LATEST_S
-from harness.archive.traces import Gap, Header
+from harness.archive.traces import TraceGap, TraceHeader
 from harness.errors import MachineError, extra
 from harness.report.export._exported_run import ExportedRun
 from harness.report.export._links import FIELD, CurrentLinks, LinkLine, vehicle_frame
@@ -25,7 +25,7 @@ from harness.report.export._samples import (
     Metres,
     NetworkSample,
     Sample,
-    Telemetry,
+    TelemetrySample,
 )
 
 with extra("export", "writing a ROS bag"):
@@ -100,9 +100,9 @@ class _RosMessages:
         time = self._recording.time
         at_ns = time.at(0.0, agent)
         for entry in self._recording.archive.traces[agent].entries():
-            if not isinstance(entry, Gap | Header) and 0 <= entry.t <= LATEST_S:
+            if not isinstance(entry, TraceGap | TraceHeader) and 0 <= entry.t <= LATEST_S:
                 at_ns = time.at(entry.t, agent)
-            if not isinstance(entry, Gap):
+            if not isinstance(entry, TraceGap):
                 yield at_ns, f"/ucp/{agent}/trace", _message("std_msgs/msg/String", data=entry.to_line().rstrip("\n"))
 
     def _of_samples(self) -> Iterator[Timed]:
@@ -130,7 +130,7 @@ class _RosMessages:
                     yield from self._count(f"/agent_{agent}/{name}", "UInt32", min(max(blocks, 0), _LARGEST))
             case LogLine(level=level, source=source, text=text):
                 yield "/rosout", _log(at_ns, LEVELS[level], source, text)
-            case Telemetry(vehicle=vehicle, message=message):
+            case TelemetrySample(vehicle=vehicle, message=message):
                 yield f"/vehicle_{vehicle}/mavlink", _bytes(bytes(message.get_msgbuf()))
 
     def _count(self, topic: str, kind: str, value: float) -> Iterator[tuple[str, Any]]:

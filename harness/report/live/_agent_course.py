@@ -9,8 +9,16 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from harness.archive.history import COMMITTED_BY, LATEST_S, ActivityStart, HistoryReader, Phase2Tie, Reconcile, Vote
-from harness.archive.traces import Header, HeldBlocks, parse_line
+from harness.archive.history import (
+    COMMITTED_BY,
+    LATEST_S,
+    ActivityStart,
+    AgentReconcile,
+    AgentVote,
+    HistoryReader,
+    Phase2Tie,
+)
+from harness.archive.traces import HeldBlocks, TraceHeader, parse_line
 from harness.report.live._live_trace import AgentTrace
 from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
 from ucp.trigger import MessageTrigger
@@ -108,14 +116,14 @@ class AgentActions:
             self.has_messages_without_effect = self.has_messages_without_effect or _NO_EFFECT in line
             if _NO_CHANGES in line and (match := _RECEIPT_LINE.match(line)) and not self._may_be_idle_too_early(line):
                 t, sender, seq = match.groups()
-                entry: MessageReceipt | Header | Entry = MessageReceipt(float(t), int(sender), int(seq))
+                entry: MessageReceipt | TraceHeader | Entry = MessageReceipt(float(t), int(sender), int(seq))
             else:
                 try:
                     entry = parse_line(line)
                 except ValueError:
                     self.problem = f"the trace of agent {self.agent_id} is damaged, and is read up to the damage"
                     return None
-            if isinstance(entry, Header):
+            if isinstance(entry, TraceHeader):
                 self._begin()
             elif not isinstance(entry, CommandEntry) and 0 <= entry.t <= LATEST_S:
                 return entry
@@ -167,9 +175,9 @@ class AgentActions:
                     self._add_activity(run.t, "reconciling", step.detail)
                 case ActivityStart():
                     self._add_activity(run.t, step.detail, "")
-                case Vote():
+                case AgentVote():
                     self._add_activity(run.t, "voted", step.outcome[:80])
-                case Reconcile():
+                case AgentReconcile():
                     self._add_activity(run.t, "reconciled", "")
                 case Phase2Tie():
                     self._add_activity(run.t, "tie", step.branch[:80])

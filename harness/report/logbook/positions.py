@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 from harness.archive.exports import ExportedBlock
 from harness.archive.run_record import RunRecord
-from harness.archive.tracks import PositionFix, Tracks
+from harness.archive.tracks import PositionFix, VehicleTracks
 from harness.report.logbook.book import Logbook
 from sitl.vehicle import Home
 from ucp.events import LoggableEvent, MalformedEventsError
@@ -115,7 +115,7 @@ class RoundedPosition(NamedTuple):
     alt_mm: int
 
 
-def recorded_tracks(record: RunRecord, recorded: Tracks) -> list[EventTrack]:
+def recorded_tracks(record: RunRecord, recorded: VehicleTracks) -> list[EventTrack]:
     """Return a track without events for each recorded vehicle, relative to the home position in the scenario."""
     if record.scenario is None:
         return []

@@ -7,6 +7,6 @@ that reach new states.
 """
 
 from harness.sweep.explore._explore_text import in_words, watching
-from harness.sweep.explore._exploring import MAX_RUNS, SEEDS, Explored, SearchProgress, Violation, explore
+from harness.sweep.explore._exploring import MAX_RUNS, SEEDS, Explored, SearchProgress, ViolatingRun, explore
 
-__all__ = ["MAX_RUNS", "SEEDS", "Explored", "SearchProgress", "Violation", "explore", "in_words", "watching"]
+__all__ = ["MAX_RUNS", "SEEDS", "Explored", "SearchProgress", "ViolatingRun", "explore", "in_words", "watching"]

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from harness.run.simulate import ENDED, evidence_lines
 from harness.scenario.verdict_names import BAD_IN_WORDS
-from harness.sweep.explore._exploring import Explored, SearchProgress, Violation
+from harness.sweep.explore._exploring import Explored, SearchProgress, ViolatingRun
 
 _WORDS = {**BAD_IN_WORDS, ENDED: "an agent crashed or hung"}
 
@@ -28,7 +28,7 @@ def watching(console: Console) -> Iterator[SearchProgress]:
     every_s = REDRAW_EVERY_S if console.is_terminal else LINE_EVERY_S
     last = 0.0
 
-    def on_violation(violation: Violation) -> None:
+    def on_violation(violation: ViolatingRun) -> None:
         words = " and ".join(_WORDS[key] for key in violation.keys)
         console.print(f"seed {violation.seed}: {words}; shrinking", highlight=False)
 

@@ -16,7 +16,7 @@ from harness.sweep.explore._smaller import replays, scenario_of, shrink, size
 
 
 @dataclass(frozen=True, slots=True)
-class Violation:
+class ViolatingRun:
     """A run with bad verdicts: its seed, and the numbers or keys of the failed checks."""
 
     seed: int
@@ -32,7 +32,7 @@ class SearchResult:
     """
 
     played: int = 0
-    violation: Violation | None = None
+    violation: ViolatingRun | None = None
     failed: dict[int, str] = field(default_factory=dict)
     unfinished: list[int] = field(default_factory=list)
     interrupted: bool = False
@@ -59,7 +59,7 @@ def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: 
                     continue
                 wrong, needs_time = outcome
                 if wrong:
-                    searched.violation = Violation(seed, wrong)
+                    searched.violation = ViolatingRun(seed, wrong)
                     break
                 if needs_time:
                     searched.unfinished.append(seed)
@@ -111,7 +111,7 @@ class SearchProgress:
     as text.
     """
 
-    on_violation: Callable[[Violation], None] = field(default=lambda violation: None)
+    on_violation: Callable[[ViolatingRun], None] = field(default=lambda violation: None)
     on_step: Callable[[int, str], None] = field(default=lambda runs, words: None)
     shown: bool = False
 

@@ -61,7 +61,7 @@ class Recording:
 
 def record(scenario: Scenario, seed: int) -> Recording:
     """Play a run and record it. If an agent crashes or hangs, the recording ends there."""
-    tape = _Recorder()
+    tape = _EventRecorder()
     try:
         result = simulate_in_memory(tape, scenario, seed, fate_script=partial(_RecordingScript, tape=tape)).result
     except AgentFailedError as error:
@@ -69,7 +69,7 @@ def record(scenario: Scenario, seed: int) -> Recording:
     return Recording(result, tape.events, sorted(tape.lost, key=lambda lost: lost.at_s))
 
 
-class _Recorder(MemoryRecorder):
+class _EventRecorder(MemoryRecorder):
     def __init__(self) -> None:
         super().__init__(tracing=True)
         self.events: list[RecordedEvent] = []
@@ -107,7 +107,7 @@ class _Recorder(MemoryRecorder):
 class _RecordingScript(FateScript):
     """Delivery rules that also record the messages that are lost by a rule or by chance."""
 
-    def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _Recorder) -> None:
+    def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _EventRecorder) -> None:
         super().__init__(fates, roster, name_of)
         self.listens = True
         self._name = name_of

@@ -32,7 +32,7 @@ from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
 from harness.sweep.matrix.matrix_summary import to_markdown
 from harness.sweep.matrix.matrix_table import name_of, troubles, unsupported
-from harness.sweep.matrix.nights import Nights
+from harness.sweep.matrix.nights import StoredNights
 from harness.sweep.matrix.report import to_html
 from ucp.agent_files import write_atomically, write_json_atomically
 
@@ -62,7 +62,7 @@ def _cases(record: MatrixRecord) -> Iterator[JunitCase]:
             yield JunitCase(name)
 
 
-def write(finished: Finished, directory: Path, nights: Nights | None = None) -> None:
+def write(finished: Finished, directory: Path, nights: StoredNights | None = None) -> None:
     """Write all output files. `nights` are drawn as a trend. Raises MachineError if a file cannot be written."""
     record = finished.record
     try:

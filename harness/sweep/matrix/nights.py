@@ -122,7 +122,7 @@ LAST = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Nights:
+class StoredNights:
     """The stored nights of one matrix, sorted by start time. `left_out` contains a sentence for each unusable file."""
 
     directory: Path
@@ -159,7 +159,7 @@ def keep(record: MatrixRecord, directory: Path) -> None:
         raise MachineError(f"{path} cannot be written: {error.strerror}") from None
 
 
-def read(directory: Path, matrix: Matrix) -> Nights:
+def read(directory: Path, matrix: Matrix) -> StoredNights:
     """Return the stored nights of `matrix` in `directory`."""
     records, left_out = [], []
     for path in sorted(directory.glob("*.json"))[-LAST:]:
@@ -167,4 +167,4 @@ def read(directory: Path, matrix: Matrix) -> Nights:
             records.append(load_night(path, matrix))
         except ScenarioError as error:
             left_out.append(str(error))
-    return Nights(directory, sorted(records, key=lambda record: record.started_at), left_out)
+    return StoredNights(directory, sorted(records, key=lambda record: record.started_at), left_out)

@@ -34,7 +34,7 @@ from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret
 from ucp.secure.envelope import CLEAR, MAGIC, SEAL_BYTES, TAG_BYTES, VERSION, ClearHeader, read_clear_header
 from ucp.secure.opening import DatagramOpener
 from ucp.secure.revocation import Revocation
-from ucp.secure.sealed_datagrams import CRYPTO_FUNCTIONS, NO_REQUEST, CryptoFunctions, Request, signing_domain
+from ucp.secure.sealed_datagrams import CRYPTO_FUNCTIONS, NO_REQUEST, AnsweredRequest, CryptoFunctions, signing_domain
 from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
 from ucp.settings import Settings
@@ -141,7 +141,7 @@ class _Driven:
         state = self.agent.state
         blocks = [*BLOCKS, *state.blocks_to_be_committed, *state.chain]
         block, chain_hash = blocks[choice % len(blocks)], state.chain.top_chain_hash
-        asked = Request(1, self.agent.session.boot, self.agent.session._own_requests.get(code - 1, 0))
+        asked = AnsweredRequest(1, self.agent.session.boot, self.agent.session._own_requests.get(code - 1, 0))
         messages: dict[int, Message] = {
             1: BlockAddRequest(block.block_hash, chain_hash),
             3: CommitBlock(block, chain_hash),

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.archive.traces import Header, Trace, parse_line, read_trace, why_not_a_trace
+from harness.archive.traces import Trace, TraceHeader, parse_line, read_trace, why_not_a_trace
 from tests.fuzz.finding import require, sound
 from tests.fuzz.targets.home import came_home, in_its_run
 from ucp.trace import Entry
@@ -39,7 +39,7 @@ def _lines(trace: Trace) -> list[str]:
 def _same_again(entry: Entry) -> None:
     line = entry.to_line()
     read = parse_line(line.encode("ascii"))
-    require(not isinstance(read, Header) and read.to_line() == line, "a line of a trace is written otherwise")
+    require(not isinstance(read, TraceHeader) and read.to_line() == line, "a line of a trace is written otherwise")
 
 
 def seeds(flown: Path) -> Iterator[bytes]:

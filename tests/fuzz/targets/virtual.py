@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.archive.exports import parse_export
-from harness.archive.traces import Header, parse_line
+from harness.archive.traces import TraceHeader, parse_line
 from harness.play.process.agent_mission import mission_file
 from tests.fuzz.finding import FailedError, require, sound
 from tests.harness.virtual import scenario
@@ -47,7 +47,7 @@ def _judge(line: bytes, answer: dict[str, Any]) -> None:
     for sent in answer["sent"]:
         decode(base64.b64decode(sent, validate=True))
     for entry in answer.get("trace", ()):
-        require(not isinstance(parse_line(json.dumps(entry).encode()), Header), "a header among what it did")
+        require(not isinstance(parse_line(json.dumps(entry).encode()), TraceHeader), "a header among what it did")
     told = answer.get("answer", {})
     if "schema" in told:
         parse_export(Path("told"), told)

@@ -9,17 +9,17 @@ from harness.archive import archive
 from harness.archive.archive import RunArchive
 from harness.archive.history import (
     CUT_SHORT,
-    Message,
+    AgentReconcile,
+    AgentVote,
+    BroadcastMessage,
     Phase2Tie,
-    Reconcile,
     ReconcilePhase,
-    Vote,
     end_of_traces,
     history_of,
 )
-from harness.archive.replication import Replication, replication_of
+from harness.archive.replication import ReplicationFigures, replication_of
 from harness.archive.run_record import FaultRecord
-from harness.archive.traces import Header, Trace
+from harness.archive.traces import Trace, TraceHeader
 from harness.checker.uniform_chain import common_prefix
 from harness.play.progress import SilentProgress
 from harness.run.run import run
@@ -63,7 +63,7 @@ def handler_run(at_s: float, handler: str, branch: str = "", **keys: Any) -> Han
 
 
 def trace_of(agent: int, *incarnations: list[HandlerRun]) -> Trace:
-    trace = Trace(Header(agent_id=agent, roster=[1, 2, 3], settings={}, clock={}))
+    trace = Trace(TraceHeader(agent_id=agent, roster=[1, 2, 3], settings={}, clock={}))
     for number, life in enumerate(incarnations):
         trace.starts += [len(trace.runs)] if number else []
         trace.runs += life
@@ -80,7 +80,7 @@ def test_tie_has_votes_and_phases_of_both_reconciles() -> None:
         (2, "2.1", 3.0, 13.0, "approved"),
     ]
     phases = [ReconcilePhase("phase 1", 32.0, 37.0, 1), ReconcilePhase("phase 2", 37.0, 42.0, 1)]
-    assert found.reconciles[0] == Reconcile(1, 32.0, 42.0, "vote not approved", phases, done=True)
+    assert found.reconciles[0] == AgentReconcile(1, 32.0, 42.0, "vote not approved", phases, done=True)
     assert found.ties[0] == Phase2Tie(1, 42.0, "tie: top of chain")
     fetched = next(one for one in found.reconciles if one.agent == 2 and one.reason == "chain diverged")
     assert [(phase.name, phase.rounds) for phase in fetched.phases] == [
@@ -120,11 +120,11 @@ def test_vote_ends_at_the_loss_or_at_the_end_of_the_run() -> None:
     traces = {1: trace_of(1, [proposed, *begun], [handler_run(30.0, "process_next_deque_block", "proposed")])}
     found = history_of(traces, [FaultRecord(at_s=8.0, what="kill", detail="", agents=[1])], 50.0)
     assert found.votes == [
-        Vote(1, "aa", 5.0, 8.0, CUT_SHORT),
-        Vote(1, "", 30.0, 50.0, CUT_SHORT),
+        AgentVote(1, "aa", 5.0, 8.0, CUT_SHORT),
+        AgentVote(1, "", 30.0, 50.0, CUT_SHORT),
     ]
     phases = [ReconcilePhase("phase 1", 6.0, 8.0, 1)]
-    assert found.reconciles == [Reconcile(1, 6.0, 8.0, "asked by the operator", phases, done=False)]
+    assert found.reconciles == [AgentReconcile(1, 6.0, 8.0, "asked by the operator", phases, done=False)]
 
 
 def test_vote_of_killed_agent_ends_before_its_next_incarnation() -> None:
@@ -143,8 +143,8 @@ def test_receipt_belongs_to_the_sending_incarnation() -> None:
     ]
     found = history_of({1: trace_of(1, *sends), 2: trace_of(2, hears)}, [], 30.0)
     assert found.messages == [
-        Message(1, 1.0, "Commit Block", None, [(2, 2.0)]),
-        Message(1, 20.0, "Commit Block", None, [(2, 21.0)]),
+        BroadcastMessage(1, 1.0, "Commit Block", None, [(2, 2.0)]),
+        BroadcastMessage(1, 20.0, "Commit Block", None, [(2, 21.0)]),
     ]
 
 
@@ -153,7 +153,7 @@ def test_handler_run_with_impossible_time_is_left_out(at_s: float) -> None:
     commit = handler_run(at_s, "receive_commit_block", changes=[("complete", "aa"), ("chain+", "aa")])
     traces = {1: trace_of(1, [handler_run(1.0, "build_data_block"), commit])}
     assert history_of(traces, [], end_of_traces(traces)).commits == []
-    assert replication_of(traces, []) == [Replication(0.0, 0, 0, 1, None, None)]
+    assert replication_of(traces, []) == [ReplicationFigures(0.0, 0, 0, 1, None, None)]
     assert end_of_traces(traces) == 1.0
 
 

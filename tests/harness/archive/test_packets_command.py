@@ -14,7 +14,7 @@ from tests.ucp.secure.swarm import KEYS, session
 from ucp.block import Block
 from ucp.messages import BlockAddRequest, BlockAddResponse, CommitBlock, encode
 from ucp.secure.bundle import KeySet, write_bundle
-from ucp.secure.session import Request
+from ucp.secure.session import AnsweredRequest
 
 BLOCK = Block(1, 5, b"events")
 BEFORE, AFTER = bytes(32), bytes(range(32))
@@ -41,7 +41,7 @@ def test_bundle_decrypts_sealed_datagrams(tmp_path: Path) -> None:
     scene = CaptureScript(1, 2, 3)
     request, vote = BlockAddRequest(BLOCK.block_hash, BEFORE), BlockAddResponse(BLOCK.block_hash, True)
     scene.broadcast(10, 1, asks.seal(0, request, None, None, 0))
-    scene.broadcast(10.02, 2, answers.seal(0, vote, Request(1, asks.boot, 0), None, 0))
+    scene.broadcast(10.02, 2, answers.seal(0, vote, AnsweredRequest(1, asks.boot, 0), None, 0))
     scene.finish(30)
     run_dir = scene.write(tmp_path / "run")
     write_bundle(tmp_path / "3.bundle.json", KEYS.bundle(3))

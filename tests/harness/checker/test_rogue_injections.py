@@ -6,7 +6,7 @@ from typing import Any
 
 from harness.archive.archive import RunArchive
 from harness.archive.run_record import RogueInjection
-from harness.archive.traces import Header, Trace
+from harness.archive.traces import Trace, TraceHeader
 from harness.checker.injections import account, in_words
 from harness.play.rogue.rogue_line import forged_sequence
 from tests.harness.virtual import scenario
@@ -33,7 +33,7 @@ def trace(agent: int, *runs: tuple[float, int, str], changes: bool = False) -> T
         )
         for t, sequence, branch in runs
     ]
-    return Trace(Header(agent_id=agent, roster=[1, 2, 3, 4], settings={}, clock={}), triggered)
+    return Trace(TraceHeader(agent_id=agent, roster=[1, 2, 3, 4], settings={}, clock={}), triggered)
 
 
 def line(at_s: float, injection: int, **keys: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from harness.archive.traces import HANDLER_RUN, Header, Trace
+from harness.archive.traces import HANDLER_RUN, Trace, TraceHeader
 from harness.checker import Evidence, steps
 from harness.checker.judgement import Judgement
 from harness.checker.reference.state import Settings
@@ -254,7 +254,7 @@ def test_missing_start_of_a_timer_is_found(honest: Evidence) -> None:
 
 
 def test_trace_of_version_1_is_not_judged(honest: Evidence) -> None:
-    header = Header.model_validate(honest.traces[2].header.model_dump() | {"schema": "ucp-trace/1"})
+    header = TraceHeader.model_validate(honest.traces[2].header.model_dump() | {"schema": "ucp-trace/1"})
     old = dataclasses.replace(honest.traces[2], header=header)
     judgement = steps.check(with_traces(honest, {**honest.traces, 2: old}))
     assert judgement.verdict == "not applicable"
@@ -307,7 +307,7 @@ def test_agent_is_followed_after_a_wrong_boot() -> None:
     agent.boot(StoredState(completed=[block.block_hash for block in stack], stack=stack), 0.0)
     agent.handle_timer(1.0)
     header = {"schema": SCHEMA, "agent_id": 1, "roster": [1, 2], "initial_data": in_base64(b"mission"), "clock": {}}
-    trace = Trace(Header.model_validate({**header, "settings": dataclasses.asdict(agent.state.settings)}))
+    trace = Trace(TraceHeader.model_validate({**header, "settings": dataclasses.asdict(agent.state.settings)}))
     trace.extend(agent.trace())
     trace.runs[0].branch = "done"
     judgement = steps.check(Evidence({}, {1: trace}))

@@ -3,7 +3,7 @@
 import pytest
 
 from harness.archive.lag import LagLine, MeasuredLag
-from harness.archive.traces import Header, Trace
+from harness.archive.traces import Trace, TraceHeader
 from harness.checker.timer_lag import ENOUGH, timer_lag
 from ucp.trace import HandlerRun, StateSummary
 from ucp.trigger import UnknownTrigger
@@ -16,7 +16,7 @@ def _run(t: float, handler: str, branch: str, reconciling: bool = False) -> Hand
 
 def _votes(*late_s: float, reconciling: bool = False) -> Trace:
     """Return the trace of an agent whose voting timers of 10 s expired late by these times."""
-    header = Header(agent_id=1, roster=[1], settings={"vote_timeout_s": 10.0}, clock={})
+    header = TraceHeader(agent_id=1, roster=[1], settings={"vote_timeout_s": 10.0}, clock={})
     runs = [
         run
         for number, late in enumerate(late_s)

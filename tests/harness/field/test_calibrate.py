@@ -11,7 +11,7 @@ import pytest
 from benchmarks.calibrating import calibrated, covered
 from harness.errors import FieldError
 from harness.field.calibrate._delivery_model import DeliveryModel, TransmissionAttempt, fit, student
-from harness.field.calibrate.calibration import Calibration, calibrate, model_of, validate
+from harness.field.calibrate.calibration import CalibrationResult, calibrate, model_of, validate
 from harness.scenario import Scenario
 from harness.scenario.load import load_scenario
 from netem.radio import LogDistance
@@ -116,13 +116,13 @@ def test_quantiles_equal_those_of_the_tables() -> None:
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Calibration, DeliveryModel]:
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CalibrationResult, DeliveryModel]:
     directory = tmp_path_factory.mktemp("calibrate") / "run"
     calibration, truth = calibrated(1, directory, agents=4, duration_s=600.0)
     return directory, calibration, truth
 
 
-def test_simulated_flight_is_fitted(flown: tuple[Path, Calibration, DeliveryModel]) -> None:
+def test_simulated_flight_is_fitted(flown: tuple[Path, CalibrationResult, DeliveryModel]) -> None:
     _, calibration, truth = flown
     assert calibration.source == "captures"
     assert covered(calibration, truth) == {"range_m": True, "spread": True, "floor": True}
@@ -152,7 +152,7 @@ def _taken_home(run: Path, directory: Path, vehicles: tuple[int, ...]) -> Path:
 
 
 def test_flight_logs_give_the_distances_of_the_run(
-    flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path
+    flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path
 ) -> None:
     run, _, _ = flown
     calibration = calibrate([_taken_home(run, tmp_path / "home", (1, 2, 3, 4))])
@@ -167,7 +167,9 @@ def test_flight_logs_give_the_distances_of_the_run(
         assert attempt.distance_m == pytest.approx(expected_m, abs=1.0, rel=0.01)
 
 
-def test_vehicle_without_positions_is_named(flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path) -> None:
+def test_vehicle_without_positions_is_named(
+    flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path
+) -> None:
     calibration = calibrate([_taken_home(flown[0], tmp_path / "home", (1, 2))])
 
     assert {attempt.link for attempt in calibration.attempts} == {frozenset((1, 2))}
@@ -175,7 +177,7 @@ def test_vehicle_without_positions_is_named(flown: tuple[Path, Calibration, Deli
 
 
 def test_flight_without_positions_is_refused_with_the_reason(
-    flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path
+    flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path
 ) -> None:
     with pytest.raises(FieldError, match="no message has a known receiver and known distance") as caught:
         calibrate([_taken_home(flown[0], tmp_path / "home", ())])
@@ -183,7 +185,7 @@ def test_flight_without_positions_is_refused_with_the_reason(
 
 
 def test_records_of_one_vehicle_are_refused_with_the_reason(
-    flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path
+    flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path
 ) -> None:
     home = _taken_home(flown[0], tmp_path / "home", (1, 2, 3, 4))
     for agent_id in (2, 3, 4):
@@ -194,7 +196,7 @@ def test_records_of_one_vehicle_are_refused_with_the_reason(
 
 
 def test_messages_after_a_clock_jump_are_left_out(
-    flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path
+    flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path
 ) -> None:
     home = _taken_home(flown[0], tmp_path / "home", (1, 2, 3, 4))
     before = calibrate([home])
@@ -216,7 +218,7 @@ def test_messages_after_a_clock_jump_are_left_out(
 
 
 def test_signal_strengths_determine_the_exponent(
-    flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path
+    flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path
 ) -> None:
     home = _taken_home(flown[0], tmp_path / "home", (1, 2, 3, 4))
     rng, messages = Random(1), [files.dataflash("PARM", 5_000_000, b"SYSID_THISMAV", 2, 1)]
@@ -237,7 +239,9 @@ def test_signal_strengths_determine_the_exponent(
     assert calibration.exponent == calibration.signal.exponent
 
 
-def test_command_writes_a_scenario_that_runs(flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path) -> None:
+def test_command_writes_a_scenario_that_runs(
+    flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path
+) -> None:
     run, calibration, _ = flown
     out, page = tmp_path / "fitted.yaml", tmp_path / "page.html"
     done = harness("calibrate", run, "-o", out, "--html", page)
@@ -254,7 +258,9 @@ def test_command_writes_a_scenario_that_runs(flown: tuple[Path, Calibration, Del
     assert harness("calibrate", run, "-o", out).returncode == 2
 
 
-def test_json_has_the_fit_and_its_intervals(flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path) -> None:
+def test_json_has_the_fit_and_its_intervals(
+    flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path
+) -> None:
     done = harness("calibrate", flown[0], "-o", tmp_path / "fitted.yaml", "--json")
     result = json.loads(done.stdout)
 
@@ -265,7 +271,9 @@ def test_json_has_the_fit_and_its_intervals(flown: tuple[Path, Calibration, Deli
     assert result["validation"]["log_score"] < result["validation"]["constant_log_score"]
 
 
-def test_flight_at_one_distance_gets_one_loss(tmp_path: Path, flown: tuple[Path, Calibration, DeliveryModel]) -> None:
+def test_flight_at_one_distance_gets_one_loss(
+    tmp_path: Path, flown: tuple[Path, CalibrationResult, DeliveryModel]
+) -> None:
     shutil.copytree(flown[0], tmp_path / "run")
     tracks = tmp_path / "run" / "tracks.jsonl"
     lines = [json.loads(line) for line in tracks.read_text().splitlines()]
@@ -279,7 +287,7 @@ def test_flight_at_one_distance_gets_one_loss(tmp_path: Path, flown: tuple[Path,
     assert any("the range cannot be estimated" in sentence for sentence in calibration.sentences())
 
 
-def test_channel_has_the_fitted_range(flown: tuple[Path, Calibration, DeliveryModel], tmp_path: Path) -> None:
+def test_channel_has_the_fitted_range(flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path) -> None:
     out = tmp_path / "fitted.yaml"
     assert harness("calibrate", flown[0], "-o", out, "--channel", "lora_sf7").returncode == 0
     network = load_scenario(out).network

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from harness.archive.traces import MAX_LINE_BYTES, Gap, read_trace
+from harness.archive.traces import MAX_LINE_BYTES, TraceGap, read_trace
 from harness.errors import FieldError
 from harness.field.ingest import IngestResult, ingest_files
 from tests.harness.field.flights import flown, trace_of
@@ -72,7 +72,7 @@ def test_lines_after_damage_are_used_and_the_gap_is_noted(damaged_copy: Path) ->
     result = ingest_files([damaged_copy])
     trace = result.largest().traces[2]
     assert len(trace.runs) == len(lines) - 3
-    assert trace.gaps == [Gap(4, 2, len(lines[5]) + len(lines[6]))]
+    assert trace.gaps == [TraceGap(4, 2, len(lines[5]) + len(lines[6]))]
     assert [line for line, _ in next(trace.incarnations())] == [2, 3, 4, 5, *range(8, len(lines) + 1)]
     (left_out,) = result.left_out
     assert left_out.sentence == f"{path}, line 6: it is damaged, and so is the rest up to line 7"
@@ -85,7 +85,7 @@ def test_complete_line_after_a_truncated_one_is_recovered(damaged_copy: Path) ->
     path.write_bytes(b"".join(lines))
     result = ingest_files([damaged_copy])
     trace = result.largest().traces[2]
-    assert len(trace.runs) == len(lines) - 2 and trace.gaps == [Gap(4, 1, 60)]
+    assert len(trace.runs) == len(lines) - 2 and trace.gaps == [TraceGap(4, 1, 60)]
     assert "line 6: it is damaged; its readable end is used" in report_of(result)
 
 
@@ -119,7 +119,7 @@ def test_trace_without_its_beginning_begins_with_a_gap(damaged_copy: Path) -> No
     path = trace_of(damaged_copy, 1)
     path.write_bytes(b"".join(lines_of(path)[100:]))
     trace = ingest_files([damaged_copy]).largest().traces[1]
-    assert trace.gaps == [Gap(0, 0, 0)]
+    assert trace.gaps == [TraceGap(0, 0, 0)]
 
 
 @pytest.mark.parametrize("in_one_file", [True, False])
@@ -174,7 +174,7 @@ def test_gap_in_one_copy_is_filled_from_another(damaged_copy: Path) -> None:
     trace = result.largest().traces[1]
     assert (
         trace.runs == [*intact_run.runs[:49], *intact_run.runs[50:]]
-        and trace.gaps == [Gap(49, 1, 2)]
+        and trace.gaps == [TraceGap(49, 1, 2)]
         and not trace.cut_off
     )
     assert "3 handler runs that are lost there are read from here" in report_of(result)

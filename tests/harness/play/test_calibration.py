@@ -12,18 +12,18 @@ from typer.testing import CliRunner, Result
 from harness import cli
 from harness.commands import doctor as doctor_module
 from harness.play.machine import capabilities
-from harness.play.machine.capabilities import Requirement
+from harness.play.machine.capabilities import MachineRequirement
 from netem.conditions import NetworkConditions
 from netem.errors import LabError
-from netem.estimates import Lateness, ReceivedStream, lost
+from netem.estimates import MachineLateness, ReceivedStream, lost
 from netem.measure import MeasuredQuantity, NetworkStudy, Observer
 
 WORKS = [
-    Requirement("netem", False, False, "unknown"),
-    Requirement("nftables", True, False, "works"),
-    Requirement("engine", True, True, "nftables"),
+    MachineRequirement("netem", False, False, "unknown"),
+    MachineRequirement("nftables", True, False, "works"),
+    MachineRequirement("engine", True, True, "nftables"),
 ]
-NOTHING_WORKS = [Requirement("engine", False, True, "nothing works", "install nftables")]
+NOTHING_WORKS = [MachineRequirement("engine", False, True, "nothing works", "install nftables")]
 STUDY = NetworkStudy(NetworkConditions(), (MeasuredQuantity(1, 4, "loss 0.15", "lost", 0.15, lost),))
 
 
@@ -33,13 +33,13 @@ def losing(*shares: float) -> Observer:
 
     def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         first = round(next(streams) * packets)
-        lateness = Lateness([0.0001] * packets, [0.0002] * 10)
+        lateness = MachineLateness([0.0001] * packets, [0.0002] * 10)
         return {(1, 4): ReceivedStream([0.0] * packets, [(number, 0.1) for number in range(first, packets)], lateness)}
 
     return observe
 
 
-def fake(monkeypatch: pytest.MonkeyPatch, observer: Observer, findings: list[Requirement] = WORKS) -> None:
+def fake(monkeypatch: pytest.MonkeyPatch, observer: Observer, findings: list[MachineRequirement] = WORKS) -> None:
     """Replace the machine by one with these properties and this measuring function."""
     monkeypatch.setattr(doctor_module, "examine", lambda: findings)
     monkeypatch.setattr(capabilities, "studies", lambda engine: (STUDY,))

@@ -13,8 +13,8 @@ import pytest
 
 from harness.archive import archive
 from harness.archive.archive import RunArchive
-from harness.archive.history import BlockCommit, History, Phase2Tie, Reconcile, ReconcilePhase, Vote
-from harness.archive.replication import Replication
+from harness.archive.history import AgentReconcile, AgentVote, BlockCommit, MissionHistory, Phase2Tie, ReconcilePhase
+from harness.archive.replication import ReplicationFigures
 from harness.play.progress import SilentProgress
 from harness.report import _timeline_charts, _timeline_lanes, _timeline_section, write_report
 from harness.run.run import run
@@ -130,11 +130,11 @@ def test_page_of_twenty_minutes_with_all_messages_stays_small(troubled: Path) ->
 def test_long_run_with_many_changes_is_thinned_and_reported() -> None:
     phases = [ReconcilePhase("phase 1", 0.0, 1.0, 1)] * 3
     spans = [(agent, float(at_s)) for agent in range(1, 51) for at_s in range(200)]
-    votes = [Vote(agent, "aa", at_s, at_s + 1, "approved") for agent, at_s in spans]
-    reconciles = [Reconcile(agent, at_s, at_s + 1, "why", phases, done=True) for agent, at_s in spans]
+    votes = [AgentVote(agent, "aa", at_s, at_s + 1, "approved") for agent, at_s in spans]
+    reconciles = [AgentReconcile(agent, at_s, at_s + 1, "why", phases, done=True) for agent, at_s in spans]
     commits = [BlockCommit(agent, at_s + part / 4, "aa", "heard") for agent, at_s in spans for part in range(4)]
     ties = [Phase2Tie(agent, at_s, "tie: block") for agent, at_s in spans]
-    restless = History(votes, reconciles, commits, ties, None)
+    restless = MissionHistory(votes, reconciles, commits, ties, None)
     picture = _timeline_lanes.draw(restless, [], [], range(1, 51), {}, 200.0, "")
     assert picture.notes == [
         "Of 10000 votes the 6000 longest are drawn",
@@ -152,7 +152,7 @@ def test_long_run_with_many_changes_is_thinned_and_reported() -> None:
 
 
 def test_charts_are_thinned_but_keep_the_worst_moments() -> None:
-    spreads = [Replication(float(at_s), 9 - 9 * (at_s == 777), 9, 1, 1, 1.0) for at_s in range(5000)]
+    spreads = [ReplicationFigures(float(at_s), 9 - 9 * (at_s == 777), 9, 1, 1, 1.0) for at_s in range(5000)]
     kept = _timeline_charts.thin_states(spreads, 5000.0)
     assert len(kept) <= _timeline_charts.MAX_MOMENTS
     assert spreads[777] in kept

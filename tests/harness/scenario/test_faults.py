@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from harness.archive.run_record import FaultRecord, JudgedRecord
-from harness.archive.traces import Header, Trace
+from harness.archive.traces import Trace, TraceHeader
 from harness.checker import Evidence
 from harness.checker._agreement import find_agents_with_chance
 from harness.play.backend import agent_seed
@@ -149,7 +149,7 @@ def test_reconcile_ended_by_a_brown_out_counts_as_no_chance_to_agree() -> None:
     runs = [run_of(10.0, **began), run_of(20.0, **ended)]
     connected = [{"at_s": 0.0, "what": "start", "detail": "", "fully_connected": True}]
     record = JudgedRecord.model_validate({"roster": [1], "network": connected})
-    header = Header(agent_id=1, roster=[1], settings={}, clock={})
+    header = TraceHeader(agent_id=1, roster=[1], settings={}, clock={})
     without_boot, with_boot = Trace(header, runs), Trace(header, runs, starts=[1])
     assert find_agents_with_chance(Evidence({}, {1: without_boot}, record), {1}) == {1}
     assert find_agents_with_chance(Evidence({}, {1: with_boot}, record), {1}) == set()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from harness.archive.exports import SUFFIX, Export
-from harness.archive.traces import HANDLER_RUN, Header, Trace
+from harness.archive.traces import HANDLER_RUN, Trace, TraceHeader
 from harness.checker import Evidence, steps
 from harness.play.keyring.key_directory import KeyDirectory
 from tests.harness.command import harness
@@ -51,7 +51,7 @@ class SealedSwarm:
         clock = {"epoch_us": 0, "speedup": 1.0}
         traces = {
             agent_id: Trace(
-                Header(
+                TraceHeader(
                     schema=SCHEMA,
                     agent_id=agent_id,
                     roster=list(ROSTER),

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.channel import PRESETS, Channel, FrameFate, Radio, TimeSlotRadio, Transmission, WifiRadio
+from netem.channel import PRESETS, Channel, EndedTransmission, FrameFate, Radio, TimeSlotRadio, WifiRadio
 from netem.radio import Place
 
 WIFI_1 = PRESETS["wifi_1"]
@@ -30,7 +30,7 @@ def channel(radio: Radio, *metres: float, seed: int = 1) -> Channel:
     return made
 
 
-def sent(radio: Radio, metres: Sequence[float], *sends: tuple[int, float], seed: int = 1) -> list[Transmission]:
+def sent(radio: Radio, metres: Sequence[float], *sends: tuple[int, float], seed: int = 1) -> list[EndedTransmission]:
     """Send answers, each by (sender, seconds), and return all transmissions."""
     made = channel(radio, *metres, seed=seed)
     for sender, at_s in sends:
@@ -255,7 +255,7 @@ SENDS = st.lists(
 
 def played(preset: str, sends: Sequence[tuple[int, float, int]], steps: int) -> list[tuple[object, ...]]:
     made = channel(PRESETS[preset], 0, 30, 200, 420, 800)
-    found: list[Transmission] = []
+    found: list[EndedTransmission] = []
     for sender, at_s, data_bytes in sorted(sends, key=lambda send: send[1]):
         made.send(sender, at_s, data_bytes)
         if steps:

@@ -21,7 +21,7 @@ from itertools import groupby, pairwise
 
 import pytest
 
-from netem.channel import PRESETS, Channel, Transmission, WifiRadio
+from netem.channel import PRESETS, Channel, EndedTransmission, WifiRadio
 
 pytestmark = pytest.mark.any_user
 
@@ -58,7 +58,7 @@ def saturated(radio: WifiRadio, n: int) -> list[tuple[float, int]]:
     for station in range(n):
         channel.send(station, 0.0, DATA_BYTES)
         channel.send(station, 0.0, DATA_BYTES)
-    sent: list[Transmission] = []
+    sent: list[EndedTransmission] = []
     while len(sent) < FRAMES:
         now = channel.next_event()
         assert now is not None

@@ -15,7 +15,7 @@ from ucp.secure.bundle import KeySet, bundle_name
 from ucp.secure.envelope import CHALLENGE, CONTROL_NAMES, REQUEST_OF, read_clear_header
 from ucp.secure.opening import DatagramOpener
 from ucp.secure.revocation import Revocation
-from ucp.secure.sealed_datagrams import Request
+from ucp.secure.sealed_datagrams import AnsweredRequest
 from ucp.secure.secured_agent import make_boot
 from ucp.secure.session import Session
 from ucp.trace import in_base64
@@ -35,7 +35,7 @@ class SecuredStory(RecordedMission):
         self._peers = {peer: Session(KEYS.bundle(peer), make_boot(peer, b"a chance")) for peer in ROSTER}
         for session in self._peers.values():
             session.set_clock(0.0)
-        self._requests: dict[int, Request] = {}
+        self._requests: dict[int, AnsweredRequest] = {}
         """Type of a request -> the agent's last request of this type."""
         super().__init__(max_block_bytes=MAX_BLOCK_BYTES)
 
@@ -97,5 +97,5 @@ class SecuredStory(RecordedMission):
         if datagram[3] in CONTROL_NAMES:
             return None
         opened = self._opener.open(datagram)
-        self._requests[opened.clear.type] = Request(AGENT_ID, opened.clear.boot, opened.clear.sequence)
+        self._requests[opened.clear.type] = AnsweredRequest(AGENT_ID, opened.clear.boot, opened.clear.sequence)
         return opened.datagram.message

@@ -14,7 +14,7 @@ from ucp.secure.bundle import KeySet
 from ucp.secure.crypto_suite import expand
 from ucp.secure.envelope import CLEAR, REQUEST_OF
 from ucp.secure.revocation import Revocation, revocations_digest
-from ucp.secure.sealed_datagrams import Request
+from ucp.secure.sealed_datagrams import AnsweredRequest
 from ucp.secure.secured_agent import SecuredAgent, make_boot
 from ucp.secure.session import Session
 
@@ -63,7 +63,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
     yield "a good one", good
     yield "the same again", good
     yield "of an earlier life", good[: CLEAR.size - 18] + bytes(16) + good[CLEAR.size - 2 :]
-    stale = Request(AGENT_ID, BOOT, 99)
+    stale = AnsweredRequest(AGENT_ID, BOOT, 99)
     yield "an answer to what was not asked", other.seal(2, BlockAddResponse(BLOCK_HASH, True), stale, None, 0)
     forged = CommitBlock(Block(1, 5, b"never made"), BLOCK_HASH)
     yield "a block that its maker did not sign", other.seal(3, forged, None, bytes(64), 0)
@@ -104,7 +104,7 @@ def _secret(epoch: int) -> bytes:
 
 
 def _sealed(sender: int, sequence: int, message: Message) -> dict[str, Any]:
-    request = Request(AGENT_ID, BOOT, 4) if TYPE_CODES[type(message)] in REQUEST_OF else None
+    request = AnsweredRequest(AGENT_ID, BOOT, 4) if TYPE_CODES[type(message)] in REQUEST_OF else None
     signature = signature_of(message.block) if type(message) in CARRY_A_BLOCK else None  # type: ignore[union-attr]
     sealed = session(sender).seal(sequence, message, request, signature, 0)
     named = None if request is None else {**request._asdict(), "boot": BOOT.hex()}

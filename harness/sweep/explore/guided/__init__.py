@@ -5,7 +5,7 @@ or livelock. `_corpus` stores scenarios and findings in a directory. `_finding_i
 the same finding. `_night` plays known findings first, then hunts until its time is over, and writes a page.
 """
 
-from harness.sweep.explore.guided._night import Night, spend
+from harness.sweep.explore.guided._night import NightResult, spend
 from harness.sweep.explore.guided._night_text import in_words, watching
 
-__all__ = ["Night", "in_words", "spend", "watching"]
+__all__ = ["NightResult", "in_words", "spend", "watching"]

@@ -94,7 +94,7 @@ class Finding(BaseModel):
         return f"{slug}_{digest}.yaml"
 
 
-class _Findings(BaseModel):
+class _FindingsFile(BaseModel):
     model_config = ConfigDict(populate_by_name=True)
 
     schema_: Literal["ucp-findings/2"] = Field(default="ucp-findings/2", alias="schema")
@@ -153,7 +153,7 @@ class Corpus:
         if not path.exists():
             return []
         try:
-            return _Findings.model_validate_json(self._read(path)).findings
+            return _FindingsFile.model_validate_json(self._read(path)).findings
         except (ValidationError, ValueError, RecursionError, ScenarioError):
             self.left_out.append(f"{path} is no list of findings: what was found before is not known")
             return []
@@ -164,7 +164,7 @@ class Corpus:
         return self._document(path) if path.exists() else None
 
     def write_findings(self, findings: list[Finding]) -> None:
-        document = _Findings(findings=findings[-MOST_FINDINGS:]).model_dump(mode="json", by_alias=True)
+        document = _FindingsFile(findings=findings[-MOST_FINDINGS:]).model_dump(mode="json", by_alias=True)
         self._checked_write(lambda path: write_json_atomically(path, document), self.directory / "findings.json")
 
     def write_scenario(self, finding: Finding, text: str) -> Path:

@@ -85,7 +85,7 @@ class NightFinding:
 
 
 @dataclass
-class Night:
+class NightResult:
     """The results of a night. `growth` contains pairs of a number of runs and the number of agent states known after
     them.
     """
@@ -148,7 +148,7 @@ def spend(
     most_runs: float = float("inf"),
     jobs: int = 1,
     watcher: NightProgress = NightProgress(),
-) -> Night:
+) -> NightResult:
     """Search for `for_s` seconds or `most_runs` runs, and store the results in `directory`. Ctrl-C ends the night
     early.
 
@@ -185,12 +185,12 @@ class _NightRun:
         self._start_s, self._start_processor_s = time.monotonic(), _processor_s()
         self._ends_s = self._start_s + for_s
         started_at = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-        self._night = Night(scenario, corpus.directory, Hunt(limits, Random(f"{first_seed}")), started_at)
+        self._night = NightResult(scenario, corpus.directory, Hunt(limits, Random(f"{first_seed}")), started_at)
         self._known = {finding.identity: finding for finding in corpus.findings()}
         self._new: dict[FindingIdentity, Finding] = {}
         self._shown: dict[FindingIdentity, tuple[int, int]] = {}
 
-    def spend(self, initial: list[CandidateRun]) -> Night:
+    def spend(self, initial: list[CandidateRun]) -> NightResult:
         night = self._night
         try:
             self._replay()

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from rich.console import Console
 
 from harness.proof.coverage import in_words as coverage_in_words
-from harness.sweep.explore.guided._night import Night, NightProgress
+from harness.sweep.explore.guided._night import NightProgress, NightResult
 from harness.sweep.explore.guided._night_page import unfinished_in_words
 
 REDRAW_EVERY_S = 0.1
@@ -50,7 +50,7 @@ def watching(console: Console) -> Iterator[NightProgress]:
             console.file.write(CLEAR_LINE)
 
 
-def in_words(night: Night) -> Iterator[str]:
+def in_words(night: NightResult) -> Iterator[str]:
     """Yield the lines that the command prints at the end of a night."""
     for finding in night.findings:
         of = f", appears with {finding.shown} of {finding.of} seeds" if finding.of else ""

@@ -27,7 +27,7 @@ from harness.sweep.matrix.matrix_table import (
     troubles,
     unjudged,
 )
-from harness.sweep.matrix.nights import Nights
+from harness.sweep.matrix.nights import StoredNights
 from harness.sweep.matrix.report import _heatmap, _night_table, _trend
 from harness.sweep.matrix.report._drilldown import drilldown
 
@@ -35,7 +35,7 @@ _TEMPLATE = Path(__file__).with_name("page.html.j2")
 _STYLE, _GROWTH_STYLE = (_TEMPLATE.with_name(f"{name}.css").read_text(encoding="utf-8") for name in ("page", "growth"))
 
 
-def to_html(finished: Finished, directory: Path, nights: Nights | None = None) -> str:
+def to_html(finished: Finished, directory: Path, nights: StoredNights | None = None) -> str:
     """Return the page as HTML.
 
     `directory` will contain the page and the kept runs. `nights` includes this one, if it is finished.

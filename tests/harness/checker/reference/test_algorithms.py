@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
-from harness.checker.reference.state import Chain, Settings, State, Timer
+from harness.checker.reference.state import Chain, ReferenceState, Settings, Timer
 from tests.harness.checker.reference.driver import Agent, Step
 from ucp.block import LATEST_US, Block, InceptionBlock, next_chain_hash
 from ucp.events import LoggableEvent
@@ -204,7 +204,7 @@ def test_chain_never_pops_the_inception_block() -> None:
 
 
 def test_new_state_is_idle_and_holds_nothing() -> None:
-    state = State(1, b"mission", Settings())
+    state = ReferenceState(1, b"mission", Settings())
     assert state.idle
     assert not state.holds(OTHER_HASH)
     assert [timer.name for timer in state.timers] == ["voting", "phase one", "phase two", "phase three", "finalize gap"]
@@ -212,7 +212,7 @@ def test_new_state_is_idle_and_holds_nothing() -> None:
 
 
 def test_state_holds_a_block_until_the_block_leaves() -> None:
-    state = State(1, b"mission", Settings())
+    state = ReferenceState(1, b"mission", Settings())
     first, second, third = (block_of(2, timestamp_us) for timestamp_us in (1, 2, 3))
     state.push_deque(first)
     state.push_stack(second)
@@ -1090,7 +1090,7 @@ def test_boot_restores_the_blocks_and_finalizes_a_reconcile() -> None:
 
 
 def test_restored_agent_is_in_a_reconcile() -> None:
-    state = State(1, b"mission", Settings())
+    state = ReferenceState(1, b"mission", Settings())
     state.restore([], [], [], [])
     assert state.reconcile_in_progress
     assert state.newest_block_timestamp_us == -1

@@ -23,7 +23,7 @@ from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import find_file
 from harness.sweep.explore._scenario_document import document_of, script
-from harness.sweep.explore.guided import Night, spend
+from harness.sweep.explore.guided import NightResult, spend
 from harness.sweep.explore.guided._corpus import MOST_BYTES, opened
 from harness.sweep.explore.guided._finding_identity import identities
 from harness.sweep.explore.guided._hunt import CandidateRun, Hunt, KeptRun
@@ -53,7 +53,7 @@ def ordinary(**keys: Any) -> Scenario:
     return Scenario.model_validate({**ORDINARY, **keys})
 
 
-def night(directory: Path, scenario: Scenario | None = None, *, runs: int = 70, jobs: int = 1) -> Night:
+def night(directory: Path, scenario: Scenario | None = None, *, runs: int = 70, jobs: int = 1) -> NightResult:
     return spend(scenario or ordinary(), directory, most_runs=runs, jobs=jobs)
 
 

@@ -14,7 +14,7 @@ from harness.sweep.matrix._culprits import find_culprits
 from harness.sweep.matrix._run_steps import fingerprint, first_changed, name_change
 from harness.sweep.matrix.matrix_run import compare_with, name_changes, on_cores
 from harness.sweep.matrix.matrix_table import changed_runs, troubles
-from harness.sweep.matrix.nights import BaselineNight, Nights
+from harness.sweep.matrix.nights import BaselineNight, StoredNights
 from harness.sweep.matrix.report import to_html
 from tests.harness.command import harness
 from tests.harness.sweep.matrix.stub import judge, matrix, played
@@ -150,7 +150,7 @@ def test_page_has_each_cell_and_night_with_its_commit(tmp_path: Path) -> None:
     tonight, _ = regression("0123456789ab", "ba9876543210")
     first = night(played(matrix(seeds=[1, 2, 4]), 1, judge), "0123456789ab")
     first = first.model_copy(update={"started_at": "2026-01-01T02:00:00Z"})
-    page = to_html(Finished(tonight, []), tmp_path, Nights(tmp_path, [first, tonight], []))
+    page = to_html(Finished(tonight, []), tmp_path, StoredNights(tmp_path, [first, tonight], []))
     assert "<small>0123456789ab</small>" in page
     assert ', commit ba9876543210">' in page
     assert '<td class="violated" title="3 runs: 1 with a violation or failure">✗1</td>' in page

@@ -15,7 +15,7 @@ from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._cell_play import directory_name
 from harness.sweep.matrix._cell_scenarios import scenario_file, write_scenarios
 from harness.sweep.matrix.matrix_run import compare_with
-from harness.sweep.matrix.nights import BaselineNight, Nights
+from harness.sweep.matrix.nights import BaselineNight, StoredNights
 from harness.sweep.matrix.report import _drilldown, _heatmap, _trend, to_html
 from harness.sweep.matrix.report._heatmap import known_figures
 from tests.harness.command import harness
@@ -37,10 +37,10 @@ def tiles(finished: Finished, name: str) -> dict[str, _heatmap.HeatmapTile]:
     return {str(tile.href): tile for grid in grids for _, row in grid.rows for tile in row}
 
 
-def over(finished: Finished, nights: int) -> Nights:
+def over(finished: Finished, nights: int) -> StoredNights:
     record = finished.record
     days = [record.model_copy(update={"started_at": f"2026-01-{day:02}T02:17:00Z"}) for day in range(1, nights + 1)]
-    return Nights(Path("nights"), days, [])
+    return StoredNights(Path("nights"), days, [])
 
 
 def test_each_cell_has_its_number_and_the_shade_grows_with_it() -> None:
@@ -172,7 +172,7 @@ def test_oldest_nights_are_left_out_if_there_are_too_many(monkeypatch: pytest.Mo
 
 def test_hostile_texts_stay_text_and_nothing_is_loaded() -> None:
     finished = played(matrix(name=HOSTILE, about=HOSTILE), 1, breaks)
-    page = to_html(finished, Path(), Nights(Path(HOSTILE), [], [HOSTILE]))
+    page = to_html(finished, Path(), StoredNights(Path(HOSTILE), [], [HOSTILE]))
     assert "<script" not in page
     assert "<img" not in page
     assert html.escape(HOSTILE).replace("&#x27;", "&#39;").replace("&quot;", "&#34;") in page

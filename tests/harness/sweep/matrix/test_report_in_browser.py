@@ -6,7 +6,7 @@ from typing import Literal
 import pytest
 
 from harness.sweep.matrix import matrix_outputs
-from harness.sweep.matrix.nights import Nights
+from harness.sweep.matrix.nights import StoredNights
 from tests.harness.report.browser import Browser
 from tests.harness.sweep.matrix.stub import matrix, played
 from tests.harness.sweep.matrix.test_report import breaks, over
@@ -22,7 +22,7 @@ FIGURES = SHOWN.format(".figure h3", "textContent")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("matrix")
     finished = played(matrix(agents=[5, 10], loss=(0.0, 0.15, 0.3, 0.5)), 1, breaks)
-    matrix_outputs.write(finished, directory, Nights(directory, over(finished, 9).records, ["one is left out"]))
+    matrix_outputs.write(finished, directory, StoredNights(directory, over(finished, 9).records, ["one is left out"]))
     return directory / "report.html"
 
 

@@ -27,7 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String, UInt8MultiArray
 
 from ucp.export import export_chain
-from ucp.loop import Callback, Loop, Timer
+from ucp.loop import Callback, Loop, ScheduledCall
 from ucp.mission import Mission
 from ucp.node import Node, main
 
@@ -66,7 +66,7 @@ class RosLoop(Loop):
         self._called_back = Semaphore(0)
         Thread(target=self._wait_for_sockets, daemon=True).start()
 
-    def call_later(self, delay_s: float, callback: Callback) -> Timer:
+    def call_later(self, delay_s: float, callback: Callback) -> ScheduledCall:
         timer = super().call_later(delay_s, callback)
         self._set_timer()
         return timer

@@ -7,7 +7,7 @@ stack, hold ties in phase 2, and give an agent answers that no correct agent sen
 from collections.abc import Callable
 from typing import Any
 
-from harness.archive.traces import Header, Trace
+from harness.archive.traces import Trace, TraceHeader
 from tests.harness.checker.reference.random_inputs import ROSTER
 from ucp.agent import Agent
 from ucp.block import Block, next_chain_hash
@@ -33,7 +33,9 @@ def new_trace(settings: Settings) -> Trace:
     """Return the empty trace of agent 1."""
     used, clock = settings.to_json(), {"epoch_us": 0}
     return Trace(
-        Header(schema=SCHEMA, agent_id=1, roster=[*ROSTER], settings=used, clock=clock, initial_data=in_base64(DATA))
+        TraceHeader(
+            schema=SCHEMA, agent_id=1, roster=[*ROSTER], settings=used, clock=clock, initial_data=in_base64(DATA)
+        )
     )
 
 
