@@ -42,7 +42,7 @@ class Run(CellRecord):
     failed: str | None = None
     unsupported: str | None = None
     reached: Annotated[Any, Field(exclude=True)] = None
-    """A `harness.proof.coverage.Reached` if coverage of this run was measured. It is not written to files."""
+    """A `harness.proof.coverage.ReachedStates` if coverage of this run was measured. It is not written to files."""
 
     @property
     def judged(self) -> bool:
