@@ -28,6 +28,7 @@ FILES = (
     "handler",
     "interest",
     "messages",
+    "plain_file",
     "reconcile",
     "sealed",
     "settings",

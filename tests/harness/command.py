@@ -19,11 +19,16 @@ COMMAND = [sys.executable, "-m", "harness.cli"]
 def harness(
     *arguments: object,
     deadline_s: float = DEADLINE_S,
-    env: Mapping[str, str] = os.environ,
+    env: Mapping[str, str] | None = None,
     cwd: Path | None = None,
     input: str = "",
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command to its end, and return its output."""
+    """Run the command to its end, and return its output.
+
+    By default, COLUMNS is not set: a worker of pytest-xdist has it, and output in a pipe has no width.
+    """
+    if env is None:
+        env = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
     words = [str(argument) for argument in arguments]
     if forks.same_interpreter(env):
         return forks.call(words, env, cwd or Path.cwd(), input, deadline_s)

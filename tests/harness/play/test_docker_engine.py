@@ -67,9 +67,9 @@ def test_inaccessible_engine_is_one_sentence(tmp_path: Path) -> None:
     server = listening(path)
     path.chmod(0o600)
     code = f"""
-import os; from harness.play.keyring.key_directory import Home
-from harness.play.containers import docker_engine; os.environ["DOCKER_HOST"] = "unix://{path}"; os.setuid(65534)
-try: docker_engine.Engine.connect()
+import os; from harness.play.containers import docker_engine
+os.environ["DOCKER_HOST"] = "unix://{path}"; os.setuid(65534)
+try: docker_engine.DockerEngine.connect()
 except docker_engine.DockerError as error: print(error)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

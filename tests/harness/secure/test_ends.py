@@ -21,6 +21,12 @@ def key_directories() -> set[Path]:
     return {path for place in (MEMORY, Path(tempfile.gettempdir())) for path in place.glob("ucp-keys-*")}
 
 
+def _allow_hang_up_and_core_files() -> None:
+    """Undo an ignored SIGHUP, which a program inherits under nohup, and a limit for core files."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    resource.setrlimit(resource.RLIMIT_CORE, (resource.getrlimit(resource.RLIMIT_CORE)[1],) * 2)
+
+
 @pytest.fixture
 def run(tmp_path: Path) -> Iterator[Running]:
     scenario = write_scenario(tmp_path, security={}, speedup=20, duration_s=2000)
@@ -28,7 +34,7 @@ def run(tmp_path: Path) -> Iterator[Running]:
         scenario,
         tmp_path / "run",
         *("--backend", "process"),
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CORE, (resource.getrlimit(resource.RLIMIT_CORE)[1],) * 2),
+        preexec_fn=_allow_hang_up_and_core_files,
     )
     yield asked
     asked.process.kill()

@@ -38,12 +38,10 @@ def test_growth_matrix_grows_with_agents_and_lengths_and_leaves_no_traces() -> N
     assert (len(matrix.tasks), matrix.traces) == (7 * 3 * 2 * 3, False)
 
 
-def test_the_page_on_nights_has_a_matrix_and_a_workflow() -> None:
-    blocks = re.findall(r"```yaml\n(.*?)```", NIGHTLY.read_text(), re.DOTALL)
-    asked, workflow = (yaml.safe_load(block) for block in blocks)
-    assert len(Matrix.model_validate(asked).points) == 6
-    said = [step["run"] for step in workflow["jobs"]["matrix"]["steps"] if "run" in step]
-    assert any("ucp-harness matrix nightly.yaml --out out" in command for command in said)
+def test_page_on_nights_begins_with_a_matrix_of_six_cells() -> None:
+    block = re.search(r" *```yaml\n(.*?)```", NIGHTLY.read_text(), re.DOTALL)
+    assert block is not None
+    assert len(Matrix.model_validate(yaml.safe_load(block[1])).points) == 6
 
 
 def test_each_cell_has_the_scenario_with_its_loss(tmp_path: Path) -> None:
