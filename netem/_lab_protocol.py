@@ -22,7 +22,7 @@ _MAX_DESCRIPTORS = 64
 
 
 class WireError(Exception):
-    """An error: the stream contains invalid data. Everything after them is unusable."""
+    """An error: the stream contains invalid data, so the rest of the stream cannot be used."""
 
 
 def encode(message: dict[str, Any]) -> bytes:

@@ -262,7 +262,7 @@ class _RunningKernel:
         return UmlError(f"User Mode Linux failed: {problem}; it last said: {last}")
 
     def end(self) -> None:
-        """Kill the virtual machine, if it still runs."""
+        """Kill the virtual machine of User Mode Linux, if it still runs."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()

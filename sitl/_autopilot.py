@@ -411,7 +411,7 @@ class Autopilot:
             self._stay()
 
     def place(self, frame: int, lat_e7: int, lon_e7: int, alt_m: float) -> LocalPlace:
-        """Return a place that is given in one of `FRAMES`, in metres from home.
+        """Return the position in metres from home of a place that is given in one of the coordinate frames `FRAMES`.
 
         Latitude and longitude 0 mean the current position.
         """

@@ -72,7 +72,7 @@ class ArduPilot:
 
     @property
     def sha256(self) -> str | None:
-        """The SHA-256 hash of the binary in hexadecimal, or None if it cannot be read."""
+        """The SHA-256 hash of the binary in hexadecimal, or None if the binary cannot be read."""
         with contextlib.suppress(OSError):
             return sha256(self.binary)
         return None

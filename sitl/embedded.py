@@ -86,7 +86,7 @@ class Embedded:
 
 class _OptionParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """Print one sentence instead of the usage text."""
+        """Print an error as one sentence, without the usage text of the program."""
         self.exit(2, f"{self.prog}: {message}\n")
 
 

@@ -95,7 +95,7 @@ class InstalledVersion:
 
     @cached_property
     def damage(self) -> str | None:
-        """A description of the first file that was changed after its download, or None. This reads all files."""
+        """A description of the first file that was changed after its download, or None. All files are read for this."""
         if self.manifest is None:
             return f"{MANIFEST} is missing or cannot be read"
         for name in dict.fromkeys((self.binary.name, DEFAULTS[self.vehicle], *self.manifest.files)):

@@ -158,7 +158,7 @@ class JsonLines(Generic[Record]):
             self._problem = f"cannot be read: {error.strerror}"
 
     def leave_out(self) -> None:
-        """Count the last line as unusable, because the caller rejected it."""
+        """Count the last line of the file as unusable, because the caller rejected it."""
         self._left_out += 1
 
     def problems(self) -> list[str]:

@@ -309,5 +309,5 @@ def _toggle(times: dict[Key, list[float]], keys: Iterable[Key], at_s: float) -> 
 
 
 def _is_on(times: Sequence[float], at_s: float) -> bool:
-    """Return true if something is on at `at_s` that is off at first and changes at each of these times."""
+    """Return true if a condition is on at `at_s`. The condition is off at first and changes at each of these times."""
     return bisect_right(times, at_s) % 2 == 1

@@ -65,7 +65,9 @@ class RunDirectory:
         claim(path, self.agents, self.vehicles)
 
     def vehicle(self, vehicle_id: int, incarnation: int = 1) -> Path:
-        """Create the directory of a vehicle and return it. A replacement of a lost vehicle has its own directory."""
+        """Create the directory of a vehicle and return its path. A vehicle that replaces a lost vehicle has its own
+        directory.
+        """
         path = self.vehicles / (str(vehicle_id) if incarnation == 1 else f"{vehicle_id}-{incarnation}")
         path.mkdir(exist_ok=True)
         return path

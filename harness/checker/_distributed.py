@@ -114,8 +114,8 @@ def _has_known_names(run: HandlerRun) -> bool:
 
 
 def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:
-    """Return the error in the trigger of a handler run, or None if it is valid. The text completes "the handler
-    ...".
+    """Return the error in the trigger of a handler run, or None if the trigger is valid. The text completes "the
+    handler ...".
     """
     match run.trigger:
         case MessageTrigger(name, sender, sequence):

@@ -84,7 +84,7 @@ def was_running(trace: Trace, timestamp_us: int) -> bool:
 
 
 def may_be_of_missing_incarnation(evidence: Evidence, block: ExportedBlock) -> bool:
-    """Return whether the agent of a block may have completed it in an incarnation that is not on record.
+    """Return whether the author of a block may have completed the block in an incarnation that is not on record.
 
     Only the record of a run lists all incarnations. Without it, the trace of an agent shows the times of its
     incarnations, and an export lists the blocks of the last incarnation only.

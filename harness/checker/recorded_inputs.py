@@ -39,7 +39,7 @@ def _decoded(text: str) -> Datagram:
 
 
 def event_of(record: RecordedBytes | None) -> LoggableEvent:
-    """Return the decoded event. Raises MalformedEventsError if the bytes are invalid."""
+    """Return the event in this record. Raises MalformedEventsError if the bytes are invalid."""
     if record is not None and isinstance(record.content, LoggableEvent):
         return record.content
     try:

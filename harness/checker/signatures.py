@@ -65,7 +65,7 @@ def are_signed(exports: Iterable[Export]) -> bool:
 
 
 def vouch(exports: Iterable[Export], keys: TrustedKeys | None) -> tuple[list[str], str | None]:
-    """Return a sentence on each wrong signature in some exports, and the reason why the others prove nothing.
+    """Return a sentence on each wrong signature in some exports, and the reason why the other signatures prove nothing.
 
     The exports may be unsigned if no keys are given. They then count as exports of a mission without keys.
     """

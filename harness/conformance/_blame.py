@@ -171,7 +171,9 @@ class BlameEvidence:
 
 
 def _took_another_decision(observation: TestedStep) -> ExpectedRun | None:
-    """Return the handler run of the expired timer, if a different decision in it explains all unexpected messages."""
+    """Return the handler run of the expired timer, if another decision in this handler run explains all unexpected
+    messages.
+    """
     first, *then = observation.outcome.runs
     if first.handler not in BEGINNING_OF_COUNT or not observation.unexpected:
         return None

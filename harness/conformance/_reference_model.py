@@ -180,7 +180,7 @@ class ModelSnapshot:
         self._deadlines = [(timer, timer.deadline) for timer in model.state.timers]
 
     def restore(self) -> ReferenceModel:
-        """Set the reference back to the saved state, and return it."""
+        """Set the reference agent back to the saved state, and return this agent."""
         for part, plain, containers in self._parts:
             part.update(plain)
             for name, value in containers:

@@ -214,7 +214,7 @@ def explore(variant: SettingsVariant) -> Iterator[AgentTransition]:
 
 
 def walk(variant: SettingsVariant, path: tuple[str, ...]) -> tuple[ReferenceModel, float]:
-    """Return the reference after these inputs, and the time of the last input."""
+    """Return the reference agent after these inputs, and the time of the last input."""
     model, now = ReferenceModel(variant.settings), 0.0
     for name in path:
         advanced = advance(model, INPUTS[name], now)
@@ -259,7 +259,7 @@ one agent can reach them again and again."""
 
 
 def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, given: AgentInput) -> bool:
-    """Return true if the later expiry of the timer would show that an agent wrongly counted the input."""
+    """Return true if the later expiry of the timer would show that an agent wrongly counted this input."""
     if (
         (before.activity, before.holdings) not in COUNTING_STATES
         or given.preceding is None

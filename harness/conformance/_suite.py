@@ -352,7 +352,7 @@ class VectorSuite:
         return TOO_LATE
 
     async def play(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Give a new agent these inputs. Return the first failure, or RIGHT, or TOO_LATE if the machine was too
+        """Play these inputs to a new agent. Return the first failure, or RIGHT, or TOO_LATE if the machine was too
         late.
         """
         try:

@@ -34,7 +34,7 @@ class MissionKeys:
 
     @property
     def public(self) -> "PublicKeys":
-        """The public keys of the mission."""
+        """The public keys of the secured mission."""
         return next(iter(self.bundles.values())).public
 
     def add_depot_key(self, initial_data: bytes) -> bytes:
@@ -117,8 +117,8 @@ def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
 
 
 def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Scenario) -> "RevocationAuthority":
-    """Return the authority whose key signs the exclusion of vehicles. Raises ScenarioError if the directory lacks
-    it.
+    """Return the authority that excludes vehicles, from its key in the directory. Raises ScenarioError if the key is
+    missing.
     """
     from harness.play.keyring.key_directory import REVOCATION_NAME, KeyDirectory, KeysError, RevocationAuthority, listed
 

@@ -24,7 +24,7 @@ Outcome = Literal["completed", "interrupted", "failed", "not supported"]
 
 @dataclass
 class RunOutcome:
-    """The result of playing a scenario, before the checker judges it."""
+    """The result of a played scenario, before the checker judges it."""
 
     outcome: Outcome = "completed"
     outcome_detail: str | None = None

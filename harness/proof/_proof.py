@@ -259,8 +259,8 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Ex
 
 
 def _with_instants(bounds: Bounds) -> Bounds:
-    """Return the same bounds, with up to one lost and one duplicated message per step. Each path within them is a
-    possible run.
+    """Return the same bounds, with up to one lost and one duplicated message per step. Each path within the new bounds
+    is a possible run.
     """
     return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
 

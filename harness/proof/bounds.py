@@ -134,7 +134,7 @@ class Bounds:
             raise BoundsError("--clocks any excludes --quirk and --captured: leave them out")
 
     def why_not_reduced(self) -> str | None:
-        """Return the reason why no two states may count as one. None for the released core, as reductions assume."""
+        """Return the reason why the prover must not treat two states as one, or None for the released core."""
         if edited := edited_files():
             return f"it assumes the released core, and {', '.join(edited)} was edited"
         if (variant := variant_in_use()) is not None:

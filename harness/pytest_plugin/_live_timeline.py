@@ -215,7 +215,7 @@ class LiveTimeline(GrowingTimeline):
         return silent
 
     async def end(self, swarm: mission.Swarm, *, reconcile_finally: bool) -> None:
-        """End the mission if it has not ended. Raises ScenarioError if a second final reconcile is requested."""
+        """End the mission if it still runs. Raises ScenarioError if a second final reconcile is requested."""
         if swarm.played.final_reconcile is not None:
             if reconcile_finally:
                 raise ScenarioError("the final reconcile is over: a mission has one, at its end")

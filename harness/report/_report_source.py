@@ -50,7 +50,7 @@ class ReportSource:
 
     @property
     def unmet_expectations(self) -> list[str]:
-        """Sentences about results besides verdicts that the scenario does not expect."""
+        """Sentences about expected results of the scenario, other than verdicts, that the run did not show."""
         if not self.record.characteristics:
             return []
         return [sentence for _, unmet in self.record.unmet_expectations(self.chains) for sentence in unmet]

@@ -120,7 +120,7 @@ def draw(
 def _legend(
     history: MissionHistory, faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], *, by_phase: bool
 ) -> list[tuple[Markup, str]]:
-    """Return a legend of all marks that the picture contains."""
+    """Return a legend of all marks in the timeline picture."""
     outcomes = {vote.outcome for vote in history.votes}
     phases = {phase.name for reconcile in history.reconciles for phase in reconcile.phases}
     entries = [

@@ -41,7 +41,7 @@ class NetworkDivision:
         return self.together | self.alone | frozenset().union(*self.parts.values())
 
     def place_of(self, vehicle: int) -> tuple[int | None, frozenset[int]]:
-        """Return the number of the vehicle's group, and the vehicles that it reaches."""
+        """Return the number of a vehicle's group, and the vehicles that this vehicle reaches."""
         return self.part_of(vehicle), self.reachable_from(vehicle)
 
     def part_of(self, vehicle: int) -> int | None:

@@ -197,7 +197,7 @@ class GitBisection:
         return int(self._git(self.tree, "rev-list", "--count", f"{good}..{bad}"))
 
     def begin(self, good: str, bad: str) -> "str | SuspectCommits":
-        """Start the search. Check out the first commit to test, and return its hash."""
+        """Start the search for a commit. Check out the first commit to test, and return its hash."""
         return self._next(self._git(self.tree, "bisect", "start", bad, good, accept=(0, 2)))
 
     def mark(self, mark: Mark) -> "str | SuspectCommits":

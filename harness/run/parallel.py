@@ -91,7 +91,7 @@ def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError
 
 
 def raise_error(outcome: R | HarnessError) -> R:
-    """Raise the result of a task if it is an error. Otherwise return it."""
+    """Raise the result of a task if the result is an error. Otherwise return the result."""
     if isinstance(outcome, HarnessError):
         raise outcome
     return outcome

@@ -241,7 +241,7 @@ class NetworkDisturbance(StrictModel):
         return self
 
     def changes(self) -> NetworkValues:
-        """Return the changed conditions, without the partition."""
+        """Return the changed network conditions, without the partition."""
         values: NetworkValues = self.network.by_scope() if self.network else {}
         return values if self.loss is None else overlay(values, {None: {"loss": self.loss}})
 

@@ -84,7 +84,7 @@ class WifiRadio(Radio):
 
 @dataclass(frozen=True, kw_only=True)
 class TimeSlotRadio(Radio):
-    """A telemetry radio with time slots. The vehicles send one after another, each in its own slot."""
+    """A telemetry radio with time slots. The vehicles send one after another, each vehicle in its own time slot."""
 
     rate_bps: float
     preamble_s: float

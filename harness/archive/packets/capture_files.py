@@ -65,7 +65,7 @@ def capture_files(paths: Iterable[Path]) -> list[Path]:
 
 
 def read_captures(paths: Iterable[Path], opener: "DatagramOpener | None" = None) -> Captures:
-    """Read all captures of one mission. The first capture with a comment determines which mission that is.
+    """Read all captures of one mission, which is the mission of the first capture with a comment.
 
     Captures from the field have no comment and are always used. `opener` decrypts the sealed datagrams of a secured
     mission.

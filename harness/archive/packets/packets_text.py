@@ -153,7 +153,7 @@ def exchange_lines(
 
 
 def totals(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[str]:
-    """Yield lines with totals, and with the other contents of the captures."""
+    """Yield lines with the totals of the captures, and with contents that are not UCP messages."""
     lost = sum(len(transmission.lost_by) for transmission in transmissions)
     received = sum(len(transmission.received) for transmission in transmissions)
     counted = [

@@ -53,7 +53,7 @@ class Transmission(NamedTuple):
         return [reception.by for reception in self.received]
 
     def for_receiver(self, receiver: ListenerName) -> "Transmission":
-        """Return a copy that has only this receiver."""
+        """Return a copy of the transmission that has only this receiver."""
         return self._replace(
             received=tuple(reception for reception in self.received if reception.by == receiver),
             lost_by=tuple(name for name in self.lost_by if name == receiver),

@@ -50,7 +50,7 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams]]:
-    """Return two tables by vehicle: the datagrams that left it, and the datagrams that reached it."""
+    """Return two tables by vehicle: the datagrams that left the vehicle, and the datagrams that reached it."""
     left: dict[int, Datagrams] = defaultdict(Counter)
     reached: dict[int, Datagrams] = defaultdict(Counter)
     by_number = {capture.number: capture for capture in captures.used}

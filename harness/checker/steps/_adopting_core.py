@@ -83,7 +83,9 @@ class AdoptingCore(_Core):
         self.step_is_over()
 
     def before(self, run: HandlerRun) -> StateBeforeStep | None:
-        """Return the data that `undo` needs in addition to the step's recorded changes, or None if it needs none."""
+        """Return the data that `undo` needs in addition to the step's recorded changes, or None if `undo` needs no
+        further data.
+        """
         logs, phase_three_ends = run.handler == "build_data_block", self.phase_three_timer.deadline
         if not (logs or self.reconcile_stack or phase_three_ends is not None):
             return None

@@ -35,9 +35,7 @@ class JudgedTimers:
 
     @property
     def remark(self) -> str:
-        """A remark about timers that could not be judged. It is empty if all were compared with the machine's measured
-        delays.
-        """
+        """A remark about timers that could not be judged, or an empty text if all timers were judged."""
         if not self.unmeasured:
             return ""
         which = "timers" if self.unmeasured == self.expiries else f"{self.unmeasured} of {self.expiries} timers"

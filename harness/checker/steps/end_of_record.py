@@ -37,7 +37,7 @@ class MessageArrival(NamedTuple):
 
 
 def crash(trace: Trace, recorded: AgentRecord | None) -> StepDeviation | None:
-    """Return a deviation if the record of the run says that the agent crashed in a handler. None otherwise."""
+    """Return a deviation if the record of the run states that the agent crashed in a handler, otherwise None."""
     if recorded is None or recorded.outcome != "crashed":
         return None
     named = _NAMED.search(recorded.detail or "")

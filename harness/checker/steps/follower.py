@@ -269,7 +269,7 @@ class StepComparer:
         return deepcopy(self, memo)
 
     def foresee(self, line: int, run: HandlerRun) -> list[StepDeviation]:
-        """Return the differences in triggered handlers that the next handler run shows. This runs no handler."""
+        """Return the differences in triggered handlers that the next handler run shows, without running a handler."""
         foreseeing = self.copy()
         if foreseeing.lost is None:
             foreseeing._triggered(line, run, _triggered_by(run))

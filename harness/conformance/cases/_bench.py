@@ -110,7 +110,9 @@ class BenchAgent:
         return received
 
     async def receive_one(self, kind: type[ReceivedMessage], after: str) -> ReceivedMessage:
-        """Return the next message. Raises WrongBehaviourError if there is none, or if it has a different type."""
+        """Return the next message. Raises WrongBehaviourError if no message arrives, or if the message has a different
+        type.
+        """
         what = f"a {kind.NAME} after {after}"
         (received,) = await self.receive(1, what)
         if not isinstance(received, kind):

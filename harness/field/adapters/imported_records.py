@@ -209,7 +209,7 @@ def _survived_trace(trace: Trace, export: Export | None) -> bool:
 
 
 def _trace_lines(trace: Trace, *, survived_trace: bool) -> Iterator[str]:
-    """Yield the lines of a trace. Each gap becomes a line that stands for the lost lines.
+    """Yield the lines of a trace. For each gap, yield a line that stands for the lost lines.
 
     A trace that ends within a line gets an incomplete last line, because the agent may have been killed there. If it
     survived, a gap is written instead.

@@ -200,7 +200,7 @@ def _starts_locally(run: HandlerRun) -> bool:
 
 
 def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:
-    """Yield each sent message with its datagram in base64."""
+    """Yield each message that the agent sent, with its datagram in base64."""
     for sent in run.sent:
         if sent.datagram is not None:
             with suppress(MalformedDatagramError):

@@ -65,7 +65,7 @@ class Outcome(_OutcomeModel):
 
     @property
     def sentence(self) -> str:
-        """Describe the result in one line."""
+        """Describe the result of one play in one line."""
         if self.crashed:
             return f"it crashes: {self.crashed}"
         bad = [key for key, verdict in self.verdicts.items() if kind_of(verdict) == "bad"]

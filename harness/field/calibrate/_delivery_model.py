@@ -120,7 +120,7 @@ class _TransmissionCluster(NamedTuple):
 
 
 def fit(attempts: Sequence[TransmissionAttempt], *, with_load: bool = True) -> FittedModel | None:
-    """Fit the model to transmissions. Return None if they do not determine a range and a spread.
+    """Fit the model to transmissions. Return None if the transmissions do not determine a range and a spread.
 
     That is the case if all or no messages arrived, or if the distances hardly differ.
     """

@@ -32,7 +32,9 @@ class SignalFit:
 
 
 def fit_signal(positions: Positions) -> SignalFit | None:
-    """Estimate the exponent from the signal strengths in all logs. Return None if they do not determine it."""
+    """Estimate the exponent from the signal strengths in all logs. Return None if the signal strengths do not determine
+    it.
+    """
     samples = [sample for number, log in enumerate(positions.logs) for sample in _samples(positions, number)]
     minutes = sorted({minute for _, _, minute in samples})
     if len(samples) < _MIN_SAMPLES or len(minutes) < _MIN_MINUTES:

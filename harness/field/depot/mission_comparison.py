@@ -77,7 +77,7 @@ class MissionDifference:
 
 @dataclass
 class MissionComparison:
-    """The compared files, and their differences."""
+    """The compared files of a mission, and the differences between these files."""
 
     files: list[ComparedFile]
     differences: list[MissionDifference]

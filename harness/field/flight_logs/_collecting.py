@@ -100,7 +100,7 @@ class RecordCollector:
         self._times.setdefault(time.at_us // _BIN_US, []).append((time.at_us, time.utc_us))
 
     def add_sample(self, record: FlightRecord, source: Hashable, state: Hashable = None) -> None:
-        """Store a record if the previous one from this source is a second old or has a different state."""
+        """Store a record if the previous record from the same source is a second old or has a different state."""
         if self._is_due((type(record), source), record.at_us, state):
             self.add(record)
 

@@ -247,7 +247,7 @@ def _frame_at(buffer: bytes, at: int) -> tuple[int, int, int, int, bytes] | None
 
 
 def _next_start(buffer: bytes, at: int) -> int:
-    """Return the next position at which a time and a frame may begin."""
+    """Return the next position in the log at which a time and a frame may begin."""
     first = at + 1 + _STAMP_BYTES
     found = [position for magic in (b"\xfd", b"\xfe") if (position := buffer.find(magic, first)) >= 0]
     return min(found) - _STAMP_BYTES if found else max(len(buffer) - _STAMP_BYTES, at + 1)

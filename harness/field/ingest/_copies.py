@@ -1,4 +1,4 @@
-"""Combine several copies of the same trace. One copy may contain the lines that another one has lost."""
+"""Combine several copies of the same trace, because one copy may contain the lines that another copy has lost."""
 
 from collections.abc import Iterator
 
@@ -65,7 +65,7 @@ def _key(run: HandlerRun) -> tuple[object, ...]:
 
 
 def _is_copy(incarnation: TraceIncarnation, other: TraceIncarnation) -> bool:
-    """Return true if most handler runs of one trace are also in the other."""
+    """Return true if most handler runs of one trace are also in the other trace."""
     if not incarnation.runs:
         return not other.runs and incarnation.path != other.path
     if incarnation.runs == other.runs[: len(incarnation.runs)]:

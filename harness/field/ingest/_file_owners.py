@@ -1,4 +1,6 @@
-"""Find the mission of a packet capture, and the flight of a file with public keys. Neither file names it."""
+"""Find the mission of a packet capture, and the flight of a file with public keys. These files do not name their
+mission or flight.
+"""
 
 import base64
 from collections.abc import Iterator, Sequence
@@ -57,7 +59,7 @@ PUBLIC_SCHEMA = '"ucp-keys/1"'
 
 
 def read_public_keys(path: Path, left_out: list[UnusedPart]) -> "PublicKeys | None":
-    """Return the public keys in a file, or None if they cannot be used. Then `left_out` has the reason. Raises
+    """Return the public keys in a file. If they cannot be used, return None and add the reason to `left_out`. Raises
     OSError.
     """
     try:

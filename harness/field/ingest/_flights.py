@@ -83,7 +83,7 @@ def group_by_flight(
     left_out: list[UnusedPart],
     remarks: list[FileRemark],
 ) -> list[Flight]:
-    """Return the flights. The one with the most records is first."""
+    """Return the flights, with the flight that has the most records first."""
     groups, without_header = _by_mission(incarnations, left_out)
     for path, export in exports:
         _add_export(groups, path, export, left_out)

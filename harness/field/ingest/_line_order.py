@@ -42,7 +42,7 @@ def in_order(runs: Sequence[HandlerRun]) -> tuple[list[int], list[ReorderedPart]
 
 
 def _repeated(runs: Sequence[HandlerRun]) -> Iterator[ReorderedPart]:
-    """Yield the parts that repeat the part directly before them."""
+    """Yield each part of the trace that repeats the part directly before it."""
     last_at: dict[tuple[object, ...], int] = {}
     position = 0
     while position < len(runs):
@@ -80,7 +80,7 @@ def _triggers_next(runs: Sequence[HandlerRun], position: int) -> bool:
 
 
 def _are_swapped(runs: Sequence[HandlerRun], order: Sequence[int], number: int) -> bool:
-    """Return true if the run at `number` belongs after the next one."""
+    """Return true if the handler run at `number` belongs after the next handler run."""
     first, second = runs[order[number]], runs[order[number + 1]]
     before_s = runs[order[number - 1]].t if number else 0.0
     if second.t < first.t:

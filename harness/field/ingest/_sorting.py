@@ -79,7 +79,7 @@ class RecordSorter:
         return IngestResult(flights, [*_summarise(self._left_out)], remarks)
 
     def add_file(self, path: Path) -> None:
-        """Recognise the format of a file, and read it."""
+        """Recognise the format of a file, and read the records in the file."""
         try:
             with BoundedFile(path) as file:
                 beginning = file.peek(4096)[:4096]

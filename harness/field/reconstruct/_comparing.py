@@ -183,8 +183,8 @@ class SoloSimulations:
     def _explain_deviations(
         self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: SoloSimulation
     ) -> SoloSimulation:
-        """Explain the deviations of an agent by a known error, if possible. Otherwise simulate it up to the first
-        deviation.
+        """Explain the deviations of an agent by a known error, if possible. Otherwise simulate the agent up to the
+        first deviation.
         """
         agent_id, finding = header.agent_id, judged.first_finding
         parts: Incarnations = judged.with_known_states(incarnations) if judged.lost else incarnations

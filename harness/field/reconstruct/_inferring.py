@@ -281,7 +281,9 @@ class _InputSequence:
         return None if deadline is None else self._end_of_pause(deadline, JUST_AFTER_S)
 
     def _begin_requested_reconcile(self, next_s: float) -> bool:
-        """Return true if a reconcile begins before the next input. The operator must have requested it."""
+        """Return true if a reconcile begins before the next input. Such a reconcile must have been requested by the
+        operator.
+        """
         if self._explained == len(self._sent) or self._agent.state.reconcile_in_progress:
             return False
         sighting = self._sent[self._explained]

@@ -126,7 +126,7 @@ class OtherRecords:
 
     @property
     def _reason_unreadable(self) -> str:
-        """The reason why encrypted event data cannot be divided into events. It is "" if they are not encrypted."""
+        """The reason why encrypted event data cannot be divided into events, or "" if they are not encrypted."""
         exports = self._exports.values()
         if not any(sealed_to(base64.b64decode(export.inception.block_data)) for export in exports):
             return ""

@@ -299,7 +299,7 @@ class _IncarnationSimulation:
         return MATTERS[type(message)](agent.state, sender, message)
 
     def _ignores(self, recorded_input: RecordedInput) -> bool:
-        """Return true if a message had no effect although it should have had one."""
+        """Return true if the agent ignored a message that should have had an effect."""
         if not isinstance(recorded_input.cause, DatagramReceived) or any(
             run.changes or run.sent for run in recorded_input.runs
         ):

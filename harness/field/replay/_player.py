@@ -271,7 +271,7 @@ class RecordPlayer:
         return shift or self._doubt(deviations)
 
     def _doubt(self, deviations: list[StepDeviation]) -> str | None:
-        """Return damage to a single line that would also explain the deviations, or None.
+        """Return damage to a single line of the trace that would also explain the deviations, or None.
 
         It is a coincidence at most a few times in a record. If it explains more places, the deviations count.
         """

@@ -183,7 +183,7 @@ class StepText:
     # The state
 
     def in_short(self) -> Text:
-        """Return the state of the agent in one line."""
+        """Return the state of the agent as text in one line."""
         if self._player.lost is not None:
             return shown("  the state of the agent is not known", style="yellow")
         state = self._player.state

@@ -38,7 +38,8 @@ class DifferenceRecord(BaseModel):
 
 class ReplayedRecord(BaseModel):
     """The replay of one record. `steps` counts the compared handler runs, and `unjudged` the others. `unjudged_because`
-    has the reasons."""
+    has the reasons.
+    """
 
     record: Annotated[str, Field(description="The file, or the first of the files.")]
     agent_id: int

@@ -71,7 +71,7 @@ class CleanupResult:
 
 
 def clean(engine: DockerEngine) -> CleanupResult:
-    """Remove the containers of all ended runs, and leave all others. Raises DockerError."""
+    """Remove the containers of all ended runs, and keep all other containers. Raises DockerError."""
     cleaned = CleanupResult()
     for container in engine.do("list containers", engine.api.containers, all=True, filters={"label": RUN}):
         name = container["Names"][0].removeprefix("/")

@@ -91,8 +91,8 @@ class _ProcessIncarnation:
     """Number of bytes of its trace that the trace of the first incarnation already contains."""
 
     def handler_runs(self) -> dict[str, int | float] | None:
-        """Return the number of handler runs that the agent last reported, with the time of the report. None without a
-        report.
+        """Return the number of handler runs that the agent last reported, with the time of the report, or None without
+        a report.
         """
         if self.status is None:
             return None

@@ -64,7 +64,7 @@ class LiveChannel:
         return min(self._traffic.next_s, self._due[0].at_s if self._due else NEVER)
 
     def send(self, at_s: float, vehicle: int, frame: bytes, data_bytes: int, sequence: int | None) -> None:
-        """Let a vehicle send this frame on the channel. `data_bytes` is the length of the message in it."""
+        """Let a vehicle send this frame on the channel. `data_bytes` is the length of the message in the frame."""
         at_s = max(at_s, self._played_s)
         self._traffic.send(at_s, self._number[vehicle], _ChannelMessage(frame, sequence), data_bytes)
 

@@ -128,7 +128,8 @@ class VehicleProcess:
         self._flight = self.pilot.flight(flight.to_plan(), flight.by) if flight else self.pilot.ascent(altitude_m)
 
     async def _introduce(self) -> None:
-        """Set the requested parameters, and record the version and all parameters of the vehicle. Call this once.
+        """Set the requested parameters, and record the version and all parameters of the vehicle. Later calls have no
+        effect.
 
         Raises VehicleFailedError after a kill.
         """
@@ -196,7 +197,9 @@ class VehicleProcess:
         return self.pilot.shortfall(self._flight)
 
     async def simulate(self, what: str, circumstance: SimulatedFailure, at_s: float) -> str | None:
-        """Make the vehicle simulate an event such as a GPS failure. If it cannot, return the reason as a sentence."""
+        """Make the vehicle simulate an event such as a GPS failure. Return the reason as a sentence if the vehicle
+        cannot do this.
+        """
         assert self.pilot is not None
         entry: dict[str, Any] = {"at_s": at_s, "what": what, "parameters": {}}
         self._circumstances.append(entry)

@@ -74,8 +74,8 @@ class RogueDatagram:
 
 @dataclass(frozen=True, slots=True)
 class _ReceivedDatagram:
-    """A datagram that the rogue node received. `message` is None if it is encrypted. An answer to it must contain
-    `request`.
+    """A datagram that the rogue node received. `message` is None for an encrypted datagram. An answer to the datagram
+    must contain `request`.
     """
 
     sender: int

@@ -210,7 +210,7 @@ class EventLoop:
 
     @contextmanager
     def _containing_crash(self, number: int) -> Iterator[None]:
-        """Let the mission go on without this agent if it crashes in the context."""
+        """Continue the mission without this agent if the agent crashes in the context."""
         try:
             yield
         except Exception as error:

@@ -66,7 +66,7 @@ class VirtualAgent(Protocol):
     def silent_until(self) -> float | None: ...
 
     def outgoing(self) -> Sequence[AgentOutput]:
-        """Return the outputs since the previous call, in order."""
+        """Return the outputs of the agent since the previous call, in order."""
 
     def trace(self) -> list[Entry]: ...
 

@@ -88,7 +88,7 @@ class StationTracks:
                     connection.sock.send(data)
 
     def close(self) -> dict[str, Any]:
-        """Close all connections, and return their record for run.json."""
+        """Close all connections to the ground station, and return their record for run.json."""
         passed = self._station.to_json()
         self._station.close()
         for connection in self._connections.values():

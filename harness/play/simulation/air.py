@@ -185,7 +185,7 @@ class VirtualAir:
 
     @property
     def quiet_at(self) -> float:
-        """The time after which none of the messages on their way arrives any more.
+        """The mission second after which no message that is on its way still arrives.
 
         While a shared channel has messages, it is at least the time of the channel's next event.
         """
@@ -370,7 +370,7 @@ class VirtualAir:
         return new
 
     def close_ended_queries(self, number: int, state: AgentState) -> None:
-        """Close the queries of an agent that ended together with a timer."""
+        """Close each open query of an agent that no longer accepts answers to it."""
         open_queries = self.open_queries[number]
         for about, query in list(open_queries.items()):
             if not STILL_ASKED[query.question[0]](state):

@@ -35,7 +35,7 @@ class AttackEntries:
         self._completed_s.append(at_s)
 
     def sees(self, local: int) -> None:
-        """Record the chain hashes of an agent in this state, so that entries can refer to them."""
+        """Record the chain hashes of an agent in this state, so that timeline entries can refer to these hashes."""
         chain = self._local.state(local).chain
         below: tuple[bytes, ...] = ()
         self._chains[chain.inception.chain_hash] = below

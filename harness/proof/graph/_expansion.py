@@ -81,7 +81,7 @@ def cycles_left_alone() -> Iterator[None]:
 
 
 class StateStore(Sequence[State]):
-    """The states of a swarm, numbered in the order in which they were added. Each one is stored as bytes."""
+    """The states of a swarm as bytes, numbered in the order in which they were added."""
 
     def __init__(self, agents: int) -> None:
         self._form = Struct(f"={AGENTS + agents}i")

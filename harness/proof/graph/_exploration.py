@@ -64,7 +64,9 @@ class StateGraph:
         return number
 
     def take_in(self, expansion: StateExpansion) -> None:
-        """Add the successors of the next state in the order of numbers."""
+        """Add the successors of the first state whose successors are still unknown. The order is that of the state
+        numbers.
+        """
         number = len(self.quiet)
         self.transitions += expansion.ways
         self.quiet.append(expansion.by_timer)

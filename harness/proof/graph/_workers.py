@@ -240,8 +240,8 @@ class _WorkerHandle:
     def expansions_of(
         self, answer: SuccessorBatch, first: int, add: Callable[[State, int], int]
     ) -> Iterator[StateExpansion]:
-        """Yield the successors of each state in the answer, beginning with state number `first`. `add` stores new
-        states in the graph.
+        """Yield the successors of each state in the answer of a worker, beginning with state number `first`. `add`
+        stores new states in the graph.
         """
         fresh = iter(self._translator.decode(answer.batch))
         numbers = self._numbers

@@ -197,7 +197,7 @@ class _BlockDistribution:
             collected.shown.add("4")
 
     def _act(self, state: Alone) -> None:
-        """Explore the actions that an agent takes without a message, such as the expiry of a timer."""
+        """Explore the steps that an agent takes without a message, such as the expiry of a timer."""
         agent_id, local, zone, completed = state
         if self._known_flaw(local):
             return

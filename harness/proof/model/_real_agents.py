@@ -81,7 +81,7 @@ class RealAgents:
 
 
 def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHandler[Any]:
-    """Return a handler that runs the given one and then calls `after`."""
+    """Return a handler that runs the given handler and then calls `after`."""
 
     def run(*inputs: Any) -> str:
         branch = handler.run(*inputs)

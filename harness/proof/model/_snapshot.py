@@ -70,7 +70,9 @@ def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
 
 
 def dead(state: AgentState) -> Snapshot:
-    """Return the initial values of the parts that every handler of a correct agent writes before it reads them."""
+    """Return the initial values of those parts of the state that every handler of a correct agent writes before it
+    reads them.
+    """
     parts: Snapshot = {}
     if not state.voting_timer.active:
         parts |= _DEAD_VOTE

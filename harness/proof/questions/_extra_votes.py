@@ -127,7 +127,7 @@ class ExtraVotes:
                 )
 
     def _explore_all(self, state: State, votes: int, instants: int) -> None:
-        """Explore all successors, and record whether this number of votes is enough for each one."""
+        """Explore all successors of a state, and record for each one whether this number of votes is enough."""
         states, numbers = [state], {state: 0}
 
         def number_of(after: State) -> int:

@@ -104,7 +104,7 @@ class ChainNumbers:
 
 
 def lives(trace: Trace, header: CheckedHeader, chains: ChainNumbers, *, ended: bool) -> Iterator[EncodedIncarnation]:
-    """Yield the encoded steps between any two restarts of an agent, up to the first line that cannot be encoded.
+    """Yield the encoded steps of each incarnation of an agent, up to the first line that cannot be encoded.
 
     `ended` is true if the agent reached the end of its mission, so that its last steps are recorded.
     """

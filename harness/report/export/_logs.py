@@ -1,4 +1,4 @@
-"""Read the log files of a run's programs. Each line gets the time with which it begins.
+"""Read the log files of a run's programs. The time of each line is the time with which the line begins.
 
 Agents may use any log format. A line without a time gets the time of the previous line, and a first line without a time
 gets the start of the mission. No log states its time zone. The reader assumes the zone in which the first line is

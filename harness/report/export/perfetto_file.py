@@ -211,7 +211,7 @@ class _PerfettoTrace:
         return at_ns, 0, self._packet(at_ns, _agent(agent), track, TrackEvent.TYPE_SLICE_END)
 
     def _count(self, at_ns: int, group: str, name: str, value: float) -> Iterator[Event]:
-        """Yield a counter event if the value has changed since the last one."""
+        """Yield a counter event if the value of the counter has changed since the last event."""
         if self._counters.get((group, name)) != value and abs(value) <= _LARGEST:
             self._counters[group, name] = value
             packet = self._packet(at_ns, group, name, TrackEvent.TYPE_COUNTER)

@@ -207,7 +207,9 @@ def _transform(position: FieldPosition) -> Any:
 
 
 def _markers(at_ns: int, lines: list[LinkLine]) -> Any:
-    """Return one marker with all lines. RViz rejects an empty list, so without lines the old marker is deleted."""
+    """Return one marker with all lines. Without lines, the marker deletes the old lines, because RViz rejects an empty
+    list.
+    """
     marker: Any = _STORE.types["visualization_msgs/msg/Marker"]
     origin = (0.0, 0.0, 0.0)
     marker_message = marker(

@@ -98,7 +98,7 @@ class NetworkAndVehicles:
 
     @property
     def at_s(self) -> float:
-        """The mission second of the last entry that was read."""
+        """The mission second of the last entry that was read from the file."""
         return max(self._conditions.at_s, self._tracks.at_s)
 
     @property

@@ -11,7 +11,7 @@ STRIDE_S = 20.0
 
 
 async def copy_finished_run(feed: ChangeFeed, log: ChangeLog) -> None:
-    """Write all changes of a finished run in order of time."""
+    """Write all changes of a finished run to a log, in order of time."""
     until_s = 0.0
     log.append([feed.run_change(live=False)])
     while True:

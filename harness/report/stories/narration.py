@@ -160,7 +160,7 @@ class StoryWriter:
         return f", not to {_listed(missed)}" if missed else ""
 
     def _chains(self, until_s: int | None) -> list[str]:
-        """Return the chains as a tree with agents at its ends."""
+        """Return the chains of all agents as a tree of blocks, with the agents at the ends."""
         chains: dict[int, list[str]] = {}
         for agent_id, trace in self._traces.items():
             positions = {action.position: action.instant for action in self._actions if action.agent_id == agent_id}
@@ -179,7 +179,7 @@ class StoryWriter:
 
 
 def _actions_with_causes(traces: Mapping[int, Trace]) -> list[AgentReaction]:
-    """Return all actions, each with the action that caused it."""
+    """Return all actions of agents, each with the action that caused it."""
     actions = [action for agent_id, trace in traces.items() for action in _actions(agent_id, trace)]
     sent: dict[tuple[int, int], list[AgentReaction]] = defaultdict(list)
     for action in actions:

@@ -1,4 +1,4 @@
-"""Faults of agents and vehicles, with a class for each. This package finds the classes in its modules.
+"""Faults of agents and vehicles, with a class for each kind of fault. This package finds the classes in its modules.
 
 No other module lists the faults: to add one, add its class to a file in this directory.
 """

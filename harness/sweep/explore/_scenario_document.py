@@ -260,7 +260,7 @@ def _limit_duration(entry: Document, last_s: float) -> Document:
 
 
 def move_times(document: Document, to: Callable[[float], float]) -> Document:
-    """Return the document with all times changed by the function `to`."""
+    """Return the scenario document with the function `to` applied to all its times."""
     for key in ("events.script", "timeline"):
         document = with_key(document, key, [_move_entry_times(entry, to) for entry in at(document, key) or []])
     document = with_key(document, "fates", [_move_fate_times(fate, to) for fate in document.get("fates", [])])

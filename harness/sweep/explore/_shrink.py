@@ -25,7 +25,7 @@ WORTH_FORKING_S = 0.03
 
 
 class BudgetSpentError(Exception):
-    """An error: the maximum number of runs has been played."""
+    """An error: the search has played its maximum number of runs."""
 
 
 class Shrinker:

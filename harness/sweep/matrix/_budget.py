@@ -23,7 +23,7 @@ def informative(
     budget_s: float,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[MatrixTask]:
-    """Yield tasks until the budget is used up. `runs` has the results so far, and grows while this function yields."""
+    """Yield tasks until the budget is used up. `runs` has the finished results, and grows between two tasks."""
     until = clock() + budget_s
     begun = Counter(task.point for task in runs)
     left: dict[MatrixPoint, list[MatrixTask]] = {}

@@ -43,7 +43,7 @@ class RunFailedError(HarnessError):
 
 @gc_paused()
 def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> JudgedRun:
-    """Simulate a run in virtual time, and judge it. Every step is judged if `tracing` is true."""
+    """Simulate a run in virtual time, and judge the run. Every step is judged if `tracing` is true."""
     from harness.run.simulate import simulate
 
     run = simulate(scenario, seed, tracing=tracing)

@@ -78,7 +78,9 @@ def growths(matrix: Matrix, cells: Sequence[Cell], runs: Sequence[Run]) -> list[
 
 
 def _points(over: tuple[Variable, ...], metric: str, runs: Iterable[Run]) -> Iterable[tuple[list[float], float]]:
-    """Yield a point for each run. An unknown value becomes 0, so that `fit` excludes and counts the run."""
+    """Yield a point for each run, for the fit of a power law. An unknown value becomes 0, so that `fit` excludes and
+    counts the run.
+    """
     for run in runs:
         values = {"agents": run.agents, "blocks": run.figures.get("blocks") or 0.0}
         yield [values[name] for name in over], BY_NAME[metric].of(run.figures) or 0.0

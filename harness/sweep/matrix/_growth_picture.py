@@ -190,7 +190,7 @@ def _place_of(item: Cell | Growth, panel: GrowthPanel) -> ChartLineKey:
 
 
 def _name(matrix: Matrix, losses: Sequence[float], place: ChartLineKey) -> str:
-    """Return the values in which a line differs from the others, as text."""
+    """Return the values in which a line differs from the other lines, as text."""
     return ", ".join(
         [
             *([f"{words.percent(place.loss)} loss"] if len(losses) > 1 else []),

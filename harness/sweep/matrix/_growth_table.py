@@ -53,7 +53,7 @@ def growth_tables(record: MatrixRecord) -> Iterator[GrowthTables]:
 
 
 def _rows(growths: Iterable[Growth]) -> list[tuple[str, Variable, dict[str, Law]]]:
-    """Group the laws by the runs to which they are fitted: over agents, then over blocks, then over both."""
+    """Group the laws of growth by the runs to which they are fitted: over agents, then over blocks, then over both."""
     by_row: dict[tuple[float, str, Variable], dict[str, Law]] = {}
     for growth in growths:
         for variable in growth.over:

@@ -106,7 +106,7 @@ def _heading(name: str, top: float) -> Markup:
 
 
 def _series(record: MatrixRecord) -> list[list[Cell]]:
-    """Return the rows of results, each sorted by loss rate. If no run has ended, return one empty row."""
+    """Return the rows of results, each sorted by loss rate, or one empty row if no run has ended."""
     return [sorted(cells, key=lambda cell: cell.loss) for cells in series(record)] or [[]]
 
 
@@ -116,7 +116,7 @@ def _name(record: MatrixRecord, cells: Sequence[Cell]) -> str:
 
 
 def description(record: MatrixRecord) -> str:
-    """Return a text that describes the picture."""
+    """Return a text that describes the picture of the matrix."""
     if not record.cells:
         return "No run has ended."
     parts = []

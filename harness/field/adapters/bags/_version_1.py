@@ -1,4 +1,4 @@
-"""Read ROS bags of version 1 (wiki.ros.org/Bags/Format/2.0). Damaged records are skipped."""
+"""Read ROS bags of version 1 (wiki.ros.org/Bags/Format/2.0), and skip damaged records."""
 
 import re
 import struct

@@ -139,9 +139,7 @@ def _figures(record: MergedRecord, single_copies: list[str]) -> list[tuple[str, 
 def _trees(
     record: MergedRecord, reconciliation: ReconciledExports | None, ink: Mapping[int, AgentColours]
 ) -> list[tuple[str, Markup]] | None:
-    """Return pictures of the chains before and after the reconcile, or None if there are too many blocks for a
-    picture.
-    """
+    """Return pictures of the chains before and after the reconcile, or None if a picture would have too many blocks."""
     exports = record.collected.exports
     if len(record.blocks) > MAX_TREE_BLOCKS:
         return None

@@ -268,7 +268,9 @@ class ProgramPool:
         self._lock = Lock()
 
     def take(self, command: Sequence[str], agent_id: int) -> LineProgram:
-        """Return an idle or a new program. The caller must give it back. Raises OSError if it cannot be started."""
+        """Return an idle or a new program, which the caller must give back. Raises OSError if a new program cannot be
+        started.
+        """
         log = self._logs / f"{agent_id}.log" if self._logs is not None else None
         with self._lock:
             program = self._idle_program(tuple(command), log) or LineProgram(command, log)

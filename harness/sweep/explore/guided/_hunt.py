@@ -97,7 +97,7 @@ class KeptRun:
 
     @property
     def nearness(self) -> float:
-        """The expected benefit of this document in the search for an endless cycle. It is 0 without a new sequence of
+        """The expected benefit of this document in the search for an endless cycle, or 0 without a new sequence of
         failed votes.
         """
         return self.failed**2 / (1 + self.picked) / (100 + self.steps)

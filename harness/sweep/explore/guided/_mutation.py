@@ -331,7 +331,7 @@ def _splice(document: Document, other: Document, rng: Random) -> Document:
 
 
 def _moment(document: Document, rng: Random) -> float:
-    """Choose a time: at or between known times, or at the expiry of a timer that starts then."""
+    """Choose a mission second: at or between known times, or at the expiry of a timer that starts at a known time."""
     known = [event["at_s"] for event in script(document)]
     known += [entry["at_s"] for entry in timeline(document)]
     last = max(known, default=20.0)

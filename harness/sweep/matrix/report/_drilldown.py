@@ -22,8 +22,8 @@ MAX_ROWS = 12_000
 
 @dataclass(frozen=True, slots=True)
 class RunRow:
-    """A table row about one run. `href` links to its report if it was kept. `failed` or `unsupported` explains missing
-    verdicts.
+    """A table row about one run. `href` links to the report of the run if it was kept. `failed` or `unsupported`
+    explains missing verdicts.
     """
 
     seed: int

@@ -145,9 +145,7 @@ def heatmap(record: MatrixRecord, figure: HeatmapFigure) -> Heatmap:
 
 
 def _scale(figure: HeatmapFigure, record: MatrixRecord) -> tuple[float, float]:
-    """Return the values of the first and the last shade: 0 and 1 for shares, otherwise the smallest and largest
-    mean.
-    """
+    """Return the figures for the first and last shade: 0 and 1 for shares, otherwise the smallest and largest mean."""
     if figure.metric.unit != "number":
         return 0.0, 1.0
     means = [mean for cell in record.cells if (mean := figure.of(cell).mean) is not None]
