@@ -99,8 +99,8 @@ def test_buttons_of_the_page_control_the_run(browser: Browser, tmp_path: Path) -
     out = tmp_path / "run"
     with page_of("run", scenario(tmp_path), "--backend", "sim", "--watch", "--out", out) as (_, address):
         browser.show(address, width=1280, scheme="dark")
-        until(browser, f"watch.hand && !{button('Heal')}.disabled")
-        assert browser.evaluate(f"{button('Kill')}.disabled && {button('Kill')}.title").startswith("choose vehicles")
+        until(browser, f"watch.hand && !{button('Heal')}.disabled && {button('Kill')}.disabled")
+        assert browser.evaluate(f"{button('Kill')}.title").startswith("choose vehicles")
         assert browser.evaluate(f"{button('Befall')}.disabled && {button('Befall')}.title").startswith("needs vehicles")
         browser.evaluate("watch.hand.choose(2)")
         browser.evaluate(f"{button('Part')}.click()")
