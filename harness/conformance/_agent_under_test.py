@@ -50,7 +50,7 @@ class AgentUnderTest(ABC):
 
     @abstractmethod
     def exchanges(self) -> tuple[RecordedDatagram, ...]:
-        """Return all datagrams since the start of the agent."""
+        """Return all datagrams that the agent sent or received since its start."""
 
     @abstractmethod
     async def close(self) -> None:

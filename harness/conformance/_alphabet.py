@@ -98,8 +98,8 @@ def _last_responder(responders: Callable[[ReferenceModel], set[int]]) -> Callabl
 
 
 def _voters(model: ReferenceModel) -> set[int]:
-    """Return the agents that have voted in the current vote. During a reconcile, the list is empty because votes do not
-    count.
+    """Return the agents that have voted in the current vote. During a reconcile, return an empty set because votes do
+    not count.
     """
     state = model.state
     return state.voters if state.voting_timer.active and not state.reconcile_in_progress else set()
@@ -393,7 +393,7 @@ def _next(candidate: Callable[[ReferenceModel], Block | None]) -> Callable[[Refe
 
 
 def _named_block(model: ReferenceModel) -> Block | None:
-    """Return the first block that an answer of reconcile phase 2 named, or None."""
+    """Return the first block that an answer of reconcile phase 2 named. Return None if no answer named a block."""
     named = [candidate for candidate in model.state.reconcile_response_dictionary if candidate != IS_TOP_OF_CHAIN]
     return model.blocks.get(named[0]) if _phase_two(model) and named else None
 

@@ -59,8 +59,8 @@ class BlamedBranch:
 
 
 class BlameEvidence:
-    """The evidence for choosing a handler: how many tests of each branch passed or failed, and which pairs of
-    successive branches passed.
+    """The evidence for finding the handler that caused a failure. It counts the passed and failed tests of each branch,
+    and contains the pairs of successive branches in passed tests.
     """
 
     def __init__(self, variant_results: Iterable[VariantResult]) -> None:
@@ -100,14 +100,16 @@ class BlameEvidence:
         return BlamedBranch(run.handler, run.branch)
 
     def _fails_without_preceding_input(self, failure: ConfirmedFailure) -> bool:
-        """Return true if the timer's expiry also fails without the preceding answer, which the agent must ignore."""
+        """Return true if the test of the timer's expiry alone, without an ignored answer before it, has not passed."""
         key = failure.observation.key
         if INPUTS[key.input].preceding is None:
             return False
         return (failure.variant, VectorKey(*failure.observation.before, TIMER)) not in self._pairs
 
     def _counts_wrongly_from_start(self, failure: ConfirmedFailure) -> bool:
-        """Return true if the agent counted wrongly from the start, because it decides correctly after other counts."""
+        """Return true if the agent probably began its count wrongly. The sign of this is that it decides correctly
+        after other counts.
+        """
         observation, first = failure.observation, failure.observation.outcome.runs[0]
         if first.handler not in BEGINNING_OF_COUNT:
             return False
@@ -134,7 +136,9 @@ class BlameEvidence:
 
     @staticmethod
     def _starter_of_timer(failure: ConfirmedFailure) -> BlamedBranch:
-        """Return the handler that starts the timer with the wrong duration, with its branch if it ran in this step."""
+        """Return the handler that starts the timer whose duration is wrong. Include its branch if the handler ran in
+        this step.
+        """
         for run in failure.observation.outcome.runs:
             if HANDLERS[run.handler].starts and run.branch in STARTING_BRANCHES:
                 return BlamedBranch(run.handler, run.branch)
@@ -171,8 +175,8 @@ class BlameEvidence:
 
 
 def _took_another_decision(observation: TestedStep) -> ExpectedRun | None:
-    """Return the handler run of the expired timer, if another decision in this handler run explains all unexpected
-    messages.
+    """Return the handler run at the expiry of the timer, if a different decision in it would explain all unexpected
+    messages. Otherwise return None.
     """
     first, *then = observation.outcome.runs
     if first.handler not in BEGINNING_OF_COUNT or not observation.unexpected:
@@ -190,8 +194,8 @@ def _messages_after(event: LocalEvent) -> set[str]:
 
 
 def _sends_other_content(observation: TestedStep) -> ExpectedRun | None:
-    """Return the handler run that sent the right messages with wrong content. Return None if a block or a type is wrong
-    too.
+    """Return the handler run that sent messages of the right types with wrong content. Return None if a block or a
+    message type is wrong.
     """
     if BLOCK_KEYS & set(observation.wrong_status_keys) or set(observation.missing) != set(observation.unexpected):
         return None

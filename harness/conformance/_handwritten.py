@@ -1,4 +1,6 @@
-"""Run the handwritten test cases, each with its own agents. Some run in parallel, and failed ones run again alone."""
+"""Run the handwritten test cases, each with its own agents. Some cases run in parallel. Failed cases run a second time,
+each of them alone.
+"""
 
 import asyncio
 from dataclasses import replace

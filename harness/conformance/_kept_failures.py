@@ -1,4 +1,4 @@
-"""Write files about each failure, including a scenario that gives the agent the same inputs again.
+"""Write files about each failure. One of them is a scenario that gives the same inputs to the agent.
 
 failure.txt       the expected and the received messages
 vector.jsonl      the inputs and the expected answers, as `COMMAND --virtual` reads and writes them
@@ -78,7 +78,7 @@ EPOCH_US = 1_700_000_000_000_000
 
 
 def keep(case: CaseResult, command: Sequence[str], directory: Path) -> None:
-    """Write the files of a failure into a new directory. Raises MachineError if that fails."""
+    """Write the files of a failure into a new directory. Raises MachineError if the files cannot be written."""
     try:
         directory.mkdir(parents=True)
         lines = list(lines_of(case))

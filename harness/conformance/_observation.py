@@ -162,7 +162,8 @@ def compare(
 def _timer_expired_early(
     model: ReferenceModel, expected: Sequence[Message], received: Sequence[Message], status: Mapping[str, Any]
 ) -> str | None:
-    """Return the timer whose early expiry explains the received messages and the status, or None.
+    """Return the timer whose early expiry explains the received messages and the status. Return None if there is no
+    such timer.
 
     This call advances the model, so the model cannot follow the agent any more.
     """

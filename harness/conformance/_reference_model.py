@@ -169,7 +169,7 @@ CONTAINERS = frozenset((bytearray, set, list, deque, dict))
 
 
 class ModelSnapshot:
-    """A saved state of the reference, to which it can return later.
+    """A saved state of the reference agent. `restore` sets the reference agent back to this state.
 
     Counters for reports are left out. Paused timers are left out, too, because no timer is paused between inputs.
     """
@@ -191,7 +191,9 @@ class ModelSnapshot:
 
 
 def _sorted(part: dict[str, Any]) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """Return the immutable values of an object's attributes, and copies of its containers."""
+    """Split the attributes of an object into two groups. Return the immutable attributes, and copies of the attributes
+    that are containers.
+    """
     containers = [(name, _copied(value)) for name, value in part.items() if type(value) in CONTAINERS]
     return {name: value for name, value in part.items() if type(value) not in CONTAINERS}, containers
 

@@ -125,8 +125,8 @@ def _candidates(model: ReferenceModel) -> tuple[object, ...]:
 
 
 class VectorKey(NamedTuple):
-    """The identity of a generated test: an input in a state. `counted` is empty if the input does not depend on earlier
-    counts.
+    """The identity of a generated test: an input in a state. `counted` is empty if the effect of the input does not
+    depend on the counted answers.
     """
 
     activity: str
@@ -155,7 +155,7 @@ class AgentTransition:
 
 
 def next_timer_name(model: ReferenceModel) -> str | None:
-    """Return the name of the timer that expires next, or None if no timer runs."""
+    """Return the name of the timer that expires next. Return None if no timer runs."""
     running = [timer for timer in model.state.timers if timer.deadline is not None]
     return min(running, key=lambda timer: timer.deadline or 0.0).name if running else None
 
@@ -177,8 +177,8 @@ def advance(model: ReferenceModel, given: AgentInput, now: float) -> tuple[Expec
 
 
 def explore(variant: SettingsVariant) -> Iterator[AgentTransition]:
-    """Yield each generated test once, with a shortest sequence of inputs that leads to it. Each call gives the same
-    result.
+    """Yield each generated test once, with a shortest sequence of inputs that leads to it. Each call yields the same
+    tests.
     """
     seen: set[VectorKey] = set()
     model = ReferenceModel(variant.settings)
@@ -259,7 +259,7 @@ one agent can reach them again and again."""
 
 
 def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, given: AgentInput) -> bool:
-    """Return true if the later expiry of the timer would show that an agent wrongly counted this input."""
+    """Return true if the next expiry of the timer would reveal an agent that wrongly counts this input."""
     if (
         (before.activity, before.holdings) not in COUNTING_STATES
         or given.preceding is None
@@ -275,10 +275,10 @@ def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, g
 
 
 def _outcome_of_timer(snapshot: ModelSnapshot, now: float, name: str, *, counts: bool) -> ExpectedOutcome | None:
-    """Return the handler runs after this input and the expiry of the timer. If `counts` is true, the input counts
-    although it must not.
+    """Return the handler runs after this input and the next expiry of the timer. `counts` is true for an input that the
+    agent must count, and false for an input that it must ignore.
 
-    Return None if the input is impossible, or unless the agent counts (`counts`) or ignores the input.
+    Return None if the input is impossible in the saved state, or if `counts` is wrong for this input.
     """
     model = snapshot.restore()
     advanced = advance(model, INPUTS[name], now)

@@ -98,7 +98,9 @@ ReplayOutcome = ConfirmedFailure | ReplayVerdict
 
 
 class VectorSuite:
-    """All generated tests. `show_progress` is called after each change with the number of passed tests."""
+    """All generated tests, with the methods that play them. `show_progress` gets the number of passed tests after each
+    change.
+    """
 
     def __init__(
         self,
@@ -130,7 +132,8 @@ class VectorSuite:
         self._unexplained_ends: set[str] = set()
 
     async def run(self, until: float) -> None:
-        """Play all tests, then those for which the machine was too late, and then the suspected failures.
+        """Play all tests. Then repeat the tests for which the machine was too late, and at the end the suspected
+        failures.
 
         `until` is the second of the monotonic clock at which no further vectors begin. Raises NoAgentError if the
         agent never starts.
@@ -174,7 +177,9 @@ class VectorSuite:
                 self._working[number] -= 1
 
     def _next_variant(self) -> int | None:
-        """Return the settings with the most remaining tests for each agent, or None if no tests remain."""
+        """Return the index of the settings with the most remaining tests for each agent. Return None if no tests
+        remain.
+        """
         shares = [
             (vector_map.left / (self._working[number] + 1), number)
             for number, vector_map in enumerate(self._maps)
@@ -196,7 +201,7 @@ class VectorSuite:
             self._on_tour[number] -= 1
 
     async def _run_tour(self, variant_result: VariantResult, vector_map: VectorMap, until: float) -> None:
-        """Start an agent, and let it play tests one after another until it fails or no test remains."""
+        """Start an agent, and let it play tests in sequence until it fails or no test remains."""
         try:
             async with self._starting:
                 agent = await self._start(variant_result.vectors.variant, False)
@@ -240,8 +245,8 @@ class VectorSuite:
 
     @staticmethod
     def _suspicions_to_retry(variant_result: VariantResult) -> Iterator[SuspectedFailure]:
-        """Yield the suspected failures with the shortest inputs, at most MAX_RETRIES_OF_A_KIND with the same
-        branches.
+        """Yield the suspected failures, those with the fewest inputs first. Yield at most MAX_RETRIES_OF_A_KIND with
+        the same branches.
         """
         kinds: Counter[object] = Counter()
         for suspicion in sorted(variant_result.suspicions, key=lambda suspicion: len(suspicion.path)):
@@ -253,7 +258,7 @@ class VectorSuite:
     # Replays with few agents at a time
 
     async def _retry_late(self, late_keys: Iterator[tuple[VariantResult, VectorKey]], until: float) -> None:
-        """Play the tests for which the machine was too late each time."""
+        """Play the tests that were abandoned because the machine was too late at each attempt."""
         for variant_result, key in late_keys:
             if time.monotonic() >= until:
                 return
@@ -291,10 +296,11 @@ class VectorSuite:
     async def _retry_variants(
         self, variant_result: VariantResult, suspicion: SuspectedFailure
     ) -> AsyncIterator[ReplayOutcome]:
-        """Repeat a suspected failure with different sequences of inputs until it fails again. Yield each result.
+        """Test a suspected failure with several sequences of inputs, until the agent fails in one. Yield the result of
+        each sequence.
 
-        The first path is the shortest one. The next paths are the shortest one with an additional answer that the agent
-        must ignore. The last paths are the ends of the original path.
+        The first sequence is the shortest one. The next ones are the shortest one with an additional answer that the
+        agent must ignore. The last ones are the ends of the original sequence.
         """
         variant = variant_result.vectors.variant
         name = suspicion.path[-1]
@@ -322,8 +328,8 @@ class VectorSuite:
     async def _find_miscounted(
         self, variant: SettingsVariant, path: Sequence[str], failure: ConfirmedFailure, *, needs_earlier_round: bool
     ) -> ConfirmedFailure:
-        """Return the failure with its cause, if it disappears when the ignored answers of one handler are left out.
-        Otherwise return None.
+        """Return the failure. Add the cause if the failure disappears without the answers that a certain handler must
+        ignore.
         """
         counted = _ignored_answers(variant, path)
         for handler in dict.fromkeys(run.handler for run in counted.values()):
@@ -336,7 +342,7 @@ class VectorSuite:
         return replace(failure, needs_earlier_round=needs_earlier_round)
 
     async def _play_repeatedly(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Repeat these inputs several times. Return RIGHT if the agent is right at least once, otherwise the failure.
+        """Play these inputs several times. Return RIGHT if the agent is right at least once, otherwise its failure.
 
         Return TOO_LATE if the machine was late in too many replays.
         """
@@ -352,8 +358,8 @@ class VectorSuite:
         return TOO_LATE
 
     async def play(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Play these inputs to a new agent. Return the first failure, or RIGHT, or TOO_LATE if the machine was too
-        late.
+        """Give these inputs to a new agent. Return its first failure, or RIGHT without a failure, or TOO_LATE if the
+        machine was too late.
         """
         try:
             agent = await self._start(variant, True)
@@ -371,7 +377,7 @@ class VectorSuite:
 
 
 def _kind_of_end(ended: str) -> str:
-    """Return a short phrase about the end of an agent, "it hangs" or "it ended with status 1"."""
+    """Return a short phrase about the end of an agent, such as "it hangs" or "it ended with status 1"."""
     return ended.partition(":")[0]
 
 
@@ -382,15 +388,17 @@ def _unexplained_failure(variant: SettingsVariant, suspicion: SuspectedFailure, 
 
 
 def _single_run(variant: SettingsVariant, path: tuple[str, ...], name: str) -> ExpectedRun | None:
-    """Return the handler run that the last input causes after these inputs. Return None unless there is exactly one."""
+    """Return the handler run that the input `name` causes after the inputs in `path`. Return None unless there is
+    exactly one.
+    """
     model, now = walk(variant, path)
     advanced = advance(model, INPUTS[name], now)
     return advanced[0].runs[0] if advanced is not None and len(advanced[0].runs) == 1 else None
 
 
 def _ignored_answers(variant: SettingsVariant, path: Sequence[str]) -> dict[int, ExpectedRun]:
-    """Return, for each answer in these inputs that the agent must ignore, its position and the handler run that ignores
-    it.
+    """Return the answers among these inputs that the agent must ignore: position of the input -> handler run that
+    ignores it.
     """
     model, now = ReferenceModel(variant.settings), 0.0
     uncounted = {}
@@ -404,9 +412,10 @@ def _ignored_answers(variant: SettingsVariant, path: Sequence[str]) -> dict[int,
 
 
 def _path_tails(variant: SettingsVariant, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield final parts of these inputs, from the shortest to the whole. Each begins where the agent was idle.
+    """Yield parts of these inputs that end with the last input, from the shortest part to all inputs. Before each part,
+    the agent was idle.
 
-    Ends with more than MAX_PATH inputs are left out.
+    Parts with more than MAX_PATH inputs are left out.
     """
     model, now = ReferenceModel(variant.settings), 0.0
     idle = [0]
@@ -422,7 +431,7 @@ def _path_tails(variant: SettingsVariant, path: tuple[str, ...]) -> Iterator[tup
 
 
 async def _run_all(work: Sequence[Coroutine[Any, Any, None]]) -> None:
-    """Run all coroutines in parallel. The first error cancels the others and is raised."""
+    """Run all coroutines in parallel. If one raises an error, cancel the other coroutines and raise this error."""
     try:
         async with asyncio.TaskGroup() as group:
             for each in work:

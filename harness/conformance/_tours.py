@@ -1,4 +1,4 @@
-"""Let one agent play many generated tests, one after another, along the shortest paths between their states.
+"""Let one agent play many generated tests in sequence, along the shortest paths between their states.
 
 In each state the tour first plays the vectors that leave the agent unchanged, and then one that changes it. If no
 vectors are left in a state, the tour goes to the nearest state with vectors that are left. Many tours run in parallel,
@@ -102,7 +102,7 @@ class VectorMap:
         return key in self._growing, INPUTS[key.input].tally == "timer", key not in self._quiet, key.input
 
     def take(self, key: VectorKey) -> bool:
-        """Remove a test from the remaining tests. Return true if it was one of them."""
+        """Remove a test from the remaining tests. Return true if the test was one of them."""
         here = self._unseen.get((key.activity, key.holdings))
         if here is None or key not in here:
             return False
@@ -111,9 +111,10 @@ class VectorMap:
         return True
 
     def return_key(self, key: VectorKey) -> bool:
-        """Add a test to the remaining tests again, because the machine was too late. After MAX_TRIES times, abandon it.
+        """Put a test back into the remaining tests, because the machine was too late for it. After MAX_TRIES times,
+        abandon the test.
 
-        Return whether it is left.
+        Return true if the test remains.
         """
         self._tries[key] += 1
         if self._tries[key] >= MAX_TRIES:
@@ -136,11 +137,11 @@ class VectorMap:
     def path_from(
         self, state: AgentState, ruled_out: Container[VectorKey] = ()
     ) -> tuple[list[str], VectorKey | None] | None:
-        """Return the cheapest sequence of inputs to a remaining test, with this test. Return None if no test can be
+        """Return the cheapest sequence of inputs to a remaining test, and the test. Return None if no test can be
         reached.
 
-        An empty path means that a new agent gets there more cheaply. Return None if no path leads to such a vector.
-        `ruled_out` contains vectors that were impossible, or led to another state than the map has.
+        An empty path means that a new agent reaches a test more cheaply. `ruled_out` contains tests that were
+        impossible, or led to a state that differs from the map.
         """
         queue: list[tuple[float, int, AgentState | VectorKey, tuple[str, ...]]] = [(0.0, 0, state, ())]
         if state != self.start:
@@ -167,7 +168,9 @@ class VectorMap:
         return None
 
     def leads_to(self, state: AgentState, name: str) -> AgentState | None:
-        """Return the state to which the input leads according to the map, or None if the map does not contain it."""
+        """Return the state to which the input leads according to the map. Return None if the map does not contain the
+        input.
+        """
         return next((after for each, after, _ in self._edges_from(state) if each == name), None)
 
     def _edges_from(self, state: AgentState) -> Iterator[tuple[str, AgentState, float]]:
@@ -189,7 +192,7 @@ class AgentTour:
         self._passed = passed
 
     async def run(self, until: float) -> SuspectedFailure | None:
-        """Play until the agent deviates or nothing remains, at most until the second `until` of the monotonic clock.
+        """Play tests until the agent deviates, no test remains, or the monotonic clock reaches the second `until`.
 
         Return the deviation, or None if the agent did not deviate.
         """
@@ -231,7 +234,7 @@ class AgentTour:
             self._claim = None
 
     def _next_input(self) -> str | None:
-        """Return the name of the next input, or None if this agent should stop here."""
+        """Return the name of the next input. Return None if this agent should stop here."""
         state = state_of(self._agent.model)
         if self._agent.timer_is_near:
             self._discard_plan()

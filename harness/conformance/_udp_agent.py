@@ -231,7 +231,7 @@ class UdpAgent(AgentUnderTest):
         received: Sequence[tuple[float, bytes]],
         status: Mapping[str, Any],
     ) -> bool:
-        """Return true if timers that expired before or after the input explain the messages and the status.
+        """Return true if timers that expired shortly before or after the input explain the agent's messages and status.
 
         If so, the model then is in the state of the agent.
         """
@@ -257,7 +257,7 @@ class UdpAgent(AgentUnderTest):
         return False
 
     async def _status(self) -> dict[str, Any]:
-        """Return the status of the agent, or an empty status if the agent does not answer."""
+        """Return the status of the agent. Return an empty status if the agent does not answer."""
         try:
             return await self.process.ask("status")
         except (AgentEndedError, AgentRefusedError):
@@ -268,8 +268,8 @@ class UdpAgent(AgentUnderTest):
         return deadline is not None and self._wall_s(deadline) - time.time() < self._timing.early_s
 
     async def _wait_for_timer(self, until: float, name: str) -> str | None:
-        """Wait until the timer expires or a message arrives. If the message is too early, return a sentence about
-        it.
+        """Wait until the timer expires or a message arrives. Return a sentence if the message is too early. Otherwise
+        return None.
         """
         while time.time() < until and not self.peer_socket.received:
             await self.peer_socket.arrival(until)
@@ -280,11 +280,13 @@ class UdpAgent(AgentUnderTest):
         return None
 
     def _first_arrival_s(self) -> float:
-        """Return the mission second of the first received message, or 0 if there is none."""
+        """Return the mission second of the first received message. Return 0 if no message has arrived."""
         return self._mission_s(self.peer_socket.received[0][0]) if self.peer_socket.received else 0.0
 
     async def _give(self, action: Action) -> list[Any]:
-        """Give the input to the agent. After the input of an event, return the deque in the agent's export."""
+        """Give the input to the agent. If the input is an event, return the deque in the agent's export. Otherwise
+        return an empty list.
+        """
         match action:
             case PeerDatagram():
                 self.peer_socket.send(action.data)
@@ -341,7 +343,7 @@ class UdpAgent(AgentUnderTest):
 
 
 def _end(error: Exception) -> str | None:
-    """Return a description of how the agent ended, or None if a slow machine may be the cause of the error."""
+    """Return a description of how the agent ended. Return None if a slow machine may be the cause of the error."""
     return str(error) if isinstance(error, AgentHangsError | AgentExitedError) else None
 
 
@@ -350,7 +352,7 @@ def _contents(received: Sequence[tuple[float, bytes]]) -> list[bytes]:
 
 
 def _messages(datagrams: Iterable[bytes]) -> list[Message] | None:
-    """Return the decoded messages, or None if a datagram is malformed."""
+    """Return the decoded messages. Return None if a datagram is malformed."""
     try:
         return [decode(data).message for data in datagrams]
     except MalformedDatagramError:
@@ -372,7 +374,7 @@ def _expire(model: ReferenceModel, now: float) -> list[bytes]:
 def log_same_block(
     model: ReferenceModel, action: LoggedEvent, now: float, waiting: list[Any]
 ) -> tuple[ExpectedOutcome, list[str]]:
-    """Give the reference an event with the agent's timestamp, so that both complete the same block.
+    """Give the reference an event with the agent's timestamp, so that agent and reference complete the same block.
 
     `waiting` is the deque of the agent's export. Return the outcome, and sentences about a wrong block.
     """

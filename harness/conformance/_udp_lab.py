@@ -52,11 +52,11 @@ class NoAgentError(HarnessError):
 
 
 class AgentEndedError(Exception):
-    """An error: the agent ended by itself, or does not answer. The message describes the end."""
+    """An error: the agent ended without a request, or does not answer. The message describes the end."""
 
 
 class AgentExitedError(AgentEndedError):
-    """An error: the process of the agent ended by itself."""
+    """An error: the process of the agent ended without a request."""
 
 
 class AgentHangsError(AgentEndedError):
@@ -65,7 +65,7 @@ class AgentHangsError(AgentEndedError):
 
 class UdpLab:
     """A virtual network in which `count` agents can be tested at once. Open it with `async with`. `take_port` reserves
-    a port.
+    a UDP port for an agent.
     """
 
     def __init__(self, place: Path, command: Sequence[str], count: int) -> None:

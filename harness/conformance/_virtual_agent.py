@@ -142,7 +142,9 @@ class VirtualProgram:
         return answer
 
     async def finish(self) -> str:
-        """End the input of the process, and return how the process ends: "status 0" if it follows the contract."""
+        """Close the input of the process, and return a phrase about its end. The phrase is "status 0" if the agent
+        follows the contract.
+        """
         self._input.close()
         with suppress(TimeoutError):
             await asyncio.wait_for(_wait_for_end(self._process), ANSWER_LIMIT_S)
@@ -172,8 +174,8 @@ async def _wait_for_end(process: subprocess.Popen[bytes]) -> None:
 
 
 class VirtualTimeAgent(AgentUnderTest):
-    """An agent in virtual time, from one start to its end. Afterwards its process is added to the list `idle`, if there
-    is one.
+    """An agent in virtual time, from one start to its end. At its end, its process can be added to the list `idle` for
+    reuse.
     """
 
     def __init__(self, variant: SettingsVariant, program: VirtualProgram, idle: list[VirtualProgram] | None) -> None:
@@ -268,7 +270,7 @@ def _same_instant(announced_s: Any, expected_s: float | None) -> bool:
 
 
 async def case_of_end(programs: Sequence[VirtualProgram]) -> CaseResult:
-    """End the inputs of these processes, and return the result of the test case about their exit status."""
+    """Close the inputs of these processes, and return the result of the test case about their exit status."""
     ends = [await program.finish() for program in programs]
     wrong = next((end for end in ends if end != RIGHT_END), None)
     if wrong is None:
@@ -278,8 +280,8 @@ async def case_of_end(programs: Sequence[VirtualProgram]) -> CaseResult:
 
 
 def starter(command: Sequence[str], errors: Path) -> tuple[Start, list[VirtualProgram]]:
-    """Return a function that starts agents in virtual time, and the list of idle processes that must be closed at the
-    end.
+    """Return a function that starts agents in virtual time, and a list of idle processes. The caller must close these
+    at the end.
     """
     idle: list[VirtualProgram] = []
 

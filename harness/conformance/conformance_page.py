@@ -1,4 +1,4 @@
-"""Write a table of agents and Algorithms with test results, as one HTML file that needs no other files."""
+"""Write a table of agents and Algorithms with test results, as a single HTML file."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -57,7 +57,9 @@ def read_agents(path: Path) -> dict[str, list[str]]:
 
 
 def to_html(results: Mapping[str, ConformanceResults | str]) -> str:
-    """Return the conformance results as an HTML page. Agents that could not be tested have a sentence instead."""
+    """Return the conformance results as an HTML page. For an agent that could not be tested, the page contains a
+    sentence.
+    """
     tested = {name: result for name, result in results.items() if isinstance(result, ConformanceResults)}
     rows = {name: {row.algorithm: row for row in result.rows()} for name, result in tested.items()}
     numbers = [number for number in (*sorted(TITLES), FURTHER_CHECKS) if any(number in each for each in rows.values())]

@@ -74,7 +74,7 @@ class CaseResult:
 
 @dataclass
 class AlgorithmCounts:
-    """The number of test cases of one Algorithm with each verdict."""
+    """The number of test cases of one Algorithm, by verdict."""
 
     algorithm: int
     passed: int = 0

@@ -1,4 +1,4 @@
-"""A directory in memory for secrets, which disappears even if this process is killed.
+"""Keep secrets in a directory in memory. The directory is removed even if this process is killed.
 
 A file in `/tmp` may reach a disk, and stays after SIGKILL. The directory is therefore in `/dev/shm`. A guard process
 reads a pipe that only this process writes, and removes the directory when the kernel closes the pipe.
@@ -18,7 +18,7 @@ _GUARD = 'trap "" HUP INT QUIT TERM; read _; rm -rf -- "$1"'
 
 @contextmanager
 def memory_directory(prefix: str) -> Iterator[Path]:
-    """Create the directory, and remove it afterwards. Raises OSError.
+    """Create a directory in memory for the context, and remove it at the end. Raises OSError.
 
     Without `/dev/shm`, it is in the directory for temporary files.
     """
@@ -35,7 +35,7 @@ def memory_directory(prefix: str) -> Iterator[Path]:
 
 @contextmanager
 def no_core_files() -> Iterator[None]:
-    """Let this process, and programs that it starts, write no core files inside the context."""
+    """Prevent core files inside the context, for this process and for the programs that it starts."""
     before = resource.getrlimit(resource.RLIMIT_CORE)
     resource.setrlimit(resource.RLIMIT_CORE, (0, before[1]))
     try:

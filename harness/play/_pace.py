@@ -22,7 +22,7 @@ class VirtualTimePace:
     """
 
     def __init__(self, factor: float | None = None, *, paused: bool = False) -> None:
-        """Set the initial speed. `factor` is the number of mission seconds per second of wall time, or None for
+        """Set the initial speed. `factor` is the number of mission seconds per second of wall time. None means
         unlimited speed.
         """
         self.factor = factor
@@ -37,7 +37,7 @@ class VirtualTimePace:
 
     @property
     def stops_at_next_run(self) -> bool:
-        """True if the present step ends at the next handler run."""
+        """True if the current single step of virtual time ends at the next handler run."""
         return self._step is not None and self._step_to_s == NEXT_RUN
 
     def set_factor(self, factor: float | None) -> None:
@@ -86,7 +86,7 @@ class VirtualTimePace:
         self.end_step()
 
     async def allowed_until(self, now_s: float) -> float | None:
-        """Return the mission second up to which time may advance now, or None if there is no limit.
+        """Return the mission second up to which virtual time may advance now. Infinity means that there is no limit.
 
         If time may not advance now, wait for a short time and return None.
         """

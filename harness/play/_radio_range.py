@@ -40,8 +40,8 @@ class RadioRange:
         return replace(change, losses=self._set_losses({}) if change.clears_all else {}, conditions=self._conditions())
 
     def move(self, at_s: float, places: Mapping[int, Place]) -> NetworkChange | None:
-        """Move the vehicles to these positions. Return the resulting network change, or None if the network stays the
-        same.
+        """Move the vehicles to these positions. Return the resulting network change. Return None if the network stays
+        the same.
         """
         if self._radio is None:
             return None

@@ -27,14 +27,14 @@ _WORD_BITS = 32
 class _SentFrame(Protocol):
     @property
     def sequence(self) -> int | None:
-        """The sequence number of an agent's message, or None for another sender's datagram."""
+        """The sequence number of the message in the frame. None if the frame does not contain a message of an agent."""
 
 
 Message = TypeVar("Message", bound=_SentFrame)
 
 
 class ChannelTraffic(Generic[Message]):
-    """A shared radio channel of all agents, with the messages that wait for it or are being sent."""
+    """The messages on a radio channel that all agents share. They wait for the channel, or are in transmission."""
 
     def __init__(
         self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int, journal: Journal | None
@@ -104,7 +104,9 @@ class ChannelTraffic(Generic[Message]):
 
 
 class ChannelTotals:
-    """Counts of sent frames, of lost and received frames by receiver, and of the channel's load over time."""
+    """Counts of a shared channel: sent frames, lost frames by receiver, dropped messages by sender, and its load over
+    time.
+    """
 
     def __init__(self, roster: Sequence[int]) -> None:
         self.frames = 0
@@ -134,7 +136,7 @@ class ChannelTotals:
         self._drops.setdefault(fate, Counter())[sender] += 1
 
     def _occupy(self, began_at: float, ended_at: float) -> None:
-        """Add an interval in which the channel was busy to the load over time."""
+        """Add a time interval to the load of the channel. The channel was busy during this interval."""
         while began_at < ended_at:
             index = int(began_at / LOAD_S)
             until = min(ended_at, (index + 1) * LOAD_S)
@@ -160,7 +162,8 @@ class ChannelTotals:
 
 
 class BitCounter:
-    """A counter for sets of small numbers. Each set is an integer whose bits are its members.
+    """A counter for sets of small numbers. For each number, it counts the sets that contain the number. A set is given
+    as an integer with a bit for each member.
 
     The counts are kept in binary, each digit of all counts as one integer. To add a set is then a ripple-carry addition
     of all bits at once, which takes two steps on average, for any number of bits.

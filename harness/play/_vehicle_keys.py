@@ -38,18 +38,18 @@ class MissionKeys:
         return next(iter(self.bundles.values())).public
 
     def add_depot_key(self, initial_data: bytes) -> bytes:
-        """Return the data of the inception block. If event data are encrypted, they include the public key for the
-        depot.
+        """Return the data of the inception block. If event data are encrypted, the result includes the public key for
+        the depot.
         """
         return seal_to(initial_data, self.public.depot) if self.seals and self.public.depot else initial_data
 
     def revoke(self, agent_id: int) -> bytes:
-        """Return the signed message body that excludes this vehicle."""
+        """Return the signed message body that excludes this vehicle from the mission."""
         return self.authority.revoke(agent_id)
 
 
 def mission_keys(scenario: Scenario, secret: bytes) -> MissionKeys | None:
-    """Return the keys of the mission, or None if the mission is not secured.
+    """Return the keys of the mission. Return None if the mission is not secured.
 
     Fresh keys are derived from `secret`, which has 32 bytes. Raises ScenarioError for unusable keys, and MachineError
     if the package cryptography is missing.
@@ -86,7 +86,7 @@ def require_key_packages(scenario: Scenario) -> None:
 
 
 def refuse_revocations(scenario: Scenario) -> None:
-    """Raise ScenarioError if the scenario excludes a vehicle and this machine lacks the key to sign that message."""
+    """Raise ScenarioError if the scenario excludes a vehicle and this machine lacks the key that signs this message."""
     mission_keys(scenario, bytes(FRESH_BYTES))
 
 
@@ -117,8 +117,8 @@ def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
 
 
 def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Scenario) -> "RevocationAuthority":
-    """Return the authority that excludes vehicles, from its key in the directory. Raises ScenarioError if the key is
-    missing.
+    """Return the authority that can exclude vehicles, from its key file in the directory. Raises ScenarioError if the
+    file is missing.
     """
     from harness.play.keyring.key_directory import REVOCATION_NAME, KeyDirectory, KeysError, RevocationAuthority, listed
 
@@ -144,8 +144,8 @@ class KeyDirectories:
         self.directories = {agent_id: directory / str(agent_id) for agent_id in (keys.bundles if keys else ())}
 
     def write_bundle(self, agent_id: int, *, kept: bool) -> Path | None:
-        """Write the file with the vehicle's keys, and return its path. `kept` keeps an existing file. Raises
-        OSError.
+        """Write the file with the vehicle's keys, and return its path. If `kept` is true, an existing file stays
+        unchanged. Raises OSError.
         """
         if self.keys is None:
             return None

@@ -40,7 +40,7 @@ def resolve_command(command: Sequence[str], what: str) -> list[str]:
 
 
 def _interpreter(program: Path) -> Path | None:
-    """Return the interpreter that the first line of a script names, or None if the file is not a readable script."""
+    """Return the interpreter that the first line of a script names. Return None if the file is no readable script."""
     try:
         with program.open("rb") as file:
             line = file.readline(FIRST_LINE_BYTES)
@@ -69,7 +69,7 @@ _SHELL_ERROR = re.compile(
 
 
 def last_line_in(log: Path) -> str:
-    """Return the last line of the file that contains text, or an empty string."""
+    """Return the last line of the file that contains text. Return an empty string if there is no such line."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - TAIL_BYTES))
@@ -96,14 +96,14 @@ VERSION_CHARACTERS = 80
 
 
 def _version_line(version: Any) -> str | None:
-    """Return the version that an agent reports, as one printable line, or None if it is not text."""
+    """Return the version that an agent reports, as one printable line. Return None if the version is not text."""
     if not isinstance(version, str):
         return None
     return " ".join("".join(filter(str.isprintable, word)) for word in version.split())[:VERSION_CHARACTERS] or None
 
 
 class AgentStatus(BaseModel):
-    """The status of an agent as it reports it (see ucp/contract/CONTRACT.md). Optional fields have a default."""
+    """The status that an agent reports (see ucp/contract/CONTRACT.md). Optional fields have a default."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -196,7 +196,7 @@ class AgentControl:
 
 
 async def connect(socket_path: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Open a socket whose answers are single lines. Raises OSError."""
+    """Connect to the control socket, which gives each answer as one line. Raises OSError."""
     # The address of a socket has at most 107 bytes, and the path of a run directory may be longer.
     directory = os.open(socket_path.parent, os.O_PATH)
     try:

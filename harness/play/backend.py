@@ -35,7 +35,9 @@ class Backend(ABC):
         """Raise HarnessError if this backend or this machine cannot play the scenario. The message names a solution."""
 
     def remark(self, scenario: Scenario) -> str | None:
-        """Return a sentence about a part of the scenario that this backend plays differently, or None."""
+        """Return a sentence about a part of the scenario that this backend plays differently from other backends.
+        Return None if there is no difference.
+        """
         return None
 
     @abstractmethod
@@ -64,8 +66,8 @@ class Backend(ABC):
 
 
 def agent_seed(seed: int, agent_id: int, incarnation: int = 1) -> int:
-    """Return the seed for the events and deliberate errors of an agent. Each restart of the agent has a different
-    one.
+    """Return the seed for the events and deliberate errors of an agent. The agent gets a different seed at each
+    restart.
     """
     again = f" life {incarnation}" if incarnation > 1 else ""
     return Random(f"{seed}/agent {agent_id}{again}").getrandbits(63)

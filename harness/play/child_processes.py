@@ -27,7 +27,8 @@ _PASSED_ON_PREFIXES = ("LC_", "LD_", "PYTHON", "UCP_", "XDG_", "ROS_", "RMW_", "
 
 
 def passed_on(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables that programs of a run get: those that they need to start.
+    """Return the environment variables that the harness passes to the programs of a run, because they need them to
+    start.
 
     The user's environment may contain secrets, such as tokens, and an agent may be a program of another author.
     """

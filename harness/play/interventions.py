@@ -133,12 +133,13 @@ class Interventions(GrowingTimeline):
 
     @property
     def closed(self) -> str | None:
-        """The reason why requests are impossible, or None while they are possible."""
+        """The reason why the user cannot request events now. None if requests are possible."""
         return self._closed
 
     @property
     def prepares_all_agents(self) -> bool:
-        """True if all agents are prepared for requests, for example with a disk so that they can reboot.
+        """True if all agents are prepared for any event by hand. For example, each agent has a disk, so that it can
+        reboot.
 
         False if the swarm has foreign agents, because they may not support this.
         """
@@ -160,10 +161,10 @@ class Interventions(GrowingTimeline):
         return self.pace.factor if self.pace is not None else self.scenario.speedup
 
     def ask(self, entry: Mapping[str, Any]) -> Future[float]:
-        """Request an event, given as an entry of a timeline without `at_s`. The future returns the mission second at
-        which it happens.
+        """Request an event. `entry` is a timeline entry without `at_s`. The future returns the mission second at which
+        the event happens.
 
-        The answer raises ScenarioError if the entry is impossible. Then it changes nothing.
+        The future raises ScenarioError if the event is impossible. The run then stays as it is.
         """
         answer: Future[float] = Future()
         with self._lock:
@@ -341,7 +342,8 @@ class Interventions(GrowingTimeline):
                 timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
 
     def _refuse_unprepared(self, entry: TimelineEntry) -> None:
-        """Raise ScenarioError if the agents would have needed preparation at the start of the run for this entry.
+        """Raise ScenarioError if the entry needs a preparation of agents at the start of the run, and this did not
+        happen.
 
         Also raise it for a revocation that this machine cannot sign.
         """

@@ -53,8 +53,8 @@ class RunOutcome:
         self.exit_status = error.exit_status
 
     def record(self, change: dict[str, Any]) -> None:
-        """Record a change of the network, or a fault. A movement of vehicles is recorded only if it changes which of
-        them can receive each other.
+        """Record a network change, a fault or an injection. A movement of vehicles is recorded only if it changes which
+        of them can receive each other.
         """
         if change["what"] == RANGE and self.network and _same_connections(change, self.network[-1]):
             return
@@ -66,7 +66,9 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class SoughtRun:
-    """A description of a handler run for which a caller waits. None as the branch or agent means any."""
+    """A description of a handler run for which a caller waits. If `branch` or `agent` is None, any branch or agent
+    matches.
+    """
 
     handler: str
     branch: str | None = None
@@ -97,30 +99,32 @@ class Swarm(Protocol):
     async def until(self, mission_s: float) -> None: ...
 
     async def until_run(self, sought: SoughtRun, mission_s: float) -> int | None:
-        """Wait until an agent runs this handler, or until `mission_s`. Return the agent's ID, or None if no agent ran
-        it.
+        """Wait until an agent runs this handler, at most until `mission_s`. Return the ID of the agent. Return None if
+        no agent ran the handler.
 
         Handler runs that the last change caused also count, and with processes all runs since the last `until`.
         """
 
     async def apply(self, change: Change) -> None:
-        """Apply a change of the network or a fault, and record it in `played`."""
+        """Apply a network change, a fault or an injection, and record it in `played`."""
 
     async def hold(self, fate: Fate) -> int:
-        """Hold back the messages that match `fate`, from its `from_s` on. Return a number with which `release` ends
-        this.
+        """Hold back the messages that match `fate` and are sent at `fate.from_s` or later. Return the number of this
+        hold for `release`.
 
         Raises ScenarioError if messages cannot be held here.
         """
 
     async def release(self, number: int, fate: Fate) -> None:
-        """Stop holding back messages at the times `until_s` and `hold_until_s` of `fate`."""
+        """End the hold with this number. Messages that are sent before `fate.until_s` arrive at `fate.hold_until_s` or
+        later.
+        """
 
     async def stop_events(self) -> None: ...
 
     async def until_idle(self, limit_s: float) -> bool:
-        """Wait until all living agents are idle and no message is on its way. Return false if that takes until
-        `limit_s`.
+        """Wait until all living agents are idle and no message is on its way. Return false if this takes longer than
+        `limit_s` mission seconds.
         """
 
     async def keep_chains(self) -> None:

@@ -1,4 +1,5 @@
-"""Display an active run: mission time, chain lengths and reconciling agents, and later the progress of the checker.
+"""Display an active run: mission time, chain lengths and reconciling agents. After the mission, display the progress of
+the checker.
 
 A terminal shows a live table. Other outputs, such as CI logs, get a line every few seconds.
 """
@@ -36,13 +37,13 @@ class ProgressDisplay(Protocol):
 
     def show(self, snapshot: SwarmSnapshot) -> None: ...
     def show_judging(self, step: str) -> None:
-        """Show a step of the judging after the mission, such as "reading trace 3 of 50"."""
+        """Show the current step of the checker after the mission, such as "reading trace 3 of 50"."""
 
     def close(self) -> None: ...
 
 
 class SilentProgress:
-    """A display without output, for use by other programs."""
+    """A display without output. Programs use it when they call the harness."""
 
     def show(self, snapshot: SwarmSnapshot) -> None:
         pass

@@ -1,4 +1,4 @@
-"""Accept requests from other processes to an active run, through a socket in the run directory.
+"""Accept requests to an active run from programs outside the run, through a socket in the run directory.
 
 Requests and answers are lines of JSON, as on an agent's control socket. `ask_run` is the client:
 

@@ -45,8 +45,8 @@ def estimated_bytes(scenario: Scenario, *, all_delivered: bool) -> int:
 
 
 def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) -> tuple[str, str]:
-    """Return a remark on large traces, and a warning if the traces will probably not fit. Both texts are empty for
-    small traces.
+    """Return a remark on large traces, and a warning if the traces will probably not fit on the disk. Small traces give
+    two empty texts.
     """
     expected = estimated_bytes(scenario, all_delivered=all_delivered)
     quota = trace_quota(scenario, directory) * len(scenario.roster)
@@ -64,7 +64,9 @@ def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) 
 
 
 def _messages_per_minute(agents: int) -> float:
-    """Interpolate on a logarithmic scale. Beyond the table, continue its last or first step."""
+    """Return the messages per minute of a swarm with this number of agents. The function interpolates the table on a
+    logarithmic scale, and extrapolates beyond its ends.
+    """
     steps = [*pairwise(MESSAGES_PER_MINUTE)]
     (low, few), (high, many) = next((step for step in steps if agents <= step[1][0]), steps[-1])
     exponent = math.log(many / few) / math.log(high / low)

@@ -43,8 +43,8 @@ class VariantError(HarnessError):
 
 @dataclass(frozen=True)
 class CoreChange:
-    """A variant's new handler for one algorithm of the agents. The other fields add to the declarations of the original
-    handler.
+    """A variant's new handler for one algorithm of the agents. The fields after `run` extend the declarations of the
+    original handler.
     """
 
     algorithm: int
@@ -90,7 +90,7 @@ def of_core(
 
 
 def of_reference(algorithm: int) -> Callable[[Callable[..., str]], ReferenceChange]:
-    """Return a decorator that declares a function as the algorithm in the reference implementation."""
+    """Return a decorator that declares a function as the new version of an algorithm in the reference."""
     return lambda run: ReferenceChange(algorithm, run)
 
 
@@ -160,7 +160,7 @@ _in_use: list[Variant] = []
 
 
 def variant_in_use() -> Variant | None:
-    """Return the variant that this process uses, or None for the original protocol."""
+    """Return the variant that this process uses. Return None if the process uses the original protocol."""
     return _in_use[-1] if _in_use else None
 
 
@@ -173,8 +173,8 @@ class NumberedHandler(Protocol):
 
 @contextmanager
 def replaced(tables: list[MutableMapping[Any, Any]], new: Mapping[int, Callable[[Any], Any]]) -> Iterator[None]:
-    """Replace the handlers of these algorithms in all tables inside the context. Each function in `new` receives the
-    old handler.
+    """Replace the handlers of these algorithms in all tables inside the context. Each function in `new` turns the
+    original handler into its replacement.
     """
     before = [dict(table) for table in tables]
     made: dict[int, Any] = {}

@@ -31,7 +31,7 @@ OWN_KEYS = ("preset", "processing_s")
 
 
 class ChannelModel(StrictModel):
-    """A radio channel that all vehicles share. Each key replaces a figure of the preset."""
+    """A radio channel that all vehicles share. The other keys replace numeric values of the preset."""
 
     preset: Preset
     """Radio whose figures apply: 802.11 ad hoc at 1, 6 or 11 Mbit/s, a telemetry radio with time slots (RFD900 class),
@@ -110,7 +110,9 @@ class ChannelModel(StrictModel):
     """LoRa: symbols of the preamble, without the 4.25 symbols that follow."""
 
     def radio(self) -> "Radio":
-        """Return the radio model. Raises ValueError for a key of another kind of radio, or a value out of range."""
+        """Return the radio model. Raises ValueError for a value out of range, or for a key that this kind of radio does
+        not have.
+        """
         from dataclasses import fields, replace
 
         from netem.channel import PRESETS
@@ -123,7 +125,7 @@ class ChannelModel(StrictModel):
         return replace(radio, **self._figures())
 
     def to_json(self) -> dict[str, Any]:
-        """Return the preset, the processing time and all figures of the radio model as JSON."""
+        """Return the preset, the processing time and all numeric values of the radio model as JSON."""
         from dataclasses import asdict
 
         return {**{key: getattr(self, key) for key in OWN_KEYS}, **asdict(self.radio())}

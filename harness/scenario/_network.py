@@ -110,7 +110,7 @@ class RandomDelay(StrictModel):
 
 
 def _number_or(mapping: type[StrictModel], number: Any) -> BeforeValidator:
-    """Return a validator for either a mapping or a number, so that an error message concerns only one of them."""
+    """Return a validator for a mapping or a number. An error message then concerns only the kind of the given value."""
     numbers = TypeAdapter(number)
 
     def choose(value: Any) -> Any:
@@ -120,7 +120,7 @@ def _number_or(mapping: type[StrictModel], number: Any) -> BeforeValidator:
 
 
 def _or_none(number: Any) -> BeforeValidator:
-    """Return a validator for either the word none or a number, so that an error message concerns only the number."""
+    """Return a validator for the word none or a number. An error message then concerns only the number."""
     numbers = TypeAdapter(number)
     return BeforeValidator(lambda value: value if value == "none" else numbers.validate_python(value))
 
@@ -141,7 +141,9 @@ VehicleIds = Annotated[
 
 
 class ConditionOverrides(StrictModel):
-    """Conditions that replace those of the layer below. A missing key keeps the value of the layer below."""
+    """Network conditions that replace those of an earlier or more general setting. A missing key keeps the value of
+    that setting.
+    """
 
     loss: Loss | None = None
     """Probability that a message is lost, or loss in bursts."""
@@ -168,11 +170,11 @@ KEYS = tuple(ConditionOverrides.model_fields)
 
 
 class ReceiverOverrides(ConditionOverrides):
-    """Conditions of all messages to one vehicle. A missing key keeps the value of the whole network."""
+    """Network conditions for all messages to one vehicle. A missing key keeps the value of the whole network."""
 
 
 class LinkOverrides(ConditionOverrides):
-    """Conditions of the links from each vehicle of `from` to each vehicle of `to`.
+    """Network conditions of the links from each vehicle of `from` to each vehicle of `to`.
 
     A missing key keeps the value of the receiver. Two entries for the same link are an error.
     """
@@ -252,7 +254,9 @@ class NetworkDisturbance(StrictModel):
 
 
 class NetworkModel(StrictModel):
-    """Network conditions. Each receiver of a message draws separately. A broadcast may reach some receivers only."""
+    """Network conditions. Loss and delay are drawn at random for each receiver, so a broadcast may reach only some
+    receivers.
+    """
 
     loss: Loss = 0.0
     """Probability that a message is lost, or loss in bursts."""
@@ -296,7 +300,7 @@ class NetworkModel(StrictModel):
         return {None: {key: getattr(self, key) for key in KEYS}, **_values_of(self.receivers, self.links)}
 
     def conditions(self, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
-        """Return the network conditions. Raises ConditionsError if they contradict each other."""
+        """Return the network conditions of all links. Raises ConditionsError if values contradict each other."""
         return conditions_of(self.by_scope(), partition)
 
 
@@ -323,7 +327,7 @@ def _values_of(receivers: Mapping[int, ReceiverOverrides], links: Sequence[LinkO
 
 
 def overlay(network: NetworkValues, layer: NetworkValues) -> NetworkValues:
-    """Return the network conditions, with values replaced by those of the layer."""
+    """Return the network conditions after the values in `layer` have replaced some of them."""
     return {scope: network.get(scope, {}) | layer.get(scope, {}) for scope in (*network, *layer)}
 
 
@@ -335,7 +339,7 @@ def scope_in_words(scope: Scope) -> str:
 
 
 def conditions_of(network: NetworkValues, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
-    """Return network conditions from single values. Raises ConditionsError if the values contradict each other."""
+    """Combine single values to network conditions. Raises ConditionsError if the values contradict each other."""
     for_all = network[None]
     conditions: dict[Scope, LinkConditions] = {}
     known: dict[tuple[Any, ...], LinkConditions] = {}  # of many links there are few kinds

@@ -62,7 +62,7 @@ AgentCommand = Annotated[Command | dict[VehicleKey, Command] | None, BeforeValid
 
 
 class QuirkOfAgents(StrictModel):
-    """A quirk of some agents only."""
+    """A deliberate error (quirk) that only some agents make."""
 
     agents: Annotated[list[VehicleId], Field(min_length=1)]
     """IDs of the agents that make the mistake."""
@@ -94,14 +94,14 @@ QuirkValues = Annotated[dict[str, QuirkValue], WithJsonSchema(_schema())]
 
 
 def check_quirks(asked: Mapping[Any, Any]) -> None:
-    """Raise ValueError if a deliberate error (quirk) does not exist or cannot have its value."""
+    """Raise ValueError if a deliberate error (quirk) of this name does not exist, or if its value is not allowed."""
     for name, quirk in asked.items():
         value = quirk.get("value", True) if isinstance(quirk, Mapping) else quirk
         check_quirk(str(name), value.value if isinstance(value, QuirkOfAgents) else value)
 
 
 def quirks_of_agent(asked: Mapping[str, bool | float | QuirkOfAgents], agent_id: int) -> Quirks:
-    """Return the deliberate errors (quirks) in the mission file of this agent."""
+    """Return the deliberate errors (quirks) of this agent, as its mission file contains them."""
     own: Quirks = {}
     for name, value in asked.items():
         if not isinstance(value, QuirkOfAgents):
@@ -153,8 +153,8 @@ Stagger = dict[Staggered, Annotated[float, Field(ge=0, le=MAX_TIMER_S)]]
 
 
 def staggered(settings: Settings, stagger: Mapping[Staggered, float], place: int) -> Settings:
-    """Return the settings of the agent at index `place`. Its timers differ by `stagger`. Raises ValueError if one is
-    too long.
+    """Return the settings of the agent at index `place`. Each timer in `stagger` is longer by `place` times the given
+    step. Raises ValueError if a timer is too long.
     """
     longer = {name: getattr(settings, name) + step_s * place for name, step_s in stagger.items() if step_s}
     return dataclasses.replace(settings, **longer) if longer else settings
@@ -167,7 +167,7 @@ MAX_DATA_CHARACTERS = 1400
 
 
 class ScriptedEvent(StrictModel):
-    """One event that an agent logs: zero bytes of a given number, or the data of a recorded event."""
+    """One event that an agent logs. Its data are a given number of zero bytes, or the data of a recorded event."""
 
     at_s: MissionSecond
     """Mission second at which the agent logs the event."""

@@ -1,4 +1,4 @@
-"""Parse the option `--ucp-agent [ID=]COMMAND`, which chooses other programs as the agents of a scenario."""
+"""Parse the option `--ucp-agent [ID=]COMMAND`, which selects the programs of the agents of a scenario."""
 
 import re
 import shlex
@@ -27,7 +27,7 @@ def programs_of(options: Iterable[str]) -> Programs:
 
 
 def command_keys(scenario: Scenario, programs: Programs) -> dict[str, Any]:
-    """Return the scenario keys that select these programs. Without programs, there are none."""
+    """Return the scenario keys that select these programs. The result is empty if there are no programs."""
     if not programs:
         return {}
     others = programs.get(None)

@@ -25,7 +25,9 @@ NO_MORE_FATES = "no more fates"
 
 @dataclass(frozen=True)
 class NetworkChange:
-    """New network conditions from mission second `at_s` on, with a name (`what`) and a description (`detail`)."""
+    """A change of the network at mission second `at_s`, with a name (`what`), a description (`detail`) and the new
+    conditions.
+    """
 
     at_s: float
     what: str
@@ -83,7 +85,7 @@ Change = NetworkChange | Fault | TimedInjection
 
 
 def timeline_of(scenario: Scenario) -> list[Change]:
-    """Return all changes of the scenario in order of time. The first is the initial state of the network."""
+    """Return all changes of the scenario in order of time. The first change sets the initial state of the network."""
     first, *states = _network_states(scenario)
     return [
         first,
@@ -98,7 +100,9 @@ def injections_of(scenario: Scenario) -> list[TimedInjection]:
 
 
 def silent_injections(begun: Sequence[TimedInjection], sent: Mapping[int, int]) -> list[str]:
-    """Return a sentence for each injection that sent nothing. `sent` contains the number of datagrams by injection."""
+    """Return a sentence for each injection that sent nothing. `sent` maps the number of an injection to its datagram
+    count.
+    """
     return [
         f"{injected.what} at {injected.at_s:g} s ({injected.detail}) sent nothing, for nothing like it was heard"
         for injected in begun
@@ -107,7 +111,7 @@ def silent_injections(begun: Sequence[TimedInjection], sent: Mapping[int, int]) 
 
 
 def _network_states(scenario: Scenario) -> list[Change]:
-    """Return all states of the network. Changes at the same time form one state."""
+    """Return all changes of the network in order of time. Changes at the same time are combined into one."""
     changes = [_change(step.at_s, step.what, step.network.conditions()) for step in scenario.network_steps()]
     if (channel := scenario.network.channel) is None:
         return [*changes]
@@ -116,8 +120,8 @@ def _network_states(scenario: Scenario) -> list[Change]:
 
 
 def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the records of network changes, marked as not fully connected until `at_s`, when scripted deliveries
-    end.
+    """Return the records of network changes. Those before the end of scripted deliveries at `at_s` are marked as not
+    fully connected.
     """
     since = round(at_s + 0.001, 3)  # include messages of the same instant
     before = [{**state, "fully_connected": False} for state in network if state["at_s"] < since]
@@ -127,7 +131,9 @@ def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[
 
 
 def final_reconcile(at_s: float) -> NetworkChange:
-    """Return the change that removes all network conditions, so that all messages arrive."""
+    """Return the network change for the final reconcile. It removes all network conditions, so that all messages
+    arrive.
+    """
     return replace(_change(at_s, FINAL_RECONCILE, NetworkConditions()), clears_all=True)
 
 

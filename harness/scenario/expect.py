@@ -1,4 +1,5 @@
-"""Describe the expected results of a scenario: verdicts, figures, chains and deviations, by backend and seed.
+"""Describe the expected results of a scenario: verdicts, numeric results, chains and deviations. Name the backends and
+seeds to which they apply.
 
 expect:
   characteristics: {1: holds, 5: holds, 6: not applicable}
@@ -75,7 +76,7 @@ def _known_number(key: Any) -> int:
 
 
 class NumberRange(StrictModel):
-    """A range of numbers. Needs `min`, `max`, or both. A single number is short for a range from it to itself."""
+    """A range of numbers. Needs `min`, `max`, or both. A single number in its place means exactly this number."""
 
     min: Number | None = None
     """Lowest allowed value."""
@@ -189,7 +190,7 @@ class Expect(StrictModel):
         return values
 
     def verdict(self, key: str) -> str | None:
-        """Return the expected verdict of a check, or None if the scenario expects none."""
+        """Return the expected verdict of a check. Return None if the scenario expects none."""
         if key in FURTHER_CHECKS:
             expected: str | None = getattr(self, key)
             if key == "steps" and self.deviations:
@@ -202,8 +203,9 @@ class Expect(StrictModel):
         return kind_of(verdict) != "bad" if expected is None else verdict == expected
 
     def remark(self, key: str, verdict: str) -> str:
-        """Return "as expected" for an expected verdict that is not good, "expected: holds" for another verdict than the
-        expected one, and else ""."""
+        """Return the words that follow a verdict: "as expected" if it is expected although it is not good, "expected:
+        holds" if a different verdict was expected, and otherwise an empty text.
+        """
         expected = self.verdict(key)
         if verdict == expected:
             return AS_EXPECTED if kind_of(verdict) != "good" else ""
@@ -219,7 +221,7 @@ class Expect(StrictModel):
         chains: Mapping[int, Sequence[str]],
         found: Iterable[tuple[int, str | None]],
     ) -> Iterator[tuple[str, list[str]]]:
-        """Yield each kind of expectation besides verdicts that this object has, with a sentence for each that is unmet.
+        """Yield each kind of expectation other than verdicts, with a sentence for each unmet expectation of this kind.
 
         `chains` has the block hashes of each agent's chain, and `found` an agent and a handler for each deviation.
         """
@@ -231,7 +233,7 @@ class Expect(StrictModel):
             yield "expected deviations", list(self.unexpected_deviations(found))
 
     def out_of_range(self, figures: Mapping[str, float | None]) -> Iterator[str]:
-        """Yield a sentence for each figure that is outside its expected range."""
+        """Yield a sentence for each numeric result that is outside its expected range."""
         for name, wanted in self.figures.items():
             figure = figures.get(name)
             if figure is None or figure not in wanted:
@@ -239,7 +241,7 @@ class Expect(StrictModel):
                 yield f"{name.replace('_', ' ')} is {shown}, and should be {wanted.describe()}"
 
     def unexpected_chains(self, top_chain_hashes: Mapping[int, str]) -> Iterator[str]:
-        """Yield a sentence for each agent whose chain differs from the expected one. `top_chain_hashes` come from
+        """Yield a sentence for each agent whose chain differs from the expected one. `top_chain_hashes` are from the
         exports.
         """
         for agent_id, wanted in self.chains.items():

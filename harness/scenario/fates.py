@@ -48,7 +48,7 @@ def _quoted(value: Any) -> Any:
 
 
 class Fate(StrictModel):
-    """The scripted delivery of the messages that match.
+    """A rule that decides about the delivery of the messages that match it.
 
     A message matches if it agrees with all of the keys `message`, `sender`, `receiver`, `block`, `from_s` and `until_s`
     that the fate has. The first fate that matches decides. A fate needs exactly one of `drop`, `delay_s`,

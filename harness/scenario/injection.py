@@ -87,7 +87,7 @@ class Duplicate(_LastingInjection):
 
 
 class DelayedCopy(_LastingInjection):
-    """The rogue node repeats each matching message later."""
+    """The rogue node repeats each matching message after `by_s` mission seconds."""
 
     by_s: Seconds
     """Mission seconds between the message and its copy."""

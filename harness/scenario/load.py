@@ -29,8 +29,8 @@ def scenario_names() -> list[str]:
 
 
 def find_file(path: Path) -> Path:
-    """Return the file of the included scenario with this name. If `path` exists or no such name is known, return
-    `path`.
+    """Return the file of the included scenario that `path` names. Return `path` if it exists, or if it names no
+    included scenario.
     """
     file_name = f"{path}.yaml"
     if len(path.parts) != 1 or not LIBRARY.is_dir() or file_name not in (file.name for file in LIBRARY.iterdir()):
@@ -123,7 +123,9 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
 
 
 def _near(path: Path) -> Iterator[str]:
-    """Yield the names of the library, and the YAML files beside a missing file."""
+    """Yield suggestions for a missing file: the names of the included scenarios, and the YAML files in the same
+    directory.
+    """
     if len(path.parts) == 1:
         yield from scenario_names()
     yield from (str(file) for file in islice(path.parent.glob("*.y*ml"), MAX_FILES_BESIDE))
@@ -168,7 +170,7 @@ def _siblings(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the model classes in a type annotation."""
+    """Yield the pydantic model classes in a type annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):

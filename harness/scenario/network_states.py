@@ -51,7 +51,7 @@ class NetworkState:
         return replace(conditions, links={**conditions.links, **severed})
 
     def _undivided_groups(self) -> Groups:
-        """Return the groups of vehicles that no partition separates."""
+        """Return the groups into which all active partitions together divide the vehicles."""
         temporary = [entry.groups for entry in self.temporary if entry.network_key == PARTITION]
         standing = temporary[-1] if temporary else self.partition
         partitions = [partition for partition in (standing, *(layer.partition for layer in self.layers)) if partition]
@@ -73,7 +73,7 @@ class NetworkState:
 
 @dataclass(frozen=True)
 class NetworkStep:
-    """A change of the network at one moment. `what` is its name, and `keys` are its places in the scenario."""
+    """A change of the network at one moment. `what` is its name, and `keys` are the scenario keys that cause it."""
 
     at_s: float
     what: str
@@ -121,7 +121,9 @@ def network_steps(
 
 
 def refuse_ambiguous_overlaps(timeline: Sequence[TimelineEntry]) -> None:
-    """Raise ValueError if two temporary changes of the same value overlap, so that the result is ambiguous."""
+    """Raise ValueError if a change starts during an earlier temporary change of the same value, but ends after it. The
+    result would be ambiguous.
+    """
     active: dict[tuple[Scope, str], list[tuple[float, int]]] = defaultdict(list)
     for number, entry in sorted(enumerate(timeline), key=lambda numbered: numbered[1].at_s):
         until_s = math.inf if entry.for_s is None else entry.ends_at_s
@@ -140,7 +142,7 @@ def refuse_ambiguous_overlaps(timeline: Sequence[TimelineEntry]) -> None:
 
 
 def changed_values(entry: TimelineEntry) -> Iterator[tuple[Scope, str]]:
-    """Yield each value that the entry changes, as its scope and its key."""
+    """Yield the network values that the timeline entry changes, each as its scope and its key."""
     if entry.network_key in (PARTITION, "heal"):
         yield None, "the partition"
     elif entry.network_key:

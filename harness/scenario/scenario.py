@@ -167,9 +167,7 @@ class Scenario(StrictModel):
 
     @property
     def rogue(self) -> int | None:
-        """The vehicle ID of the rogue node, which differs from all agents, or None if the timeline injects no
-        messages.
-        """
+        """The vehicle ID of the rogue node, which differs from all agents. None if the timeline injects no messages."""
         if not any(entry.injection for entry in self.timeline):
             return None
         taken = set(self.roster)
@@ -181,7 +179,7 @@ class Scenario(StrictModel):
         return self.roster if self.rogue is None else (*self.roster, self.rogue)
 
     def command_of(self, agent_id: int) -> list[str] | None:
-        """Return the command of this agent without the mission file, or None for the harness's own agent."""
+        """Return the command of this agent without the mission file. Return None for an agent of the harness."""
         asked = self.agent_command
         return asked.get(agent_id) if isinstance(asked, dict) else asked
 
@@ -200,7 +198,7 @@ class Scenario(StrictModel):
         return any(active_quirks(self.quirks_of(agent_id)) for agent_id in self.roster)
 
     def flight_of(self, vehicle: int) -> Flight | None:
-        """Return the flight plan of this vehicle, or None if it has none."""
+        """Return the flight plan of this vehicle. Return None if the vehicle has none."""
         return next((flight for flight in self.flight if vehicle in flight.vehicles), None)
 
     def timeline_in_order(self) -> list[TimelineEntry]:
@@ -264,7 +262,7 @@ class Scenario(StrictModel):
         return self
 
     def _named_vehicles(self) -> Iterator[tuple[str, int]]:
-        """Yield each vehicle ID outside of partitions, with the key that contains it."""
+        """Yield each vehicle ID in the scenario, with the key that contains it. Omit the IDs in partitions."""
         yield from ((f"network.{key}", vehicle) for key, vehicle in self.network.named_vehicles())
         yield from ((f"events.script.{index}.agent", event.agent) for index, event in enumerate(self.events.script))
         yield from (("clocks", vehicle) for vehicle in self.clocks)

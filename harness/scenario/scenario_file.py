@@ -36,7 +36,9 @@ Document = dict[str, Any]
 def to_yaml(
     document: Document, comment: Iterable[str], remark: Callable[[Document], str | None] = lambda entry: None
 ) -> str:
-    """Return the scenario as YAML text. `remark` returns a comment for an entry of a list, or None."""
+    """Return the scenario as YAML text. `remark` returns a comment for an entry of a list. It returns None for no
+    comment.
+    """
     lines = [f"# {line}".rstrip() for line in comment]
     for key in sorted(document, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER)):
         lines += _lines(key, _plain(document[key]), remark)
@@ -95,7 +97,7 @@ def in_one_line(value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return the value with integers in place of whole decimal numbers, also for agent IDs that are keys."""
+    """Return the value with whole decimal numbers as integers. Agent IDs that are keys also become integers."""
     if isinstance(value, dict):
         named = ((int(key) if isinstance(key, str) and key.isdecimal() else key, item) for key, item in value.items())
         return {key: _plain(item) for key, item in named}

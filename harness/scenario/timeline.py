@@ -86,12 +86,12 @@ class _TimelineEntryBase(NetworkDisturbance):
 
     @property
     def injection(self) -> tuple[InjectionName, Injection] | None:
-        """The name and the parameters of the injection in this entry, or None."""
+        """The name and the parameters of the injection in this entry. None if the entry is not an injection."""
         return next(((name, injection) for name in INJECTIONS if (injection := getattr(self, name)) is not None), None)
 
     @property
     def fault(self) -> Fault | None:
-        """The fault in this entry, or None."""
+        """The fault in this entry. None if the entry is not a fault."""
         for kind in TIMELINE_FAULTS:
             if (agents := getattr(self, kind.what)) is not None:
                 return kind(self.at_s, tuple(agents), **{key: getattr(self, key) for key in kind.further_keys()})
@@ -99,7 +99,7 @@ class _TimelineEntryBase(NetworkDisturbance):
 
     @property
     def network_key(self) -> str | None:
-        """The key in this entry that changes the network, or None."""
+        """The key in this entry that changes the network. None if the entry does not change the network."""
         return next((key for key in NETWORK_KEYS if getattr(self, key) is not None), None)
 
     @property
@@ -160,7 +160,7 @@ Pairs = frozenset[tuple[int, int]]
 
 @dataclass(frozen=True)
 class TemporaryChange:
-    """A temporary change of the network by a schedule. An empty layer changes nothing."""
+    """A temporary change of the network by a schedule. Without values, it changes nothing."""
 
     values: NetworkValues = field(default_factory=dict)
     partition: tuple[frozenset[int], ...] = ()
@@ -175,7 +175,7 @@ LayerStep = tuple[float, str, TemporaryChange]
 
 
 class Ramp(StrictModel):
-    """A change from a first value to a second, in equal steps. Needs at least one key."""
+    """A change of network conditions from first values to last values, in equal steps. Needs at least one key."""
 
     loss: tuple[Probability, Probability] | None = None
     """First and last probability that a message is lost."""
@@ -200,7 +200,7 @@ class Ramp(StrictModel):
         return self
 
     def _ends(self) -> tuple[NetworkValues, NetworkValues]:
-        """Return the network at the beginning and at the end of the ramp."""
+        """Return the values of the key `network` at the beginning and at the end of the ramp."""
         return (self.network[0].by_scope(), self.network[1].by_scope()) if self.network else ({}, {})
 
     def at(self, share: float) -> NetworkValues:
@@ -286,7 +286,7 @@ class Schedule(StrictModel):
         return self
 
     def named_vehicles(self) -> Iterator[tuple[str, int]]:
-        """Yield each vehicle ID outside of partitions, with the key that contains it."""
+        """Yield each vehicle ID in the schedule, with the key that contains it. Omit the IDs in partitions."""
         if self.repeat is not None and self.repeat.network is not None:
             yield from ((f"repeat.network.{key}", vehicle) for key, vehicle in self.repeat.network.named_vehicles())
         for number, end in enumerate((self.ramp.network if self.ramp else None) or ()):
@@ -336,8 +336,8 @@ def _isolate(shuffled: list[int]) -> TemporaryChange:
 
 
 def _majorities_ring(shuffled: list[int]) -> TemporaryChange:
-    """Return a change in which each vehicle receives only its neighbours on a ring. These form a different majority for
-    each vehicle.
+    """Return a change in which each vehicle receives only its nearest neighbours on a ring. Each vehicle and its
+    neighbours form a different majority.
     """
     size = len(shuffled)
     reach = (size // 2 + 1) // 2

@@ -89,7 +89,7 @@ async def _ahead(bench: CaseBench) -> None:
 
 
 async def _exported(agent: BenchAgent, *signals: int) -> dict[str, Any]:
-    """Send these signals, wait for the end of the agent, and return its chain export."""
+    """Send these signals to the agent, wait for its end, and return its chain export."""
     for number in signals:
         await agent.process.send_signal(number)
         await asyncio.sleep(SIGNAL_GAP_S)
@@ -278,7 +278,7 @@ async def _port(bench: CaseBench) -> None:
 
 
 async def _lines(agent: BenchAgent, *requests: bytes) -> list[Any]:
-    """Send several lines at once on one connection, and return the answers."""
+    """Send several lines at once to the control socket on one connection, and return the answers."""
     directory = os.open(agent.process.directory, os.O_PATH)
     try:
         path = f"/proc/self/fd/{directory}/{agent.agent_id}.control"

@@ -1,5 +1,5 @@
-"""Test cases about records: the trace, chain export and status of an agent must agree with each other and with the
-test.
+"""Test cases about records. The trace, chain export and status of an agent must agree with the events of the test, and
+with each other.
 """
 
 import base64

@@ -40,7 +40,7 @@ SECTION = "contract, Secured missions"
 
 
 class SecuredPeers:
-    """The other agents of a secured mission, with their keys."""
+    """The agents of a secured mission that the harness plays beside the tested agent, with their keys."""
 
     def __init__(self, agent: BenchAgent, keys: "KeySet") -> None:
         from ucp.secure.opening import DatagramOpener
@@ -54,12 +54,12 @@ class SecuredPeers:
         self._sequence = 0
 
     def sealed(self, sender: int, message: Message) -> bytes:
-        """Return the next datagram of another agent, encrypted and signed with its keys."""
+        """Return the next datagram of an agent that the harness plays, encrypted and signed with this agent's keys."""
         self._sequence += 1
         return self.sessions[sender].seal(self._sequence, message, None, None, 0)
 
     def revocation_in(self, datagram: bytes) -> bytes | None:
-        """Return the body of a revocation. None for any other datagram."""
+        """Return the body of a revocation, the message that excludes vehicles. Return None for any other datagram."""
         from ucp.secure.envelope import REVOCATION, read_clear_header
 
         try:
@@ -71,7 +71,7 @@ class SecuredPeers:
             return None
 
     async def receive(self, count: int, what: str) -> "list[OpenedDatagram]":
-        """Return the next datagrams of the tested agent, decrypted with the keys of another agent.
+        """Return the next datagrams of the tested agent, decrypted with the keys of an agent that the harness plays.
 
         Raises WrongBehaviourError if fewer arrive, or if one is not authentic.
         """
@@ -89,7 +89,7 @@ class SecuredPeers:
             raise
 
     def _drop_challenges(self) -> int:
-        """Remove challenges and echoes from the received datagrams, and return the number of the others."""
+        """Remove challenges and echoes from the received datagrams. Return the number of the remaining datagrams."""
         from ucp.secure.envelope import CHALLENGE, ECHO
 
         received = self.agent.peer_socket.received

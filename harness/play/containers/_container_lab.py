@@ -267,7 +267,9 @@ class ContainerLab:
         return name, created["Id"]
 
     def _kept(self, vehicle: int, role: str, directory: str | None) -> list[Mount]:
-        """Return the mounts of the directories into which the container may write: its own, and that of its keys."""
+        """Return the mounts of the directories into which the container may write: its own directory, and that of its
+        keys.
+        """
         if directory is None:
             return []
         if role == "agent":

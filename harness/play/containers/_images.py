@@ -34,7 +34,8 @@ INSTEAD = "use this machine's files (--image-from-host, `docker.image_from_host`
 
 @dataclass(frozen=True)
 class ContainerImage:
-    """A Docker image. `python` is its interpreter, and `mounted` lists directories of this machine that it can read.
+    """A Docker image. `python` is its Python interpreter. `mounted` lists the directories of this machine that its
+    containers can read.
 
     Nothing is mounted into a `foreign` image, because paths refer to files in the image.
     """
@@ -45,11 +46,11 @@ class ContainerImage:
     foreign: bool = False
 
     def command(self, argv: Sequence[str]) -> list[str]:
-        """Return the command that starts the same program inside the container."""
+        """Return the command that starts the program of `argv` inside the container."""
         return [self.python if word == sys.executable else word for word in argv]
 
     def environment(self, env: Mapping[str, str]) -> dict[str, str]:
-        """Return the environment variables for inside the container.
+        """Return the environment variables for a program inside the container.
 
         Without shared directories, it has only variables that differ from this process.
         """
@@ -62,7 +63,9 @@ class ContainerImage:
 
 
 def from_host(engine: DockerEngine) -> ContainerImage:
-    """Return an image that uses the programs of this machine, and create it if necessary. Raises DockerError."""
+    """Return an image whose containers use the programs of this machine. Create the image if it does not exist. Raises
+    DockerError.
+    """
     if not _exists(engine, HOST_IMAGE):
         repository, tag = HOST_IMAGE.split(":")
         engine.do(
@@ -81,7 +84,7 @@ def host_image() -> ContainerImage:
 
 
 def is_shared(program: Path) -> bool:
-    """Return true if an image that uses the programs of this machine contains this program."""
+    """Return true if containers that use the programs of this machine contain this program."""
     mounted = host_image().mounted
     return all(any(path.is_relative_to(outer) for outer in mounted) for path in (program, program.resolve()))
 
@@ -94,8 +97,8 @@ def named(engine: DockerEngine, name: str) -> ContainerImage:
 
 
 def agents_in_named(scenario: Scenario) -> Iterable[int]:
-    """Return the agents that run in the image of the scenario: those with their own command if there are any, otherwise
-    all.
+    """Return the agents that run in the image of the scenario: the agents with a command in `agent_command`, if this
+    key lists commands by agent, and otherwise all agents.
     """
     if scenario.docker.image is None:
         return ()
@@ -171,7 +174,9 @@ def _tar(files: Mapping[str, bytes]) -> bytes:
 
 
 def _with_environment(program: Path) -> Path:
-    """Return the directory of the virtual environment that contains the program, or else the program itself."""
+    """Return the directory of the virtual environment that contains the program. Without a virtual environment, return
+    the program.
+    """
     environment = program.parent.parent
     return environment if (environment / "pyvenv.cfg").is_file() else program
 
@@ -200,7 +205,7 @@ def _package(name: str) -> Path:
 
 
 def outermost(paths: Iterable[Path]) -> list[Path]:
-    """Return the directories that do not lie inside another one of them."""
+    """Return the directories that do not lie inside another directory of the list."""
     roots: list[Path] = []
     for path in sorted(set(paths)):
         if not any(path.is_relative_to(outer) for outer in roots):

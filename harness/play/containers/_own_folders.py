@@ -1,4 +1,4 @@
-"""A folder of its own for each agent in a container, so that it neither reads nor changes files of other agents.
+"""Give each agent in a container its own folder, so that the agent can neither read nor change files of other agents.
 
 All agents of a run have their files in one directory, `agents/`. The container of agent 7 sees `agents/7-1/` in its
 place. Links in `agents/` let the harness find the files during the run. At the end, the files replace the links.
@@ -21,7 +21,7 @@ class OwnFolders:
         self._folders: dict[int, Path] = {}
 
     def mounts(self, agent_id: int, directory: Path) -> Iterator[Mount]:
-        """Yield the mounts for an incarnation that runs in this directory. Raises OSError."""
+        """Yield the mounts for a container in which the agent runs in this directory. Raises OSError."""
         yield Mount(str(self._agents), str(self._folder(agent_id)), type="bind")
         if directory != self._agents:
             (self._folder(agent_id) / directory.name).mkdir()
@@ -40,7 +40,9 @@ class OwnFolders:
         return folder
 
     def merge(self) -> None:
-        """Move the files of each agent to the common directory. Other files that it made stay in its folder."""
+        """Move the files of each agent to the common directory. Files with unexpected names stay in the folder of the
+        agent.
+        """
         for agent_id, folder in self._folders.items():
             for path in folder.iterdir():
                 with contextlib.suppress(OSError):

@@ -81,9 +81,8 @@ def write_compose(
 
 
 def _keys(scenario: Scenario) -> MissionKeys | None:
-    """Return the mission keys from the user's bundles, which stay in their directory;
-
-    None for a mission without keys.
+    """Return the mission keys from the user's key files. These files stay in their directory. Return None for a mission
+    without keys.
     """
     if scenario.security is None:
         return None

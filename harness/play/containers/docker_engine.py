@@ -87,7 +87,7 @@ class DockerEngine:
             raise self.give_up(sentence) from None
 
     def give_up(self, sentence: str) -> DockerError:
-        """Make all later calls fail with this error. Return the first such error."""
+        """Record a failure of Docker. All later calls raise it. Return the error of the first recorded failure."""
         self._failure = self._failure or DockerError(sentence)
         return self._failure
 

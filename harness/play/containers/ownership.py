@@ -53,7 +53,7 @@ def _boot() -> str:
 
 
 def _start_time(pid: int) -> str | None:
-    """Return the start time of a process in clock ticks since boot, or None if the process has ended."""
+    """Return the start time of a process in clock ticks since boot. Return None if the process has ended."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text()
     except OSError:
@@ -71,7 +71,7 @@ class CleanupResult:
 
 
 def clean(engine: DockerEngine) -> CleanupResult:
-    """Remove the containers of all ended runs, and keep all other containers. Raises DockerError."""
+    """Remove the containers of all ended runs. Containers of active runs stay. Raises DockerError."""
     cleaned = CleanupResult()
     for container in engine.do("list containers", engine.api.containers, all=True, filters={"label": RUN}):
         name = container["Names"][0].removeprefix("/")

@@ -56,7 +56,7 @@ class KeyDirectory:
 
     @classmethod
     def new(cls, directory: Path, roster: Iterable[int], *, seals: bool, epoch_s: float) -> "KeyDirectory":
-        """Create keys in a new directory. If `seals` is true, they include a key pair for encrypted event data."""
+        """Create keys in a new directory. If `seals` is true, also create a key pair for encrypted event data."""
         keys = KeySet.derived(os.urandom(KEY_BYTES), roster, seals=seals, epoch_s=epoch_s)
         home, mission = cls(directory), keys.public.mission.hex()
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
@@ -144,8 +144,8 @@ class KeyDirectory:
         return load_revocation(path, public or self.public()) if path.exists() else None
 
     def revoke(self, agents: Sequence[int]) -> Revocation:
-        """Exclude further vehicles. The new signed list has the next number, and contains all vehicles excluded so
-        far.
+        """Exclude these vehicles from the mission. Return a signed list with the next number, which contains all
+        vehicles excluded so far.
         """
         public, last = self.public(), self.revocation()
         before = last.revoked if last else frozenset[int]()
@@ -167,7 +167,9 @@ class KeyDirectory:
         return revocation
 
     def authority(self, public: PublicKeys) -> bytes:
-        """Return the private key that signs lists of excluded vehicles. This key must match `public`."""
+        """Return the private key that signs lists of excluded vehicles. Raises KeysError if the key does not match
+        `public`.
+        """
 
         def parse(document: dict[str, Any]) -> bytes:
             key = key_in(document, "private_key", KEY_BYTES)
@@ -259,7 +261,7 @@ class RevocationAuthority:
 
     @classmethod
     def in_directory(cls, home: KeyDirectory, public: PublicKeys) -> "RevocationAuthority":
-        """Return the authority of a key directory. The directory may lack its private key, its list, or both.
+        """Return the authority of a key directory. The private key and the list of excluded vehicles may be missing.
 
         Raises KeysError.
         """
@@ -284,7 +286,9 @@ class RevocationAuthority:
         )
 
     def revoke(self, agent_id: int) -> bytes:
-        """Return a message body with a signed list that excludes this agent. A new list is made only if needed."""
+        """Return a message body with a signed list that excludes this agent. Sign a new list only if the newest one
+        lacks the agent.
+        """
         if self._last is None or agent_id not in self._last.revoked:
             assert self._private_key is not None, "was refused"
             signer = Ed25519PrivateKey.from_private_bytes(self._private_key)

@@ -25,7 +25,7 @@ from sitl.vehicle import VehicleError
 
 @dataclass(frozen=True)
 class MachineRequirement:
-    """A property of the machine that runs need. `way_out` is the user's remedy if it is missing.
+    """A property that this machine needs to play runs. `way_out` is the remedy for a machine that lacks it.
 
     Without a `needed` property, no run is possible.
     """
@@ -41,8 +41,8 @@ class MachineRequirement:
 
 
 def examine() -> list[MachineRequirement]:
-    """Return all requirements, and whether they are met. This builds and removes a small virtual network to test the
-    kernel.
+    """Return all requirements, each with the result of its check. The check of the kernel builds and removes a small
+    virtual network.
     """
     python = MachineRequirement(
         "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
@@ -114,7 +114,7 @@ def measure_engines(requirements: Iterable[MachineRequirement], say: Callable[[s
 
 
 def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -> Observer:
-    """Return an observer of measurements that also reports which measurement is running."""
+    """Return an observer of measurements that also reports the measurement in progress."""
 
     def observe_and_report(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         asked = len(study.questions)
@@ -126,7 +126,9 @@ def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -
 
 @contextlib.contextmanager
 def progress_line(console: Console) -> Iterator[Callable[[str], None]]:
-    """Yield a function that prints progress, on a temporary line of a terminal or otherwise as lines."""
+    """Yield a function that shows progress. On a terminal, each text replaces the previous one. Otherwise, each text is
+    printed as a line.
+    """
     if not console.is_terminal:
         yield lambda words: console.print(words, highlight=False, soft_wrap=True)
         return
@@ -135,7 +137,9 @@ def progress_line(console: Console) -> Iterator[Callable[[str], None]]:
 
 
 def render(engines: Sequence[EngineMeasurement]) -> RenderableType:
-    """Return a table for each network engine, with a row for each measured condition and the delays of the machine."""
+    """Return a table for each network engine, with a row for each measured network condition, and a line about the
+    machine's delays.
+    """
     return Group(*(part for measured in engines for part in (_table(measured), Text(_lateness(measured), style="dim"))))
 
 

@@ -17,7 +17,7 @@ _MISSION = re.compile(rb"(?:.*/)?([1-9][0-9]{0,4})\.mission\.json")
 
 
 def running(proc: Path = Path("/proc")) -> dict[Path, dict[int, int]]:
-    """Return, for each active run directory, the ID of one process of each vehicle."""
+    """Return the active run directories. For each directory, give one process ID for each vehicle."""
     runs: defaultdict[Path, dict[int, int]] = defaultdict(dict)
     for entry in proc.iterdir():
         if not entry.name.isdigit():
@@ -32,21 +32,23 @@ def running(proc: Path = Path("/proc")) -> dict[Path, dict[int, int]]:
 
 
 def _agent_of(entry: Path) -> bytes | None:
-    """Return the agent ID in the file name of the process's mission file, or None."""
+    """Return the agent ID in the file name of the process's mission file. Return None if the process has no mission
+    file.
+    """
     *_, last = (entry / "cmdline").read_bytes().removesuffix(b"\0").split(b"\0")
     named = _MISSION.fullmatch(last)
     return named[1] if named else None
 
 
 def _in_another_network(entry: Path, proc: Path) -> bool:
-    """Return true if the process is in a different network than this one. This excludes a user's shell in the run
-    directory.
+    """Return true if the process does not use the network of this process. A user's shell in the run directory does use
+    it.
     """
     return (entry / "ns/net").readlink() != (proc / "self/ns/net").readlink()
 
 
 def enter_command(pid: int) -> list[str]:
-    """Return the nsenter(1) command that runs another command in the network and user namespace of a process."""
+    """Return the nsenter(1) command that runs a further command in the network and user namespace of a process."""
     target, ours = Path(f"/proc/{pid}/ns/user"), Path("/proc/self/ns/user")
     user = ["--user", "--preserve-credentials"] if target.readlink() != ours.readlink() else []
     return ["nsenter", f"--target={pid}", *user, "--net", "--"]

@@ -91,8 +91,8 @@ class _ProcessIncarnation:
     """Number of bytes of its trace that the trace of the first incarnation already contains."""
 
     def handler_runs(self) -> dict[str, int | float] | None:
-        """Return the number of handler runs that the agent last reported, with the time of the report, or None without
-        a report.
+        """Return the number of handler runs that the agent last reported, with the time of the report. Return None if
+        there is no report.
         """
         if self.status is None:
             return None
@@ -101,7 +101,7 @@ class _ProcessIncarnation:
 
 
 class AgentProcess:
-    """The process of one agent, including its earlier starts."""
+    """The process of one agent. The object also keeps the files and results of its earlier processes."""
 
     def __init__(self, agent_id: int, rundir: RunDirectory, command: Sequence[str], now: Callable[[], float]) -> None:
         """Create the object. `command` starts the agent with its mission file as last argument. `now` returns mission
@@ -133,7 +133,7 @@ class AgentProcess:
 
     @property
     def status(self) -> AgentStatus | None:
-        """The newest status report since the last start, or None if the agent is neither running nor paused."""
+        """The newest status report since the last start. None if the agent is neither running nor paused."""
         return self._incarnations[-1].status if self.outcome in ("running", "paused") else None
 
     # Start and end of an incarnation
@@ -215,13 +215,13 @@ class AgentProcess:
                 await asyncio.sleep(RETRY_S)
 
     async def watch(self) -> None:
-        """Wait for the process to end by itself, then raise AgentFailedError or UnsupportedError."""
+        """Wait for the process to end without a request, then raise AgentFailedError or UnsupportedError."""
         assert self._process is not None
         await self._process.wait()
         raise self._end_error(self._process)
 
     async def kill(self, *, disk_kept: bool = False) -> None:
-        """Kill the process with SIGKILL. `disk_kept` lets the next start use the data on its disk.
+        """Kill the process with SIGKILL. If `disk_kept` is true, the next start uses the data on the agent's disk.
 
         Cancel `watch` first. Raises AgentFailedError if the agent has already failed.
         """
@@ -238,8 +238,8 @@ class AgentProcess:
             self._control_path.unlink(missing_ok=True)
 
     async def switch_off(self) -> None:
-        """End the process with SIGTERM. An agent exports its chain when it receives it. Cancel the task that runs
-        `watch` first.
+        """End the process with SIGTERM. An agent exports its chain when it receives this signal. Cancel the task that
+        runs `watch` first.
 
         Raises AgentFailedError if the agent ends with an error, or not at all.
         """
@@ -289,8 +289,8 @@ class AgentProcess:
             raise self._failure("hung", f"stopped answering: {error}") from None
 
     async def _has_ended(self, process: LabProgram) -> bool:
-        """Wait a moment, and return whether the process has ended. The connection to a process can end before the
-        process does.
+        """Return true if the process has ended. Wait for a moment first, because its connection can end before the
+        process.
         """
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(process.wait(), END_LIMIT_S)
@@ -340,8 +340,8 @@ class AgentProcess:
             self.outcome = "exported"
 
     def handler_runs_since(self, mission_s: float, handler: str) -> list[HandlerRun]:
-        """Return the runs of this handler after `mission_s` in the agent's trace, since its last start. The oldest is
-        first.
+        """Return the runs of this handler that the trace records after `mission_s` and since the agent's last start.
+        The oldest run is first.
 
         Lines that cannot be parsed are skipped, because the checker reports them.
         """
@@ -377,7 +377,8 @@ class AgentProcess:
         return await asyncio.to_thread(self._incarnations[-1].processes.end_left_behind)
 
     def collect_files(self) -> None:
-        """Join the traces of all starts of the agent, and copy its last export, to the files that the checker reads.
+        """Write the files that the checker reads: one trace, joined from all starts of the agent, and a copy of its
+        last export.
 
         A repeated call adds only new lines. Raises OSError.
         """
@@ -428,7 +429,7 @@ class AgentProcess:
         return self._incarnations[-1].directory / f"{self.agent_id}.log"
 
     def _end_error(self, process: LabProgram) -> HarnessError:
-        """Return the error for an agent whose process ended by itself.
+        """Return the error for an agent whose process ended without a request.
 
         Exit status 127 before the start of the mission means that the agent lacks a feature of the mission. A shell
         also ends with 127, if it does not find a program.

@@ -171,7 +171,9 @@ class ChannelNode:
         return {}
 
     def _clear(self, request: dict[str, Any]) -> dict[str, Any]:
-        """End the simulation of the channel. Messages on it are lost, and the switch delivers all later broadcasts."""
+        """End the simulation of the channel. Messages on it are lost, and the switch delivers all broadcasts from now
+        on.
+        """
         if self._relay is not None:
             self._lateness.missed = self._relay.count_missed()
             self._loop.watch(self._relay.input)
@@ -180,7 +182,7 @@ class ChannelNode:
         return {}
 
     def _totals(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Write the counts of the channel, for `run.json`, to a file."""
+        """Write the counts of the channel to a file. The harness copies them to `run.json`."""
         if self._relay is not None:
             self._lateness.missed = self._relay.count_missed()
         self._journal.flush()
@@ -207,7 +209,7 @@ class DeliveryLateness:
         """Greatest lateness in each interval of the load."""
 
     def add(self, due_s: float, now: float) -> None:
-        """Count a delivery at the time `now` that was due at `due_s`."""
+        """Record the lateness of a delivery that was due at `due_s` and happened at the time `now`."""
         late_s = max(0.0, now - due_s)
         self._all.append(late_s)
         index = int(due_s / LOAD_S)
@@ -266,8 +268,8 @@ class AnswerTimeMeter:
 
 
 def _quantiles(ordered: list[float]) -> dict[str, float]:
-    """Return the median and the 95 % quantile of the values, which are in ascending order. Both are 0 without
-    values.
+    """Return the median and the 95 % quantile of the values, which are in ascending order. Both results are 0 if there
+    are no values.
     """
     count = len(ordered)
     shares = {"median_s": count // 2, "p95_s": count * 95 // 100}
@@ -275,7 +277,7 @@ def _quantiles(ordered: list[float]) -> dict[str, float]:
 
 
 def _sequence(data: bytes, vehicle: int) -> int | None:
-    """Return the sequence number of a message, or None if the data are not a message of the vehicle's agent."""
+    """Return the sequence number of a message. Return None if the data are not a message of the vehicle's agent."""
     if len(data) < HEADER.size:
         return None
     magic, _, _, sender, sequence, _ = HEADER.unpack_from(data)

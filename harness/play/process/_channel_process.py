@@ -95,8 +95,8 @@ class ChannelProcess:
         await self._ask("move", places=coordinates)
 
     async def apply(self, conditions: NetworkConditions) -> None:
-        """Apply these network conditions to all frames whose transmission ends later. If the mission has not begun,
-        apply them at its start.
+        """Apply these network conditions to all frames whose transmission ends after this call. Before the mission,
+        store them for its start.
         """
         self._conditions = conditions
         if not self._begun:
@@ -107,11 +107,11 @@ class ChannelProcess:
             self._value.unlink()
 
     async def clear(self) -> None:
-        """End the simulation of the channel, so that the switch delivers all later broadcasts."""
+        """End the simulation of the channel, so that the switch delivers all broadcasts from now on."""
         await self._ask("clear")
 
     async def totals(self) -> dict[str, Any] | None:
-        """Return the channel's data for run.json, or None if the mission has not begun."""
+        """Return the channel's data for run.json. Return None if the mission has not begun."""
         if not self._begun:
             return None
         async with self._asking:
@@ -121,7 +121,7 @@ class ChannelProcess:
         return {"model": self._model.to_json(), **totals}
 
     async def watch(self) -> None:
-        """Wait for the process to end by itself, then raise MachineError."""
+        """Wait for the process to end without a request, then raise MachineError."""
         assert self._process is not None, "it is watched after its start"
         await self._process.wait()
         raise self._ended(self._process)

@@ -1,4 +1,4 @@
-"""Start the vehicle programs of a run, fly them, connect them to a ground station, and replace lost ones."""
+"""Start, fly and replace the vehicle programs of a run, and connect them to a ground station."""
 
 import asyncio
 import math
@@ -26,7 +26,7 @@ AWAY_M = 5.0
 
 
 class Fleet:
-    """The vehicles of a run, one for each agent. In a run without vehicles the object counts as false.
+    """The vehicles of a run, one for each agent. `bool(fleet)` is false in a run without vehicles.
 
     The watchers end the mission with VehicleFailedError when a vehicle fails.
     """
@@ -146,7 +146,7 @@ class Fleet:
     # End of the run
 
     def shortfalls(self, mission_s: float) -> list[str]:
-        """Return a sentence for each vehicle that should have left its home position and has not."""
+        """Return a sentence for each vehicle that has not left its home position, although it should have."""
         sentences = (
             vehicle.shortfall() for vehicle in self._vehicles.values() if self._should_have_left(vehicle, mission_s)
         )

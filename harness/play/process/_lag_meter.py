@@ -11,7 +11,7 @@ END_LIMIT_S = 5.0
 
 
 class LagMeter:
-    """A running measurement of the machine's delays. It ends when this process ends, or earlier."""
+    """A measurement of this machine's delays during a mission. It ends at the latest when this process ends."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process

@@ -33,7 +33,9 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class KernelCounters:
-    """Counters of the kernel. Each method returns the number of seconds of wall time since it was last called."""
+    """Counters of the kernel. Each method returns the increase of its counter since the previous call, in seconds of
+    wall time.
+    """
 
     def __init__(self, networks: dict[int, str]) -> None:
         """Create the counters. `networks` maps the inode number of a network namespace to the agent in it."""
@@ -43,7 +45,9 @@ class KernelCounters:
         self._stalled = self._read_stalled()
 
     def busy(self) -> dict[str, float]:
-        """Return, for each agent, the time in which its processes ran or waited for a processor."""
+        """Return, for each agent, the seconds in which its processes ran or waited for a processor since the previous
+        call.
+        """
         present = [entry.name for entry in os.scandir("/proc") if entry.name.isdigit()]
         self._agent_of = {pid: self._agent_of[pid] if pid in self._agent_of else self._agent(pid) for pid in present}
         before, self._busy = self._busy, {}
@@ -62,7 +66,9 @@ class KernelCounters:
         return busy
 
     def stalled(self) -> float:
-        """Return the time in which this machine ran no program because of a disk or a hypervisor."""
+        """Return the seconds in which this machine ran no program because of a disk or a hypervisor, since the previous
+        call.
+        """
         before, self._stalled = self._stalled, self._read_stalled()
         return sum(self._stalled) - sum(before)
 
@@ -88,8 +94,8 @@ def _busy_ns(thread: str) -> int:
 
 
 def measure(file: TextIO, started: float, speedup: float, counters: KernelCounters, ended: threading.Event) -> None:
-    """Measure until `ended` is set, and write a line for each interval. `started` is the monotonic time of mission
-    second 0.
+    """Measure the machine's delays until `ended` is set, and write a line for each interval. `started` is the monotonic
+    time of mission second 0.
     """
     slice_s = min(MAX_SLICE_S, max(MIN_SLICE_S, SLICE_MISSION_S / speedup))
     began = awake = time.monotonic()

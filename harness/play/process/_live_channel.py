@@ -88,8 +88,8 @@ class LiveChannel:
         self._traffic.move(places, now)
 
     def apply(self, conditions: NetworkConditions, now: float) -> None:
-        """Apply these network conditions to all frames whose transmission ends later. In a partition, each group has
-        its own channel.
+        """Apply these network conditions to all frames whose transmission ends after `now`. In a partition, each group
+        has its own channel.
         """
         self._play(now)
         self._medium.apply(conditions)
@@ -108,8 +108,8 @@ class LiveChannel:
         self._played_s = max(self._played_s, now)
 
     def _copy(self, at_s: float, draws: RandomDraws, receivers: int, frame: bytes) -> None:
-        """Deliver copies of a frame to these receivers, after random losses and delays. `receivers` has a bit for each
-        receiver.
+        """Schedule the arrival of a frame at these receivers, after random losses and delays. `receivers` has a bit for
+        each receiver.
         """
         for receiver in numbers(receivers):
             for delay_s in draws.copies_to(receiver):

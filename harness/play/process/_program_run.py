@@ -484,7 +484,7 @@ class ProgramRun:
         self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
 
     def _datagram_counters(self, counted: Mapping[int, UdpCounters]) -> dict[str, dict[str, int]]:
-        """Return the datagram counters of each agent whose vehicle does not use UDP itself, for run.json."""
+        """Return the datagram counters of the agents for run.json. Omit agents whose vehicle program also uses UDP."""
         agents = [agent for agent in self._udp_before_start if agent in self.scenario.roster]
         return {
             str(agent): {

@@ -75,7 +75,7 @@ class RogueProcess:
         )
 
     async def watch(self) -> None:
-        """Wait for the process to end by itself, then raise MachineError."""
+        """Wait for the process to end without a request, then raise MachineError."""
         assert self._process is not None, "`start` comes first"
         await self._process.wait()
         raise self._end_error(self._process)

@@ -23,7 +23,7 @@ class LabProgram(Protocol):
 
     @property
     def returncode(self) -> int | None:
-        """The exit status, or the negative number of the signal that killed the program. None during its run."""
+        """The exit status, or the negative number of the signal that killed the program. None while it runs."""
 
     @property
     def end(self) -> str:
@@ -83,7 +83,7 @@ class MissionLab(Protocol):
     async def read(self) -> AppliedConditions: ...
 
     async def watch(self) -> None:
-        """Wait until the network fails by itself, then raise NetemError."""
+        """Wait until the network fails, then raise NetemError."""
 
     async def close(self) -> None:
         """End all programs, and remove the network. A second call does nothing."""
@@ -93,7 +93,7 @@ class MissionLab(Protocol):
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the network. Errors are ignored."""
+        """Close the network, and ignore errors."""
 
 
 OpenLab = Callable[[Scenario, RunDirectory, Callable[[str], None]], Awaitable[MissionLab]]

@@ -32,11 +32,13 @@ PARAMETERS = "parameters.parm"
 
 
 class VehicleFailedError(HarnessError):
-    """An error: a vehicle could not be started or flown, or its program ended by itself."""
+    """An error: a vehicle could not be started or flown, or its program ended without a request."""
 
 
 class VehicleProcess:
-    """The program of one vehicle. `sysid` is its MAVLink system ID. A replacement has the next number `incarnation`."""
+    """The program of one vehicle. `sysid` is its MAVLink system ID. `incarnation` is 1 for the first program, and
+    higher for a replacement.
+    """
 
     def __init__(
         self, vehicle_id: int, sysid: int, kind: VehicleKind, rundir: RunDirectory, incarnation: int = 1
@@ -96,7 +98,7 @@ class VehicleProcess:
         await self.pilot.start()
 
     async def join(self, station: GroundStation, lab: MissionLab) -> None:
-        """Connect the vehicle and the ground station with each other. Raises VehicleFailedError."""
+        """Connect the vehicle with the ground station. Raises VehicleFailedError."""
         try:
             sock = await lab.connect(self.vehicle_id, self._station_port, timeout_s=CONNECT_LIMIT_S)
         except (ConnectionError, TimeoutError):
@@ -171,7 +173,7 @@ class VehicleProcess:
             raise VehicleFailedError("; ".join(filter(None, (str(error), self.kind.lack)))) from None
 
     async def watch(self) -> None:
-        """Wait for the process to end. Raises VehicleFailedError if it ended by itself."""
+        """Wait for the process to end. Raises VehicleFailedError if it ended without a request."""
         assert self._process is not None
         await self._process.wait()
         if not self._abandoned:
@@ -197,8 +199,8 @@ class VehicleProcess:
         return self.pilot.shortfall(self._flight)
 
     async def simulate(self, what: str, circumstance: SimulatedFailure, at_s: float) -> str | None:
-        """Make the vehicle simulate an event such as a GPS failure. Return the reason as a sentence if the vehicle
-        cannot do this.
+        """Make the vehicle simulate an event such as a GPS failure. If the vehicle cannot do this, return a sentence
+        with the reason.
         """
         assert self.pilot is not None
         entry: dict[str, Any] = {"at_s": at_s, "what": what, "parameters": {}}

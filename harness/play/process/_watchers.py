@@ -45,7 +45,7 @@ class MissionTasks:
             task.cancel()
 
     def create_task(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Start a task for whose end the mission waits. `stop` does not cancel it.
+        """Start a task. The mission ends only after the task has ended. `stop` does not cancel the task.
 
         Raises RuntimeError if a failure is already ending the mission.
         """
@@ -57,7 +57,7 @@ class MissionTasks:
 
 
 async def open_unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Event) -> T:
-    """Return the result of `opening`. If the user interrupts the run, cancel `opening` and raise
+    """Wait for `opening`, and return its result. If the user interrupts the run, cancel `opening` and raise
     InterruptedRunError.
     """
     opened = asyncio.ensure_future(opening)
@@ -73,7 +73,9 @@ async def open_unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Ev
 
 
 def _root_error(errors: BaseExceptionGroup[BaseException]) -> BaseException:
-    """Return the error that caused the others: the failure of an agent if there is one, then any other HarnessError."""
+    """Return the error that probably caused the other errors. This is the failure of an agent if there is one, and
+    otherwise a HarnessError.
+    """
     flat: list[BaseException] = []
     for error in errors.exceptions:
         flat += [_root_error(error)] if isinstance(error, BaseExceptionGroup) else [error]

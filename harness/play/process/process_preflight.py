@@ -51,12 +51,13 @@ def network_needs(scenario: Scenario) -> list[str]:
 
 
 def add_rogue_listener(conditions: NetworkConditions, scenario: Scenario) -> NetworkConditions:
-    """Return the network conditions, extended by perfect links to the rogue node if the scenario has one."""
+    """Return the network conditions. If the scenario has a rogue node, add links to it without loss and delay."""
     return conditions.with_listener(scenario.rogue, scenario.roster) if scenario.rogue else conditions
 
 
 def _network_states(scenario: Scenario) -> list[NetworkConditions]:
-    """Return each state of the network in the scenario once, at the scenario's speed and without partitions.
+    """Return the different network conditions that occur in the scenario, at the scenario's speed and without
+    partitions.
 
     With a radio model, one link of each state loses more than the others, because links differ during the flight.
     """

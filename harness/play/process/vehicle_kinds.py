@@ -34,7 +34,7 @@ def choose_vehicles(scenario: Scenario) -> dict[int, VehicleKind]:
 
 
 def _ardupilots(scenario: Scenario) -> dict[int, VehicleKind] | None:
-    """Return the ArduPilot program of each vehicle, or None if the scenario uses the embedded vehicle model.
+    """Return the ArduPilot program of each vehicle. Return None if the scenario uses the embedded vehicle model.
 
     Raises NoBinaryError if the scenario requires ArduPilot, and a binary is missing.
     """

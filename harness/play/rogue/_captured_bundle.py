@@ -66,7 +66,7 @@ class CapturedKeys:
         return session.seal(sequence, message, request, signature, 0)
 
     def _session(self, sender: int, now_us: int) -> Session:
-        """Return a session that imitates a restart of the sender now, and is therefore newer than the genuine
-        session.
+        """Return a forged session that imitates a restart of the sender at this moment. It is newer than the sender's
+        genuine session.
         """
         return Session(replace(self._bundle, agent_id=sender), make_boot(now_us, self._random_bytes()))

@@ -54,8 +54,8 @@ QUERY_OF_ANSWER = {NAMES[answer]: NAMES[query] for answer, query in REQUEST_OF.i
 
 @dataclass(frozen=True, slots=True)
 class RogueDatagram:
-    """A datagram that the rogue node sends. `what` is its kind, `injection` its number, and `source` the imitated
-    sender address.
+    """A datagram that the rogue node sends. `injection` is the number of the injection, `what` is the kind of the
+    injection, and `source` is the imitated sender address.
     """
 
     injection: int
@@ -74,8 +74,8 @@ class RogueDatagram:
 
 @dataclass(frozen=True, slots=True)
 class _ReceivedDatagram:
-    """A datagram that the rogue node received. `message` is None for an encrypted datagram. An answer to the datagram
-    must contain `request`.
+    """A datagram that the rogue node received. `message` is None for an encrypted datagram. `request` is the
+    identification that an answer to the datagram must contain.
     """
 
     sender: int
@@ -87,7 +87,7 @@ class _ReceivedDatagram:
 
 @dataclass(slots=True)
 class _ActiveInjection:
-    """An injection of messages that lasts until `until`. A flood sends its next message at `next_at`."""
+    """An injection of messages that ends at the time `until`. A flood sends its next message at the time `next_at`."""
 
     number: int
     injection: Injection
@@ -163,8 +163,8 @@ class RogueLogic:
         return clear.sender, NAMES.get(clear.type, ""), *(opened or (None, None))
 
     def begin(self, number: int, injection: Injection, now: float) -> None:
-        """Begin the injection with this number, which counts from 1. Some injections end at once, and others last for a
-        time.
+        """Begin the injection with this number, which counts from 1. A replay, a lie, or a forgery without duration
+        ends in this call.
         """
         self.sent[number] += 0
         if isinstance(injection, Replay):
@@ -178,7 +178,7 @@ class RogueLogic:
             self.handle_timer(now)
 
     def next_timer(self) -> float | None:
-        """Return the time at which `handle_timer` must be called next, or None."""
+        """Return the time at which `handle_timer` must be called next. Return None if no datagram is scheduled."""
         times = [window.next_at for window in self._windows if isinstance(window.injection, Flood)]
         return min([*times, *(at for at, _, _ in self._waiting[:1])], default=None)
 
@@ -222,7 +222,9 @@ class RogueLogic:
             heappush(self._waiting, (now + injection.by_s, self._made, copy))
 
     def _answer(self, forge: Forgery, query: Message) -> Message | None:
-        """Return the forged answer to a query, or None if this kind of forgery does not answer it."""
+        """Return the forged answer to a query. Return None if the injection `forge` does not answer queries of this
+        type.
+        """
         approve = bool(forge.approve)
         match query:
             case BlockAddRequest() if forge.message == BlockAddResponse.NAME:

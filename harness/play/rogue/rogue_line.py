@@ -49,5 +49,5 @@ def forged_sequence(injection: int, count: int) -> int:
 
 
 def injection_of(sequence: int) -> int | None:
-    """Return the number of the injection that created a datagram, or None if an agent sent it."""
+    """Return the number of the injection that created a datagram. Return None if an agent sent the datagram."""
     return (sequence - FORGED_FROM) // _EACH + 1 if sequence >= FORGED_FROM else None

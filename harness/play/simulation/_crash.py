@@ -17,7 +17,7 @@ MAX_WORDS = 200
 
 
 def core_crash(incarnation: SimulatedIncarnation | None, error: Exception) -> AgentFailedError | None:
-    """Return the failure of the agent if its own code raised the exception, otherwise None."""
+    """Return the failure of the agent if the agent's own code raised the exception. Otherwise return None."""
     frames = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
     ours = [(path, line) for path, line in frames if path.is_relative_to(CORE) or path.is_relative_to(HARNESS)]
     if incarnation is None or incarnation.state is None or not ours or not ours[-1][0].is_relative_to(CORE):

@@ -136,13 +136,13 @@ class EventLoop:
 
     @property
     def public_keys(self) -> "PublicKeys | None":
-        """The public keys of the vehicles, or None if the mission is not secured."""
+        """The public keys of the vehicles. None if the mission is not secured."""
         return self._keys.mission.public if self._keys else None
 
     @property
     def verified(self) -> "Callable[[UnverifiedSignature], bool] | None":
-        """A function that verifies signatures, with a cache of those made in this run. None if the mission is not
-        secured.
+        """A function that verifies signatures, with a cache of the signatures made in this run. None if the mission is
+        not secured.
         """
         return self._keys.crypto.verify if self._keys else None
 
@@ -159,7 +159,7 @@ class EventLoop:
         return VirtualRogue(self.roster, self.seed, self._air, number, write, captured, self._initial_data)
 
     def _late_rogue(self) -> "VirtualRogue":
-        """Return a rogue node that starts late, but has received the last messages of the run."""
+        """Return a rogue node that starts during the run, and give it the most recent messages of the run."""
         assert self._recent_messages is not None, "a scenario that injects has a rogue node from the beginning"
         rogue = self._rogue_node()
         for sender, sequence, message, sent_at in self._recent_messages:
@@ -169,7 +169,7 @@ class EventLoop:
     # Inputs
 
     def run(self, until: float) -> None:
-        """Play all inputs up to the time `until`, or up to a handler run for which a caller waits."""
+        """Play all inputs up to the time `until`. Stop earlier at a handler run for which a caller waits."""
         self._recent_runs = None
         with gc_paused():
             self._play(until)
@@ -183,7 +183,9 @@ class EventLoop:
             self.fail(crash)
 
     def _play_to_crash(self, inputs: Iterator[ScheduledInput]) -> AgentFailedError | None:
-        """Play the inputs. Return the failure of the first agent that crashes, or None at the end."""
+        """Play the inputs until an agent crashes, and return the failure of this agent. Return None if no agent
+        crashes.
+        """
         alive = self._alive
         incarnation: SimulatedIncarnation | None = None
         try:
@@ -219,11 +221,11 @@ class EventLoop:
             self.fail(crash)
 
     def fail(self, error: AgentFailedError) -> None:
-        """Record that an agent crashed, and end the record of this agent. The other agents continue."""
+        """Record that an agent crashed, and end the records of this agent. The other agents continue."""
         raise NotImplementedError
 
     def _handle_message(self, number: int, incarnation: SimulatedIncarnation, flight: MessageInFlight) -> None:
-        """Give a message to the agent, if it can affect the agent."""
+        """Give a message to the agent. Skip a message that cannot affect the agent."""
         sender, message = flight.sender, flight.message
         if self._tracing or incarnation.secured is not None or type(message) in ONLY_COUNTED:
             self._tally_answers(number, incarnation)
@@ -246,9 +248,7 @@ class EventLoop:
     def _handle_other_input(
         self, number: int, incarnation: SimulatedIncarnation, what: DueEvent | StrayDatagram | None
     ) -> None:
-        """Give the agent an input that is not a message of another agent: a timer expiry, an event, or a foreign
-        datagram.
-        """
+        """Give the agent a timer expiry, an event, or a datagram that no agent sent as a message."""
         agent = incarnation.agent
         if what is None:
             self._end_timer(number, incarnation)
@@ -289,7 +289,7 @@ class EventLoop:
         self._finish_input(number, incarnation)
 
     def _tally_answers(self, number: int, incarnation: SimulatedIncarnation) -> None:
-        """Give the agent those answers that have arrived and that it only counts.
+        """Give the agent all answers that have arrived, if their only effect is that the agent counts them.
 
         The loop calls this before the tally is read, and before other inputs if a trace is written, so that the lines
         of the trace are in order.
@@ -331,7 +331,9 @@ class EventLoop:
                 self._recent_messages.append((incarnation.agent.agent_id, sequence, message, self._now))
 
     def _send_sealed(self, number: int, incarnation: SimulatedIncarnation, agent: KeyedAgent) -> None:
-        """Send the encrypted messages of the agent. A rogue node that starts later does not receive them."""
+        """Send the encrypted messages of the agent. If a rogue node starts after this call, it does not receive these
+        messages.
+        """
         for sealed, sequence, message, plain in agent.sealed_to_send():
             if message is None:
                 self._send_stray(number, incarnation, sealed)
@@ -399,8 +401,8 @@ class EventLoop:
         self._recorder.write(agent_id, entries)
 
     def _check_sought(self, agent_id: int, run: HandlerRun) -> None:
-        """Check whether a caller waits for this handler run. If the timeline has just changed, store the run for a
-        later check.
+        """Check whether a caller waits for this handler run. If the timeline has just changed, only store the handler
+        run, so that the next call of `until_run` can check it.
         """
         if self._recent_runs is not None:
             self._recent_runs.append((agent_id, run))

@@ -1,4 +1,5 @@
-"""Prove that a simulated swarm repeats a cycle forever: the state of all agents recurs, and no other input will come.
+"""Prove that a simulated swarm repeats a cycle forever. In a cycle, the state of all agents recurs, and no input from
+outside the swarm follows.
 
 The search compares the swarm at moments without messages in flight, just before the next timer ends. A state consists
 of the protocol state of every agent, its timers relative to this moment, and the order of the timers. From this moment
@@ -70,7 +71,8 @@ class RecurrenceSearch:
     def check(
         self, swarm: Sequence[AgentAtRest], order: Sequence[object], fates: tuple[int, ...], fate_at: float
     ) -> bool:
-        """Return true if the swarm repeats a cycle. At this moment no message may be on its way, and a timer must run.
+        """Return true if the swarm repeats a cycle. Call this only while no message is on its way and at least one
+        timer runs.
 
         - `order`: order of the next ends of timers, for late timers also within an agent.
         - `fates`: number of messages that each scripted fate has matched.
@@ -96,7 +98,9 @@ class RecurrenceSearch:
         return False
 
     def record_timer_ends(self, now: float, local_s: float, state: AgentState) -> None:
-        """Record that timers of an agent are about to expire. At this moment, the agent has counted all answers."""
+        """Record that timers of an agent are about to expire. The agent must already have counted all answers that have
+        arrived.
+        """
         if now != self._next_s:
             self._delays_matter = True
         for timer in state.timers:
@@ -109,7 +113,9 @@ class RecurrenceSearch:
             self._answered_by[state.agent_id] |= state.reconcile_responders
 
     def record_state_after_timers(self, swarm: Sequence[AgentAtRest]) -> None:
-        """Record the state after all timers of this moment have expired, and before their messages arrive."""
+        """Record the state of the swarm after all timers of this moment have expired, and before the resulting messages
+        arrive.
+        """
         self._state_after_timers = _changeable_by_messages(swarm)
 
     def cycle(self, swarm: Sequence[AgentAtRest]) -> Cycle:
@@ -131,7 +137,7 @@ class RecurrenceSearch:
 
 
 def _changeable_by_messages(swarm: Sequence[AgentAtRest]) -> list[object]:
-    """Return the parts of the states that messages can change, without the counted answers."""
+    """Return the parts of the agents' states that messages can change, except the counts of answers."""
     return [
         (
             state.chain.top_chain_hash,

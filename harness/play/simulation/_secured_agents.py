@@ -57,7 +57,7 @@ class SimulatedKeys:
         self.crypto = cached_crypto()
 
     def agent(self, agent_id: int, incarnation: int, now: float) -> Callable[..., SecuredOwnAgent]:
-        """Return a function that creates an agent with keys, which starts at mission second `now`.
+        """Return a function that creates an agent with keys. The agent starts at mission second `now`.
 
         Incarnations are numbered from 1.
         """
@@ -85,10 +85,10 @@ class SimulatedKeys:
 
 
 def _drops_nothing(scenario: Scenario) -> bool:
-    """Return true if agents with keys cannot drop a datagram in this scenario, for any seed.
+    """Return true if agents with keys drop no datagram in this scenario, with any seed.
 
-    They drop copies, datagrams from other senders or earlier incarnations, and answers that arrive after a newer query.
-    None of these occurs if all agents are correct and the network only loses messages and has partitions.
+    Agents with keys drop copies, datagrams from other senders or earlier incarnations, and answers that arrive after
+    a newer query. None of these occurs if all agents are correct, and the network has only loss and partitions.
     """
     timers = scenario.settings
     return not (

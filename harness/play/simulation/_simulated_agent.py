@@ -39,7 +39,7 @@ class VirtualAgent(Protocol):
 
     @property
     def chain_changed_at(self) -> float | None:
-        """The time of the last change of the chain on the agent's clock. 0 means no change yet, and None means
+        """The time at which the chain last changed, by the agent's clock. 0 means no change yet, and None means
         unknown.
         """
 
@@ -75,7 +75,7 @@ class VirtualAgent(Protocol):
     def status(self) -> AgentStatus: ...
 
     def known_status(self) -> AgentStatus | None:
-        """Return the status of the agent, or None if the agent has failed."""
+        """Return the status of the agent. Return None if the agent has failed."""
 
     def completed(self) -> list[bytes]:
         """Return the hashes of the blocks that the agent has completed, in order."""
@@ -86,7 +86,7 @@ class VirtualAgent(Protocol):
     def stored(self, now: float) -> DiskContents: ...
 
     def end(self, now: float) -> None:
-        """End the agent. Later calls return its state at this time."""
+        """End the agent. Its methods return the state at the time `now` afterwards."""
 
 
 class OwnAgent(Agent):
@@ -139,4 +139,4 @@ class OwnAgent(Agent):
         return StoredState.of(self.state)
 
     def end(self, now: float) -> None:
-        """Do nothing when the agent ends, because this object keeps the state of the agent."""
+        """Do nothing. After the end, this object still has the last state of the agent."""

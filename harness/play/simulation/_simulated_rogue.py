@@ -21,7 +21,7 @@ MOMENT_S = LATENCY.mean_s
 
 
 class VirtualRogue:
-    """The rogue node on a simulated network. Its `number` there follows the numbers of the agents."""
+    """The rogue node on a simulated network. Its `number` is the next one after the numbers of the agents."""
 
     def __init__(
         self,

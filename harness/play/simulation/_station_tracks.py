@@ -67,7 +67,9 @@ class StationTracks:
         return shown
 
     def show(self, mission_s: float, lost: set[int]) -> None:
-        """Send the positions of the vehicles that are not `lost`, if the last update was at least `SHOW_S` ago."""
+        """Send the positions of all vehicles except the `lost` ones to the ground station. Do nothing if the last
+        update was less than `SHOW_S` ago.
+        """
         if (at := time.monotonic()) - self._shown_at < SHOW_S:
             return
         self._shown_at = at

@@ -80,7 +80,7 @@ class _AnswerLog:
 
 @dataclass(slots=True, eq=False)
 class _OpenQuery:
-    """A query of an agent that still accepts answers, since the position `since` in the order of inputs."""
+    """A query that an agent sent at the position `since` of all inputs. The agent still accepts answers to it."""
 
     question: Question
     log: _AnswerLog
@@ -104,7 +104,7 @@ Incarnation 0 stands for the current one. Without a time, the event has that of 
 
 @dataclass(frozen=True, slots=True)
 class StrayDatagram:
-    """A datagram from the address of vehicle `source` that the agent there did not send as a message."""
+    """A datagram with the address of vehicle `source` as its sender, but not a message of the agent there."""
 
     source: int
     datagram: bytes
@@ -112,7 +112,7 @@ class StrayDatagram:
 
 
 class _BroadcastCopies:
-    """The copies of a broadcast that arrive. Each is a pair of receiver and delay in seconds."""
+    """The copies of a broadcast that reach receivers. Each is a pair of receiver number and delay in seconds."""
 
     def __init__(self, copies: list[tuple[int, float]]) -> None:
         self._copies = copies
@@ -180,12 +180,12 @@ class VirtualAir:
         """Number of a hold -> held messages, each with its receiver and its arrival without the hold."""
 
     def deliver_everything(self) -> None:
-        """Also deliver messages that cannot have an effect on their receiver. Earlier messages are not affected."""
+        """Deliver all messages from now on, including those that cannot have an effect on their receiver."""
         self._deliver_all = True
 
     @property
     def quiet_at(self) -> float:
-        """The mission second after which no message that is on its way still arrives.
+        """The latest mission second at which a message that is now on its way can arrive.
 
         While a shared channel has messages, it is at least the time of the channel's next event.
         """
@@ -193,8 +193,8 @@ class VirtualAir:
         return self._quiet_at if channel is None or channel.next_s == NEVER else max(self._quiet_at, channel.next_s)
 
     def inputs_until(self, mission_s: float) -> Iterator[ScheduledInput]:
-        """Yield the inputs of all agents up to and including `mission_s`, in order. Inputs may be added during the
-        loop.
+        """Yield the inputs of all agents up to and including `mission_s`, in order. The caller may add inputs between
+        two steps.
         """
         queue = self._queue
         while True:
@@ -212,17 +212,17 @@ class VirtualAir:
         self.position = (mission_s, self._rank, 0, None)
 
     def schedule(self, at: float, number: int, what: DueEvent | None) -> None:
-        """Schedule an event to log, or a timer expiry if `what` is None."""
+        """Schedule an event that the agent logs. If `what` is None, schedule the expiry of a timer instead."""
         self._rank += 1
         heappush(self._queue, (at, self._rank, number, what))
 
     def timer_order(self, ends: Mapping[int, float]) -> list[int]:
-        """Return the agents sorted by the expiry of their next timers. `ends` contains the expiry of each."""
+        """Return the agents in the order of their next timer expiries, which `ends` contains."""
         queue = sorted(happening[:3] for happening in self._queue if happening[3] is None)
         return list(dict.fromkeys(number for at, _, number in queue if ends.get(number) == at))
 
     def inject(self, at: float, stray: StrayDatagram, numbers: Iterable[int]) -> None:
-        """Schedule the arrival of a foreign datagram at these agents."""
+        """Schedule the arrival at these agents of a datagram that no agent sent as a message."""
         self._rank += 1
         self._quiet_at = max(self._quiet_at, at)
         for number in numbers:
@@ -286,8 +286,8 @@ class VirtualAir:
             self._channel.move([places[agent_id] for agent_id in self._roster], now)
 
     def apply(self, conditions: NetworkConditions, now: float, *, clears_all: bool) -> None:
-        """Apply these network conditions to later broadcasts. `clears_all` also ends the shared channel, with all its
-        messages.
+        """Apply these network conditions to later broadcasts. If `clears_all` is true, also remove the shared channel
+        and all messages on it.
         """
         if clears_all and self._channel is not None:
             self._channel, self._medium.latency = None, LATENCY
@@ -342,7 +342,8 @@ class VirtualAir:
     # Answers
 
     def take_answers(self, number: int) -> list[tuple[float, int, MessageInFlight]]:
-        """Return the new answers that the agent counts, in order, each as (mission seconds, rank, answer).
+        """Return the answers that the agent must count now, in order of arrival, each as (mission seconds, rank,
+        answer).
 
         They have arrived since the agent's query. Only the first answer of each sender counts.
         """
@@ -370,7 +371,7 @@ class VirtualAir:
         return new
 
     def close_ended_queries(self, number: int, state: AgentState) -> None:
-        """Close each open query of an agent that no longer accepts answers to it."""
+        """Close the open queries to which the agent no longer accepts answers."""
         open_queries = self.open_queries[number]
         for about, query in list(open_queries.items()):
             if not STILL_ASKED[query.question[0]](state):
@@ -378,7 +379,7 @@ class VirtualAir:
                 query.log.askers.remove(number)
 
     def remove_agent(self, number: int) -> None:
-        """Remove an agent that was killed from the network."""
+        """Remove a killed agent from the network."""
         for query in self.open_queries[number].values():
             query.log.askers.remove(number)
         self.open_queries[number].clear()
@@ -386,7 +387,7 @@ class VirtualAir:
         self.busy_until[number] = 0.0
 
     def _open_query(self, number: int, question: Question) -> None:
-        """Open a query of the agent. Later answers to the same query of another agent count for it too."""
+        """Open a query of the agent. Later answers to a different agent with the same query count, too."""
         open_queries = self.open_queries[number]
         about: QueryKind = "vote" if question[0] is BlockAddResponse else "reconcile"
         before = open_queries.get(about)
@@ -400,7 +401,7 @@ class VirtualAir:
                 self._schedule_earliest(flights, number, query)
 
     def _keep_answer(self, question: Question, flight: MessageInFlight, sender: int) -> None:
-        """Keep an answer for the agents that have sent the same query, or will send it before the answer arrives."""
+        """Store an answer for all agents that have sent its query, or will send it before the answer arrives."""
         log = self._answer_logs[question]
         log.answer_count += 1
         log.quiet_at = self._quiet_at
@@ -426,7 +427,7 @@ class VirtualAir:
     def _earliest(
         self, flights: Iterable[MessageInFlight], receiver: int, since: ScheduledInput
     ) -> tuple[float, int, MessageInFlight] | None:
-        """Return the message that arrives first after `since`, as (mission seconds, rank, message), or None."""
+        """Return (mission seconds, rank, message) of the first arrival after `since`. Return None if there is none."""
         since_s, since_rank, _, _ = since
         started_at = self.started_at[receiver]
         soonest, latest = self._medium.soonest, self._medium.latest
@@ -481,7 +482,7 @@ class VirtualAir:
         return True
 
     def release(self, number: int, at: float) -> None:
-        """Stop holding back the messages of this rule. The messages arrive at the time `at`, or at their own time if
+        """End the hold with this number. Each held message arrives at the time `at`, or at its original arrival time if
         that is later.
         """
         for flight, receiver, would_arrive in self._held.pop(number, ()):

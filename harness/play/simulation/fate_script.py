@@ -19,7 +19,7 @@ NameOf = Callable[[bytes], str | None]
 
 @dataclass(slots=True, eq=False)
 class _ScriptedFate:
-    """A scripted delivery rule, with the number of messages that it matched and of deliveries that it decided."""
+    """A scripted delivery rule with two counts: the messages that it matched, and the deliveries that it decided."""
 
     index: int
     fate: Fate
@@ -37,7 +37,9 @@ class _ScriptedFate:
 
 @dataclass(slots=True)
 class DecidedDelivery:
-    """The decided delivery of one message. Times are mission seconds, and receivers are numbers."""
+    """The arrival times of one message that scripted rules decided. Times are mission seconds, and receivers are
+    numbers.
+    """
 
     arrivals: list[tuple[int, float]] = field(default_factory=list)
     """(receiver, time): the copy arrives at this time."""
@@ -50,7 +52,7 @@ class DecidedDelivery:
 
 
 class FateScript:
-    """The scripted delivery rules of a run. `name_of` returns the name of the block with a hash.
+    """The scripted delivery rules of a run. `name_of` returns the name of the block that has a given hash.
 
     The number of a receiver is its index in `roster`.
     """
@@ -68,7 +70,7 @@ class FateScript:
             self._about[part.fate.message, part.fate.sender].append(part)
 
     def hold(self, fate: Fate) -> int:
-        """Add a rule that holds back matching messages from now on. Return its number."""
+        """Add a rule that holds back all matching messages that are sent from now on. Return the number of the rule."""
         part = _ScriptedFate(len(self._parts), fate.model_copy(update={"until_s": None}), holds=True)
         self._parts.append(part)
         self._about[fate.message, fate.sender].append(part)
@@ -76,14 +78,14 @@ class FateScript:
         return part.index
 
     def release(self, number: int, fate: Fate) -> None:
-        """Set the times at which the rule with this number stops to hold back messages, as `fate` gives them."""
+        """End the hold with this number. `fate` is the rule with the times at which the hold ends."""
         part = self._parts[number]
         part.fate, part.holds = fate, False
 
     def decide(
         self, now: float, sender: int, message: Message, draws: RandomDraws, hears: Callable[[int], bool]
     ) -> DecidedDelivery | None:
-        """Return the delivery of a message of agent `sender`, or None if no rule matches it."""
+        """Return the delivery of a message of agent `sender`. Return None if no rule matches the message."""
         parts = [part for part in self._matching(now, sender, message) if self._count_match(part)]
         if not parts:
             return None
@@ -123,7 +125,8 @@ class FateScript:
         return decided
 
     def settled_counts(self, now: float) -> tuple[int, ...] | None:
-        """Return the number of messages that each rule has matched, limited to the largest number that the rule names.
+        """Return the number of messages that each rule has matched, at most the largest message number in the rule's
+        `count`.
 
         Return None if the result of a rule still depends on time.
         """
@@ -137,7 +140,7 @@ class FateScript:
     def unmatched(self, waiting: Collection[str]) -> list[str]:
         """Return a sentence for each rule that had no effect, because its author expects an effect.
 
-        `waiting`: names of fates for whose message another message still waits.
+        `waiting`: names of rules. The message that such a rule matches has not arrived, and other messages wait for it.
         """
         sentences = []
         for part in self._parts:
@@ -173,7 +176,7 @@ class FateScript:
 
 
 class RunningTimer(NamedTuple):
-    """A running timer of an agent, with its number among all timers of this name."""
+    """A running timer of an agent. Its number counts all timers that the agent has started, from 0."""
 
     name: str
     number: int
@@ -209,8 +212,8 @@ class LateTimers:
         return self._started > max(late, default=-1) and running.isdisjoint(late)
 
     def next(self, at: Callable[[float], float]) -> tuple[float, RunningTimer] | None:
-        """Return the next timer to expire, and its mission second. `at` converts a time on the agent's clock to mission
-        seconds.
+        """Return the mission second of the next timer expiry, and the timer. `at` converts a time on the agent's clock
+        to mission seconds.
         """
         ends = ((at(timer.deadline) + self._late_by_s.get(timer.number, 0.0), timer) for timer in self.running.values())
         return min(ends, default=None, key=lambda end: (end[0], end[1].deadline))

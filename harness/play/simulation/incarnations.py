@@ -88,7 +88,7 @@ class SimulatedIncarnation:
         return self.mission_s(local_s) if local_s else local_s
 
     def _last_local_s(self, mission_s: float) -> float:
-        """Return the time on the agent's clock, or the time at which the agent ended if it has ended."""
+        """Return the time on the agent's clock. If the agent has ended, return the time of its end."""
         return self.local_s(mission_s if self.ended_at is None else self.ended_at)
 
 
@@ -101,7 +101,7 @@ class BlockNames:
         self._names: dict[bytes, str] = {}
 
     def of(self, block_hash: bytes) -> str | None:
-        """Return the name of a block, such as 3.2, or None if no agent has completed it."""
+        """Return the name of a block, such as 3.2. Return None if no agent has completed the block."""
         if block_hash not in self._names:
             for agent_id, incarnations in zip(self._roster, self._incarnations, strict=True):
                 completed = dict.fromkeys(

@@ -26,7 +26,7 @@ class RecordedSeals:
 
 
 def recorded_seals(script: Iterable[ScriptedEvent], agent_id: int) -> RecordedSeals | None:
-    """Return the encrypted data of this agent in a script of events, or None if there are none."""
+    """Return the encrypted event data of this agent from a script of events. Return None if the script has none."""
     sealed = {
         event.logged.encode(): base64.b64decode(event.sealed)
         for event in script

@@ -27,7 +27,9 @@ class RestoredSwarm(Simulation):
         self._generating = False
 
     async def give_deque(self, agent_id: int) -> None:
-        """Restart the agent with its current state and the stored deque, without blocks that it already holds."""
+        """Restart the agent with its current state, and add the blocks of its stored deque that the agent does not
+        hold.
+        """
         incarnation = self._alive[self._number[agent_id]]
         assert incarnation is not None and incarnation.state is not None, "the agent has booted"
         state = incarnation.state

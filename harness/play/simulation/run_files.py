@@ -67,7 +67,7 @@ class DiskRecorder:
             write_json_atomically(path, incarnation.export(at_s))
 
     def problems(self) -> dict[int, str]:
-        """Return, for each agent whose trace ended early, the reason."""
+        """Return the agents whose traces ended early, each with the reason."""
         return {agent_id: trace.problem for agent_id, trace in self._traces.items() if trace.problem}
 
     def close(self) -> None:

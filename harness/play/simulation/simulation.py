@@ -72,7 +72,8 @@ class Simulation(EventLoop):
         air: Callable[..., VirtualAir] = VirtualAir,
         programs: "ProgramPool | None" = None,
     ) -> None:
-        """
+        """Create a swarm whose mission has not begun.
+
         - `on_progress`: awaited every `PROGRESS_S` mission seconds.
         - `pace`: limits the speed of virtual time.
 
@@ -251,7 +252,7 @@ class Simulation(EventLoop):
         return False
 
     def _is_settled(self) -> bool:
-        """Return true if all agents are idle. If some hang instead, record them.
+        """Return true if all agents are idle. If agents hang instead, record them in `played`.
 
         Callers must make sure that no message is on its way and that no timer runs.
         """
@@ -264,7 +265,7 @@ class Simulation(EventLoop):
         return not hanging and all(incarnation.waiting is None for incarnation in self.living())
 
     def _new_recurrence(self) -> RecurrenceSearch | None:
-        """Return a search for an endless cycle, or None if the future depends on random numbers or on further
+        """Return a search for an endless cycle. Return None if the future depends on random numbers or on further
         inputs.
         """
         moving = bool(self._tracks) and self.scenario.network.radio and self.played.final_reconcile is None
@@ -276,7 +277,7 @@ class Simulation(EventLoop):
         return RecurrenceSearch(delays)
 
     async def _run_until_recurrence(self, mission_s: float, recurrence: RecurrenceSearch) -> bool:
-        """Run until `mission_s`, or until the swarm repeats a cycle forever. Return true if it does."""
+        """Run until `mission_s`, or until the swarm repeats a cycle forever. Return true in the second case."""
         self._recurrence = recurrence
         while self._now < mission_s:
             if self._air.quiet_at > self._now:
@@ -452,7 +453,9 @@ class Simulation(EventLoop):
     def _handler_runs(
         self, incarnation: SimulatedIncarnation, status: AgentStatus | None
     ) -> dict[str, int | float] | None:
-        """Return the number of handler runs of the agent. A foreign agent reports this number itself."""
+        """Return the number of handler runs of the agent, with the time of the count. A foreign agent reports this
+        number.
+        """
         if status is None:
             return None
         at_s = self._now if incarnation.ended_at is None else incarnation.ended_at

@@ -1,4 +1,4 @@
-"""The simulation backend: it plays a swarm in virtual time, and writes the same run directory as other backends."""
+"""The simulation backend. It plays a swarm in virtual time, and writes a run directory like the other backends."""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -139,7 +139,7 @@ async def _open_station(simulation: Simulation) -> "StationTracks":
 
 
 def _export(simulation: Simulation, files: DiskRecorder) -> None:
-    """Record the end of the run, and export the chains of all agents that still answer. Raises OSError."""
+    """Record the end of the run, and export the chains of all agents that have not failed. Raises OSError."""
     while True:
         try:
             simulation.end()

@@ -36,10 +36,12 @@ class AgentOperations(Protocol):
     """
 
     async def end_incarnation(self, agent_id: int, *, with_vehicle: bool = False, disk_kept: bool = False) -> None:
-        """End the agent, and also its vehicle if `with_vehicle` is true. `disk_kept` keeps the data on its disk."""
+        """End the agent, and also its vehicle if `with_vehicle` is true. If `disk_kept` is true, the data on its disk
+        are kept.
+        """
 
     async def begin_incarnation(self, agent_id: int, *, new_vehicle: bool = False) -> None:
-        """Start the agent again with the data on its disk. If `new_vehicle` is true, the agent gets a new vehicle."""
+        """Restart the agent with the data on its disk. If `new_vehicle` is true, the agent gets a new vehicle."""
 
     async def fall(self, agent_id: int) -> None:
         """Let the vehicle of the agent fall to the ground."""
@@ -50,7 +52,7 @@ class AgentOperations(Protocol):
     async def resume(self, agent_id: int) -> None: ...
 
     async def stop_logging(self, agent_id: int) -> None:
-        """Stop the logging of events by the agent until the agent starts again."""
+        """Stop the logging of events by the agent until its next start."""
 
     async def switch_off(self, agent_id: int) -> None:
         """Let the agent export its chain, and then end it and its vehicle."""
@@ -64,8 +66,8 @@ class AgentOperations(Protocol):
     async def set_circumstance(
         self, agent_id: int, what: str, circumstance: SimulatedFailure, *, by_hand: bool
     ) -> None:
-        """Let the vehicle of the agent simulate an event such as a GPS failure. The run record states whether it
-        could.
+        """Let the vehicle of the agent simulate an event such as a GPS failure. The run record states whether this was
+        possible.
         """
 
 
@@ -133,7 +135,7 @@ class Fault:
 
     @property
     def disk_after(self) -> DiskState | None:
-        """The state of the disks after the fault, or None if the fault does not concern disks."""
+        """The state of the disks after the fault. None if the fault does not concern disks."""
         return None
 
     @classmethod
@@ -143,12 +145,12 @@ class Fault:
 
     @classmethod
     def further_keys(cls) -> list[str]:
-        """Return the keys of the timeline entry, other than `at_s` and the name of the fault."""
+        """Return the keys of the timeline entry, except `at_s` and the name of the fault."""
         return [field.name for field in fields(cls) if field.name not in Fault.__dataclass_fields__]
 
     @classmethod
     def entry_keys(cls, *agents: int, **further: Any) -> dict[str, Any]:
-        """Return the keys of a timeline entry, as arguments for the call in a pytest test."""
+        """Return the keys of a timeline entry, from the arguments of a call in a pytest test."""
         return {cls.what: list(agents), **cls.default_values, **further}
 
     @property
@@ -169,5 +171,7 @@ SAME_TIME_S = 0.001
 
 
 def planned_key(planned_s: float, at_s: float) -> dict[str, float]:
-    """Return the key `planned_s` for a record, if the change was made later than planned. Otherwise return no key."""
+    """Return the key `planned_s` for the record of a change that was made after its planned time. Otherwise return no
+    key.
+    """
     return {} if abs(planned_s - at_s) < SAME_TIME_S else {"planned_s": planned_s}

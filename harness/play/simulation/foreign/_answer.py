@@ -1,4 +1,4 @@
-"""Parse an answer line of a foreign agent (a separate program), and define the errors of such an agent."""
+"""Parse an answer line of a foreign agent (a separate program), and define the errors that the agent can cause."""
 
 import base64
 import math
@@ -91,7 +91,7 @@ def _datagram(text: Any) -> tuple[bytes, RecordedBytes]:
 
 
 def _entries(trace: list[Any]) -> Iterable[Entry]:
-    """Yield the lines of a trace except its header, which the harness writes itself."""
+    """Yield the lines of a trace except its header, which the harness writes."""
     for number, line in enumerate(trace):
         if isinstance(line, dict) and "schema" in line:
             continue

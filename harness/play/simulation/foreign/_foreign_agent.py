@@ -57,7 +57,7 @@ class _CounterPerSecond:
 
 @dataclass
 class IncarnationRecord:
-    """The recorded inputs and answers of a program, as lines, from its start to its end. Recording stops after `limit`
+    """The recorded inputs and answers of an agent, as lines, from one start to its end. Recording stops after `limit`
     bytes.
     """
 
@@ -76,7 +76,7 @@ class IncarnationRecord:
 
 
 class ForeignAgent:
-    """A foreign agent from one start to its end. It implements the interface `VirtualAgent`.
+    """A foreign agent (a separate program) from one start to its end. It implements the interface `VirtualAgent`.
 
     The methods raise AgentFailedError or AgentLacksError. After a failure, each input raises the same error again.
     """
@@ -167,7 +167,7 @@ class ForeignAgent:
         return self._timer
 
     def silent_until(self) -> float | None:
-        """Return None, because the internal state of the program is unknown."""
+        """Return None, because the harness does not know how long a separate program ignores messages."""
         return None
 
     def outgoing(self) -> Sequence[AgentOutput]:

@@ -110,7 +110,7 @@ class ForeignSwarm:
         return agent
 
     def ended(self, agent: VirtualAgent) -> None:
-        """Make the program of an agent that has ended available for another agent."""
+        """Return the program of an ended agent to the pool, so that a different agent can use it."""
         if (program := self._playing.pop(agent.agent_id, None)) is not None:
             self._programs.give_back(program)
 

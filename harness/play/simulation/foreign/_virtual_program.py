@@ -127,7 +127,7 @@ class LineProgram:
         return line
 
     def _read_rest(self, limit_s: float) -> bytes:
-        """Read the rest of a line that arrives in several pieces, and return the whole line."""
+        """Read a line that arrives in several pieces to its end, and return the whole line."""
         deadline = time.monotonic() + limit_s
         pieces = [self._received]
         length = len(self._received)
@@ -145,7 +145,7 @@ class LineProgram:
         return self._received[: self._received.find(b"\n") + 1]
 
     def _write_rest(self, left: memoryview) -> None:
-        """Write the rest of a line when the pipe is full. Output of the program is read meanwhile, so that it can
+        """Write the remaining bytes of a line when the pipe is full. Also read output of the program, so that it can
         continue.
         """
         deadline = time.monotonic() + ANSWER_LIMIT_S
@@ -186,7 +186,7 @@ class LineProgram:
         return f"; its last output: {words}" if words else ""
 
     def last_line(self) -> str:
-        """Return the last line of standard error, or an empty string."""
+        """Return the last line of the program's standard error. Return an empty string if there is none."""
         if self.log is not None:
             return last_line_in(self.log)
         size = self._errors.seek(0, os.SEEK_END)
@@ -224,7 +224,7 @@ class LineProgram:
         self.end()
 
     def release(self) -> None:
-        """Close this process's files for the program without ending the program."""
+        """Close the pipes and files that this process uses for the program. Do not kill the program."""
         self.close_input()
         assert self._process.stdout is not None
         self._process.stdout.close()
@@ -288,7 +288,7 @@ class ProgramPool:
         return None
 
     def give_back(self, program: LineProgram) -> None:
-        """Return the program to the pool. End a program that still has to write an answer."""
+        """Return the program to the pool. If it has not answered its last input, end it instead."""
         with self._lock:
             self._taken.discard(program)
             if program.owes_an_answer:
@@ -300,7 +300,7 @@ class ProgramPool:
                 self._idle.pop(0).close()
 
     def close(self) -> dict[int, list[str]]:
-        """End all programs. If they have logs, return the names of processes that they left behind, by agent."""
+        """End all programs. Return, by agent, the names of processes that a program with a log left behind."""
         programs = [*self._taken, *self._idle]
         self._taken.clear()
         self._idle.clear()

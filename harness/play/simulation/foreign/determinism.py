@@ -43,7 +43,8 @@ class DeterminismCheck:
             time.sleep(1 - time.time() % 1)
 
     def compare(self, record: IncarnationRecord) -> None:
-        """Give an agent its recorded inputs again. Raises NondeterminismError if an answer differs.
+        """Give an agent's recorded inputs to a program with the same command. Raises NondeterminismError if an answer
+        differs from the recorded one.
 
         The first incarnation of each command gets its inputs twice, so that each process plays more than one
         incarnation.
@@ -78,7 +79,9 @@ def _error_message(record: IncarnationRecord, difference: str, *, used: bool) ->
 
 
 def _first_difference(program: LineProgram, record: IncarnationRecord) -> str | None:
-    """Give the recorded inputs to a program. Return a description of the first answer that differs, or None."""
+    """Give the recorded inputs to a program. Return a description of the first answer that differs. Return None if all
+    are equal.
+    """
     for line, answer in record.exchanges:
         try:
             program.write(line)
