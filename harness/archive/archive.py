@@ -1,4 +1,4 @@
-"""Read the files of a run, or of a real flight, whether they are complete or damaged.
+"""Read the files of a run or of a real flight. The files may be complete or damaged.
 
 Checker, report and all other commands read runs through this module. It reads each file once, at its first use.
 Unusable data is left out. `problems` has a sentence for each damaged or wrong file. `gaps` has a sentence for each
@@ -58,7 +58,7 @@ ReportProgress = Callable[[str], None]
 
 
 class RecordedRun(NamedTuple):
-    """A handler run in a trace.
+    """A handler run in a trace, together with its agent and its line.
 
     `agent_id` is the agent. `life` is its incarnation, 1 until the first restart. `line` is the line in the trace, from
     1.
@@ -71,7 +71,7 @@ class RecordedRun(NamedTuple):
 
 
 class HeldBlock(NamedTuple):
-    """A block that agent `holder` holds in its `chain`, its `deque` or its reconcile `stack`.
+    """A block that the agent `holder` holds in its `chain`, its `deque` or its reconcile `stack`.
 
     `position` counts from 0, the oldest block of a chain first. The inception block is not counted.
     """
@@ -121,17 +121,17 @@ class RunArchive:
 
     @property
     def record(self) -> RunRecord:
-        """The readable content of run.json. Fields are empty where it is missing or damaged."""
+        """The readable content of run.json. Missing or damaged parts of the file give empty fields."""
         return self._record_file.record if self._record_file else RunRecord()
 
     @property
     def judged_record(self) -> JudgedRecord | None:
-        """The part of run.json that the checker needs, or None if any key of this part is missing or damaged."""
+        """The part of run.json that the checker needs. It is None if any key of this part is missing or damaged."""
         return self._record_file.judged if self._record_file else None
 
     @property
     def record_error(self) -> RunDirectoryError | None:
-        """The reason why an existing run.json cannot be read at all, or None."""
+        """The error that prevents any reading of an existing run.json. It is None if there is no such error."""
         return self._record_file.error if self._record_file else None
 
     @property
@@ -141,7 +141,9 @@ class RunArchive:
 
     @cached_property
     def origin(self) -> RunRecord:
-        """The content of run.json for the exports, even if only single files of the run directory were given."""
+        """The content of the run.json that belongs to the exports. It is also found if only single files of the run
+        directory were given.
+        """
         if self.directory is not None:
             return self.record
         beside = dict.fromkeys(path.parent for file in self._export_files for path in (file.parent, file))
@@ -154,12 +156,12 @@ class RunArchive:
 
     @cached_property
     def roster(self) -> list[int]:
-        """The IDs of the agents: those in run.json, or else those of agents that left files."""
+        """The IDs of the agents according to run.json. Without run.json, the IDs of the agents that left files."""
         names = (path.name.partition(".")[0] for directory in self._agents for path in directory.glob("*.*.json*"))
         return self.record.known_agents or sorted({int(name) for name in names if _AGENT_ID.fullmatch(name)})
 
     def forget_record(self) -> None:
-        """Forget the content of run.json after it was rewritten, so that it is read again."""
+        """Forget the stored content of run.json after this file was rewritten. The next access reads the file again."""
         for name in ("_record_file", "origin", "roster"):
             self.__dict__.pop(name, None)
 
@@ -172,7 +174,9 @@ class RunArchive:
 
     @cached_property
     def before_final_reconcile(self) -> dict[int, Export]:
-        """The chain exports before the final reconcile, by agent. There are none without a final reconcile."""
+        """The chain exports by agent, from before the final reconcile. They are empty if there was no final
+        reconcile.
+        """
         return self._before_final_reconcile.by_agent
 
     @cached_property
@@ -182,11 +186,11 @@ class RunArchive:
 
     @cached_property
     def traces(self) -> dict[int, Trace]:
-        """The trace of each agent in order of IDs. This loads all traces into memory."""
+        """The trace of each agent, in order of agent IDs. The first access loads all traces into memory."""
         return self._read_traces[0]
 
     def trace_lines(self, agent_id: int) -> Iterator[HandlerRunLine]:
-        """Yield the lines with handler runs in the trace of an agent. Raises RunDirectoryError at a damaged line."""
+        """Yield the lines with handler runs in the trace of an agent. Raises RunDirectoryError if a line is damaged."""
         assert self.directory is not None
         return read_trace_lines(trace_file(agents_directory(self.directory), agent_id))
 
@@ -213,7 +217,7 @@ class RunArchive:
 
     @cached_property
     def epoch_us(self) -> int | None:
-        """The timestamp of mission second 0, which most trace headers contain, or None without a readable header."""
+        """The timestamp of mission second 0 that most trace headers contain. It is None if no header can be read."""
         epochs = Counter(
             epoch for path in self._trace_files if type(epoch := read_clock(path).get("epoch_us")) is int
         ).most_common(1)
@@ -221,7 +225,7 @@ class RunArchive:
 
     @cached_property
     def large(self) -> bool:
-        """True if the traces together are larger than LARGE_BYTES."""
+        """True if all traces together are larger than LARGE_BYTES."""
         files = [path for path in self._trace_files if path.is_file()]
         return any(map(is_packed, files)) or sum(path.stat().st_size for path in files) > LARGE_BYTES
 
@@ -273,7 +277,7 @@ class RunArchive:
 
     @cached_property
     def public_keys(self) -> "PublicKeys | None":
-        """The public keys of a secured mission, or None if there are none or they cannot be used."""
+        """The public keys of a secured mission. They are None if the files contain none or if they cannot be used."""
         return self._public_keys[0]
 
     @cached_property
@@ -301,8 +305,8 @@ class RunArchive:
 
     @property
     def anchor(self) -> str | None:
-        """The source that confirms the public keys: the user, or run.json with their fingerprint. None without a
-        source.
+        """The source that confirms the public keys: `--keys` for keys that the user gave, or run.json if it contains
+        their fingerprint. It is None without such a source.
         """
         if self._trusted_keys is not None:
             return "--keys"
@@ -311,7 +315,7 @@ class RunArchive:
 
     @property
     def stores(self) -> dict[int, Path]:
-        """The store file of each agent with a disk, by agent ID. After restarts, this is the file of the last
+        """The store file of each agent with a disk, by agent ID. For a restarted agent, this is the file of its last
         incarnation.
         """
         if self.directory is None:
@@ -327,11 +331,15 @@ class RunArchive:
     # Network, vehicles and the rogue node
 
     def network(self, vehicles: Collection[int]) -> Connectivity:
-        """Return which vehicles could reach each other at each time. The result is empty for exports without a run."""
+        """Return which vehicles could reach each other at each time. The result is empty if the network was not
+        recorded.
+        """
         return read_connectivity(self._in_directory(NETWORK_FILE), vehicles)
 
     def link_losses(self, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
-        """Yield mission seconds with the loss rates (0 to 1) of links: first of all links, then of changed ones."""
+        """Yield mission seconds with the loss rates (0 to 1) of links. The first entry contains all links, and each
+        later entry the links whose loss rate changed.
+        """
         return read_link_losses(self._in_directory(NETWORK_FILE), vehicles)
 
     def tracks(self, vehicles: Collection[int]) -> VehicleTracks:
@@ -343,19 +351,19 @@ class RunArchive:
         return JsonLines(self._in_directory(ROGUE_FILE), model)
 
     def conditions(self, model: type[Record]) -> list[Record] | None:
-        """Return the recorded network changes and faults, each as an object of type `model`, or None without a
-        record.
+        """Return the recorded network changes and faults, each as an object of type `model`. Return None if they were
+        not recorded.
         """
         path = self._in_directory(NETWORK_FILE)
         return [*JsonLines(path, model)] if path is not None and path.is_file() else None
 
     def channel(self) -> list[ChannelLine] | None:
-        """Return the log of the shared radio channel, or None if there is none."""
+        """Return the log of the shared radio channel. Return None if there is no such log."""
         path = self._in_directory(CHANNEL_FILE)
         return [*JsonLines(path, ChannelLine)] if path is not None and path.is_file() else None
 
     def lag(self) -> MeasuredLag | None:
-        """Return the measured delays of the machine and the agents, or None if they were not measured."""
+        """Return the measured delays of the machine and the agents. Return None if they were not measured."""
         path = self._in_directory(LAG_FILE)
         lines = [*JsonLines(path, LagLine)] if path is not None and path.is_file() else []
         return MeasuredLag(lines) if lines else None
@@ -400,7 +408,7 @@ class RunArchive:
 
 
 def _early_end(trace: Trace, recorded: AgentRecord) -> str:
-    """Return the problem of a trace that its agent could not write to the end."""
+    """Return a sentence about a trace that ends early because its agent could not write all of it."""
     why = f"it ends early: {recorded.trace_problem}"
     counted = [life.counted if life else None for life in recorded.handler_runs]
     if not trace.runs or None in counted:

@@ -158,7 +158,7 @@ class JsonLines(Generic[Record]):
             self._problem = f"cannot be read: {error.strerror}"
 
     def leave_out(self) -> None:
-        """Count the last line of the file as unusable, because the caller rejected it."""
+        """Count the line that was read last as unusable. Call this method to reject a line that is valid JSON."""
         self._left_out += 1
 
     def problems(self) -> list[str]:

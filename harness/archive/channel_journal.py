@@ -12,8 +12,8 @@ Reason = Annotated[str, Field(max_length=20)]
 
 
 class ChannelLine(BaseModel):
-    """The receivers and losses of one message. `sequence` is None for a datagram that is not a message of the vehicle's
-    agent.
+    """The receivers and losses of one message. The sequence number `sequence` is None for a datagram that is not a
+    message of the vehicle's agent.
     """
 
     model_config = ConfigDict(strict=True)

@@ -34,7 +34,7 @@ Components = tuple[frozenset[int], ...]
 
 @dataclass(frozen=True, slots=True)
 class Topology:
-    """The groups of connected living vehicles from mission second `at_s` on. The largest group is first.
+    """The groups of connected living vehicles from mission second `at_s` on. The largest group is the first element.
 
     `what` names the change that caused them.
     """
@@ -46,7 +46,7 @@ class Topology:
 
 @dataclass(frozen=True, slots=True)
 class LossRates:
-    """The mean and the highest loss rate (0 to 1) of links between living vehicles from mission second `at_s` on.
+    """The mean and the highest loss rate (0 to 1) of the links between living vehicles, from mission second `at_s` on.
 
     Links with a loss of 1 are not counted, because they are no links.
     """
@@ -75,7 +75,7 @@ def _differs(loss: float, before: float) -> bool:
 
 @dataclass(frozen=True)
 class Connectivity:
-    """The states of the network over mission time. All lists are empty if the network was not recorded.
+    """The connections and losses of the network over mission time. All lists are empty if the network was not recorded.
 
     Consecutive states differ.
     """
@@ -102,13 +102,16 @@ class Connectivity:
         return [pair for pair in combinations(living, 2) if not _is_on(self._cut.get(pair, ()), at_s)]
 
     def loss(self, pair: Pair, at_s: float) -> float:
-        """Return the loss rate of a pair of vehicles at mission second `at_s`, as in `pair_losses`."""
+        """Return the loss rate between two vehicles at mission second `at_s`, with the meaning that it has in
+        `pair_losses`.
+        """
         losses = self.pair_losses.get(pair, [])
         at = bisect_right(losses, at_s, key=itemgetter(0))
         return losses[at - 1][1] if at else 1.0
 
     def airborne_intervals(self, vehicle: int, end_s: float) -> list[tuple[float, float, bool]]:
-        """Return the intervals in which the vehicle flew, each as (start, end, true if it was lost at the end).
+        """Return the intervals in which the vehicle flew. An interval is (start, end, true if the vehicle was lost at
+        the end).
 
         They end at `end_s` at the latest.
         """
@@ -148,7 +151,9 @@ class NetworkReplay:
         return self._out_of_range | self._cut_off
 
     def apply(self, line: NetworkLine) -> None:
-        """Apply a change. Raises ValueError, TypeError, AttributeError or KeyError if the line is invalid."""
+        """Apply a change of the network or a fault. Raises ValueError, TypeError, AttributeError or KeyError if the
+        line is invalid.
+        """
         losses = {self._pairs[name]: loss for name, loss in line.losses.items()}
         if line.asked is not None:
             conditions = NetworkConditions.from_json(line.asked)
@@ -180,13 +185,13 @@ class NetworkReplay:
         return losses
 
     def directions(self, pair: Pair) -> tuple[float, float]:
-        """Return the current loss rates of a pair of vehicles: from the lower to the higher ID, and back. Without a
-        link, both are 1.0.
+        """Return the current loss rates between two vehicles: from the lower ID to the higher ID, and back. Without a
+        link, both loss rates are 1.0.
         """
         return self._directions(pair) if self._is_up(pair) else (1.0, 1.0)
 
     def by_pair(self) -> dict[Pair, float]:
-        """Return the current loss rate of each pair of vehicles, as the mean of both directions. Without a link, the
+        """Return the current loss rate between each two vehicles, as the mean of both directions. Without a link, the
         loss rate is 1.0.
         """
         return {pair: sum(self._directions(pair)) / 2 if self._is_up(pair) else 1.0 for pair in self._scripted}
@@ -268,7 +273,8 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
 
 
 def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
-    """Yield mission seconds and loss rates (0 to 1) of links: first of all links, then of changed ones.
+    """Yield mission seconds with the loss rates (0 to 1) of links. The first entry contains all links, and each later
+    entry the links whose loss rate changed.
 
     The loss is 1 for a link that is partitioned, out of radio range, or belongs to a lost vehicle. Invalid lines are
     left out.
@@ -291,8 +297,8 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
 
 
 def _append_state(states: list[Topology], state: Topology) -> None:
-    """Append a state of the network if it differs from the previous state. A state of the same mission second is
-    replaced.
+    """Append the state of the network if it differs from the last one in the list. A last state of the same mission
+    second is replaced.
     """
     if states and states[-1].at_s == state.at_s:
         states.pop()
@@ -309,5 +315,7 @@ def _toggle(times: dict[Key, list[float]], keys: Iterable[Key], at_s: float) -> 
 
 
 def _is_on(times: Sequence[float], at_s: float) -> bool:
-    """Return true if a condition is on at `at_s`. The condition is off at first and changes at each of these times."""
+    """Return true if a condition is on at mission second `at_s`. The condition is off at first, and switches on or off
+    at each of `times`.
+    """
     return bisect_right(times, at_s) % 2 == 1

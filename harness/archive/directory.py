@@ -1,4 +1,4 @@
-"""Create a run directory and write its files. All later commands read them.
+"""Create a run directory and write its files. Later commands, such as `check` and `report`, read these files.
 
 run.json            resolved scenario, seed, versions, backend, engine, verdict
 agents/7.*          mission file, chain export, trace and log of agent 7, and its store if it keeps one
@@ -85,7 +85,9 @@ class RunDirectory:
         return path
 
     def write_mission(self, directory: Path, agent_id: int, mission: Mapping[str, Any]) -> Path:
-        """Write the mission file, which an agent reads at its start (ucp/contract/CONTRACT.md). Return its path."""
+        """Write the mission file (ucp/contract/CONTRACT.md), which an agent reads at its start. Return the path of the
+        file.
+        """
         path = directory / f"{agent_id}.mission.json"
         write_json_atomically(path, dict(mission))
         return path
@@ -116,23 +118,25 @@ class RunDirectory:
         return len(added)
 
     def keep_exports_before_final_reconcile(self) -> None:
-        """Copy the current exports, which contain the chains before the final reconcile."""
+        """Copy the current chain exports before the final reconcile changes the chains."""
         kept = self.path / BEFORE_FINAL_RECONCILE
         kept.mkdir()
         for path in export_paths(self.path):
             shutil.copyfile(path, kept / path.name)
 
     def write_public_keys(self, keys: "PublicKeys") -> None:
-        """Write the public keys of a secured mission, with which the checker verifies signatures."""
+        """Write the public keys of a secured mission. The checker uses them to verify signatures."""
         write_json_atomically(self.path / PUBLIC_KEYS_FILE, keys.to_json())
         self.keys_fingerprint = keys.fingerprint
 
     def append_network(self, record: Mapping[str, Any]) -> None:
-        """Append a network change or a fault, as it happened at mission second `at_s`."""
+        """Append a network change or a fault that happened at mission second `at_s`."""
         self._append(NETWORK_FILE, record)
 
     def append_injected(self, record: Mapping[str, Any]) -> None:
-        """Append a datagram of the rogue node, or the number of several, sent at mission second `at_s`."""
+        """Append an entry about the rogue node at mission second `at_s`: one datagram that it sent, or a number of
+        datagrams.
+        """
         self._append(ROGUE_FILE, record)
 
     def append_channel(self, record: Mapping[str, Any]) -> None:

@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 
 class SealedError(MalformedEventsError):
-    """An error: event data are encrypted, and no known key decrypts them. The message completes a sentence about the
-    block.
+    """An error: the event data of a block are encrypted, and no known key decrypts them. The message completes a
+    sentence about the block.
     """
 
 
 @dataclass(frozen=True)
 class EventData:
-    """Decodes the event data of one mission. `sealed` is true if they are encrypted, and `depot` contains the key if
-    known.
+    """A decoder for the event data of one mission. `sealed` is true if the data are encrypted. `depot` contains the key
+    if the key is known.
     """
 
     sealed: bool = False
@@ -38,7 +38,7 @@ class EventData:
 
     @classmethod
     def of(cls, exports: Iterable[Export], depot: "Depot | None" = None) -> "EventData":
-        """Return the decoder for the exports of one mission.
+        """Return the decoder for the mission of these exports.
 
         Raises ExportError if `depot` is given, and the mission seals its data for another depot or not at all.
         """
@@ -56,11 +56,14 @@ class EventData:
         return cls(key is not None, depot)
 
     def of_block(self, block: ExportedBlock) -> bytes:
-        """Return the decrypted event data of a block (Section 3.1). Raises SealedError without the key."""
+        """Return the decrypted event data of a block (Section 3.1). Raises SealedError if the key is unknown
+        or wrong.
+        """
         return self.opened(block.event_bytes, block.agent_id, block.timestamp_us)
 
     def opened(self, event_data: bytes, agent_id: int, timestamp_us: int) -> bytes:
-        """Return event data in decrypted form. `agent_id` and `timestamp_us` are those of the block.
+        """Return these event data in decrypted form. `agent_id` and `timestamp_us` belong to the block that contains
+        the data.
 
         Raises SealedError.
         """

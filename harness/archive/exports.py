@@ -156,15 +156,15 @@ class Export(BaseModel):
 
 @dataclass
 class Exports:
-    """The exports of one mission by agent. `errors` contains a sentence for each unusable file."""
+    """The exports of one mission, by agent. `errors` contains a sentence for each file that cannot be used."""
 
     by_agent: dict[int, Export] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
 
 
 class ExportMaker:
-    """Creates exports of agents in this process without files. Agents that hold the same block share one object for
-    it.
+    """A maker of chain exports for agents in this process, without files. Agents that hold the same block share one
+    object for it.
     """
 
     def __init__(self) -> None:
@@ -178,8 +178,8 @@ class ExportMaker:
         signatures: Mapping[bytes, bytes] | None = None,
         head: Mapping[str, Any] | None = None,
     ) -> Export:
-        """Return the same export that `read_export` would read from a file about this agent. `head` is the signed head
-        of a secured agent.
+        """Return the export of an agent. It equals the one that `read_export` reads from a file. `head` is the signed
+        head of a secured agent.
         """
         inception, signed = state.chain.inception, signatures or {}
         return Export.model_construct(
@@ -223,7 +223,7 @@ def _base64(data: bytes) -> str:
 
 
 def read_export(path: Path) -> Export:
-    """Read an export. Raises ExportError. The message names the file, the error and its place."""
+    """Read an export. Raises ExportError with a message that names the file, the error and the place of the error."""
     try:
         document = read_json(path, MAX_EXPORT_BYTES)
     except OSError as error:
@@ -299,7 +299,9 @@ def export_paths(directory: Path) -> list[Path]:
 
 
 def agents_directory(directory: Path) -> Path:
-    """Return the directory with exports and traces: `agents` in a run directory, or else the directory itself."""
+    """Return the directory with exports and traces. This is the directory `agents` in a run directory, otherwise
+    `directory` itself.
+    """
     agents = directory / "agents"
     return agents if agents.is_dir() else directory
 
@@ -338,7 +340,7 @@ def _first_problem(error: ValidationError) -> str:
 
 
 def name_blocks(exports: Mapping[int, Export]) -> dict[str, str]:
-    """Return the names of all blocks by block hash. `4.11` is the 11th block that agent 4 completed.
+    """Return the name of every block, by block hash. For example, `4.11` is the 11th block that agent 4 completed.
 
     If the export of an agent is missing, because the agent was killed, the order of its blocks follows from their
     timestamps in the exports of other agents.

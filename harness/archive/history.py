@@ -86,7 +86,7 @@ class AgentReconcile:
 
 @dataclass(frozen=True, slots=True)
 class BlockCommit:
-    """The addition of a block to a chain. `how` is one of the values of COMMITTED_BY."""
+    """The appending of a block to a chain. `how` is one of the values of COMMITTED_BY."""
 
     agent: int
     at_s: float
@@ -96,8 +96,8 @@ class BlockCommit:
 
 @dataclass(frozen=True, slots=True)
 class Phase2Tie:
-    """A tie at the end of reconcile phase 2: several answers have equally many votes. `branch` names the branch that
-    the handler then took.
+    """A tie at the end of reconcile phase 2, in which several answers have the same highest number of votes. `branch`
+    is the branch that the handler took.
     """
 
     agent: int
@@ -153,14 +153,16 @@ def has_possible_time(run: HandlerRun) -> bool:
 
 
 def incarnations(trace: Trace) -> list[list[HandlerRun]]:
-    """Return the handler runs of an agent, divided at its restarts. Runs with an impossible time are left out."""
+    """Return the handler runs of each incarnation of an agent (the time between two restarts). Runs with an impossible
+    time are left out.
+    """
     return [[run for _, run in runs if has_possible_time(run)] for runs in trace.incarnations()]
 
 
 def history_of(
     traces: Mapping[int, Trace], faults: Iterable[FaultRecord], end_s: float, *, whole: bool = True
 ) -> MissionHistory:
-    """Return the history of a run that ended at mission second `end_s`. With `whole=False`, messages are left out."""
+    """Return the history of a run that ended at mission second `end_s`. If `whole` is false, messages are left out."""
     ends: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
         if fault.kind.ends_incarnation:
@@ -192,7 +194,8 @@ def _append(history: MissionHistory, steps: Iterable[HistoryEvent]) -> None:
 
 
 class HistoryReader:
-    """Reads the handler runs of an agent between two restarts, one after another.
+    """A reader of the handler runs of one incarnation of an agent (the time between two restarts), one run after
+    another.
 
     The report and the live page both use this class, so both show the same start and end of each vote and reconcile. A
     reconcile that begins during a vote does not end the vote. The vote ends when its timer expires.
@@ -207,7 +210,7 @@ class HistoryReader:
         self._phases: list[ReconcilePhase] = []
 
     def feed(self, run: HandlerRun) -> Iterator[HistoryEvent]:
-        """Yield the parts of the history that the next handler run begins or ends."""
+        """Process the next handler run. Yield the parts of the history that begin or end with it."""
         self._now_s = run.t
         if run.handler == "process_next_deque_block" and run.branch == "proposed":
             self._vote = next((sent.block or "" for sent in run.sent), ""), run.t
@@ -224,7 +227,7 @@ class HistoryReader:
                 yield BlockCommit(self._agent, run.t, block, COMMITTED_BY.get(run.handler, "otherwise"))
 
     def end(self, at_s: float) -> Iterator[HistoryEvent]:
-        """Yield the vote and the reconcile that the end of the agent at `at_s` interrupts."""
+        """Yield the vote and the reconcile that were interrupted because the agent ended at `at_s`."""
         at_s = max(at_s, self._now_s)
         yield from self._end_vote(at_s, CUT_SHORT)
         yield from self._end_reconcile(at_s, done=False)
@@ -236,7 +239,7 @@ class HistoryReader:
             yield AgentVote(self._agent, block, since_s, max(at_s, since_s), outcome)
 
     def _continue_reconcile(self, run: HandlerRun) -> Iterator[HistoryEvent]:
-        """Yield the parts of the history that a handler run during a reconcile begins or ends."""
+        """Process a handler run during a reconcile. Yield the parts of the history that begin or end with it."""
         if run.branch.startswith("tie:"):
             yield Phase2Tie(self._agent, run.t, run.branch)
         if run.handler == "reconcile_finalize" and run.branch == "done":
@@ -292,7 +295,7 @@ def _messages(traces: Mapping[int, Trace]) -> list[BroadcastMessage]:
 
 
 def end_of_traces(traces: Mapping[int, Trace]) -> float:
-    """Return the mission second of the last handler run, or 0 if there is none."""
+    """Return the mission second of the last handler run in all traces. Return 0 if there is no handler run."""
     return max((run.t for trace in traces.values() for run in trace.runs if has_possible_time(run)), default=0.0)
 
 

@@ -1,4 +1,5 @@
-"""Read `lag.jsonl`: how late the machine woke up programs during a run, and how busy the processes of each agent were.
+"""Read `lag.jsonl`, which contains how late the machine woke up programs during a run, and how busy the processes of
+each agent were.
 
 `harness/play/process/_lag_probe.py` writes this file.
 """
@@ -16,7 +17,8 @@ _Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class LagLine(BaseModel):
-    """A line of `lag.jsonl`: mission seconds `from_s` to `until_s`, and figures in seconds of wall time.
+    """A line of `lag.jsonl` about the mission seconds `from_s` to `until_s`. The measured times are in seconds of wall
+    time.
 
     `machine_s` is how late the machine woke a program, at most, and how long programs waited for a disk or the
     hypervisor. `busy_s` is how long the processes of an agent ran, or waited for a processor. An agent without
@@ -32,14 +34,15 @@ class LagLine(BaseModel):
 
 
 class MeasuredLag:
-    """The measured delays of the machine at any time of the run."""
+    """The delays of the machine and the agents that were measured over the whole run."""
 
     def __init__(self, lines: list[LagLine]) -> None:
         self._lines = sorted(lines, key=lambda line: line.until_s)
         self._ends = [line.until_s for line in self._lines]
 
     def explains(self, agent_id: int, from_s: float, until_s: float) -> float | None:
-        """Return the measured delay, in seconds of wall time, of a timer that expired at `from_s` and ran at `until_s`.
+        """Return the measured delay of a timer, in seconds of wall time. The timer expired at `from_s`, and its handler
+        ran at `until_s`.
 
         Return None if the delays of the agent were not measured all the time.
         """

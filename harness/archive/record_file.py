@@ -36,7 +36,7 @@ NOT_AN_OBJECT = "input should be an object"
 
 @dataclass(frozen=True)
 class InvalidPart:
-    """The invalid parts below one key at the top level.
+    """An invalid part of run.json, with the number of further invalid parts below the same top-level key.
 
     `where` and `what` describe the first one, and `more` counts the others.
     """
@@ -52,7 +52,8 @@ class InvalidPart:
 
 
 def validate_leniently(model: type[Model], document: dict[str, Any]) -> tuple[Model, list[InvalidPart]]:
-    """Return the valid part of `document` as an object of type `model`, and a description of the removed parts.
+    """Return the valid part of `document` as an object of type `model`, and a description of the parts that were
+    removed.
 
     All keys of the model must have defaults. Unknown keys are ignored. A lone surrogate in a text becomes a question
     mark. `document` is changed. Raises ValueError if it has more than MAX_ERRORS errors.
@@ -87,7 +88,7 @@ def _by_key(document: dict[str, Any], errors: Sequence[ErrorDetails]) -> Iterato
 
 
 def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, list[int | str]]:
-    """Return the innermost part of the document that contains an error, and the path to it.
+    """Return the innermost part of the document that contains an error, and the path to this part.
 
     `loc` may have further steps, which name the types that pydantic tried. They are left out of the path.
     """
@@ -103,7 +104,7 @@ def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, l
 
 
 def _repair(place: Place, problem: ErrorDetails) -> bool:
-    """Replace lone surrogates in a text by question marks. Return true if that was possible."""
+    """Replace lone surrogates in a text by question marks. Return true if the part of the document was such a text."""
     holder, key = place
     if problem["type"] == LONE_SURROGATE and isinstance(text := holder[key], str):
         holder[key] = text.encode(errors="replace").decode()
@@ -112,7 +113,9 @@ def _repair(place: Place, problem: ErrorDetails) -> bool:
 
 
 def _remove(places: Sequence[Place]) -> None:
-    """Remove parts of a document. Parts of one list are removed together, so that their indices stay valid."""
+    """Remove parts of a document. Elements of the same list are removed in one step, so that their indices
+    stay valid.
+    """
     lists: dict[int, tuple[list[Any], set[int]]] = {}
     for holder, key in places:
         if isinstance(holder, dict):
@@ -190,9 +193,9 @@ _SCRIPTS = ("fates", "datagrams")
 
 
 def _exceeds(document: Any, most: int) -> bool:
-    """Return whether a document has more values than `most`, without the scripts of its scenario.
+    """Return true if a document has more than `most` values, without the scripted messages of its scenario.
 
-    The validation of those ends at the first error.
+    The scripts are not counted, because their validation ends at the first error.
     """
     parts: list[Any] = [document]
     count = 0

@@ -9,8 +9,7 @@ from harness.scenario import Scenario, load_scenario
 
 
 def load_recorded_scenario(path: Path) -> tuple[Scenario, int | None]:
-    """Return a scenario and its seed, from a scenario file, by the name of an included scenario, or from a run
-    directory.
+    """Return a scenario and its seed. `path` is a scenario file, the name of an included scenario, or a run directory.
 
     The seed is None unless `path` is a run directory. Raises HarnessError.
     """

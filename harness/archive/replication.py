@@ -1,4 +1,5 @@
-"""Compute how the mission data spread over the agents: the agents' chains at each mission second, from their traces.
+"""Compute from traces how the mission data spread over the agents. The result contains the agents' chains at each
+mission second.
 
 The checker computes the same figures (`harness.checker._figures`) for the end of a run. Only chains of living agents
 count. Copies are counted in these chains, for each completed block.
@@ -16,8 +17,8 @@ from ucp.trace import HandlerRun
 
 @dataclass(frozen=True, slots=True)
 class ReplicationFigures:
-    """The figures from mission second `at_s` on: chain lengths in blocks, the number of different chains, and copies
-    per block.
+    """The numbers that hold from mission second `at_s` on: chain lengths in blocks, the number of different chains, and
+    the number of copies of blocks.
 
     Copies are None until an agent completes a block.
     """
@@ -31,7 +32,7 @@ class ReplicationFigures:
 
 
 def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -> list[ReplicationFigures]:
-    """Return the replication figures at mission second 0 and after each change."""
+    """Return the replication of the blocks at mission second 0 and after each change."""
     steps: list[tuple[float, int, int, FaultRecord | HandlerRun]] = []
     for fault in faults:
         steps += [(fault.at_s, 0, agent, fault) for agent in fault.agents or () if agent in traces]
@@ -82,7 +83,9 @@ class _LivingChains:
             self._paths.setdefault(agent, [])
 
     def apply_run(self, agent: int, incarnation: int, run: HandlerRun) -> None:
-        """Apply the changes of a handler run. The first run after a restart empties the chain."""
+        """Apply the changes of a handler run to the agent's chain. The first handler run after a restart empties this
+        chain.
+        """
         if incarnation > self._incarnation[agent]:
             self._incarnation[agent] = incarnation
             self._empty(agent)

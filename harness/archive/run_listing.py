@@ -16,7 +16,9 @@ RUNS = Path("runs")
 
 @dataclass(frozen=True)
 class PastRun:
-    """A run directory with its record. `problem` is the reason why the record cannot be read, or None."""
+    """A run directory with its record. `problem` is the reason why the record cannot be read. It is None if the record
+    can be read.
+    """
 
     path: Path
     record: RunRecord
@@ -28,7 +30,8 @@ class PastRun:
 
 
 def past_runs(folder: Path, most: int) -> Iterator[PastRun]:
-    """Yield the newest runs in `folder`, at most `most` of them, by the time at which run.json was last written.
+    """Yield the runs in `folder` whose run.json was written last. The newest run is first, and there are at most `most`
+    runs.
 
     Raises RunDirectoryError if it is no folder.
     """

@@ -34,7 +34,7 @@ class _RecordModel(BaseModel):
 
 
 class FindingRecord(_RecordModel):
-    """One piece of evidence. `block` is the name of the block, such as 4.11."""
+    """One piece of evidence of a judgement. `block` is the name of a block, such as 4.11."""
 
     agent_id: int
     detail: str
@@ -54,7 +54,7 @@ class CharacteristicRecord(_RecordModel):
 
 
 class JudgementRecord(_RecordModel):
-    """The judgement of a further check: `steps`, `records` or `liveness`."""
+    """The judgement of a check that is not about a characteristic: `steps`, `records` or `liveness`."""
 
     name: str
     verdict: Verdict
@@ -63,7 +63,7 @@ class JudgementRecord(_RecordModel):
 
 
 class NetworkState(_RecordModel):
-    """The state of the network from mission second `at_s` on.
+    """A description of the network from mission second `at_s` on.
 
     `what` names the change, and `detail` describes the state in words. `fully_connected` is true without any loss or
     partition.
@@ -94,7 +94,7 @@ class FaultRecord(_RecordModel):
 
     @property
     def kind(self) -> type[faults.Fault]:
-        """The class of the fault."""
+        """The Python class for this kind of fault."""
         return faults.fault_class(self.what)
 
     @property
@@ -104,7 +104,7 @@ class FaultRecord(_RecordModel):
 
 
 class FinalReconcile(_RecordModel):
-    """The final reconcile. `complete` is true if a last round of reconciles changed no chain."""
+    """The final reconcile. `complete` is true if the last round of reconciles changed no chain."""
 
     at_s: float
     rounds: int
@@ -112,8 +112,9 @@ class FinalReconcile(_RecordModel):
 
 
 class CycleStep(_RecordModel):
-    """A handler run in a cycle, `after_s` mission seconds after the start of a period. `branch` is null if no trace has
-    it."""
+    """A handler run in a cycle, `after_s` mission seconds after the start of a period. `branch` is null if no trace
+    contains the handler run.
+    """
 
     agent_id: int
     after_s: float
@@ -122,8 +123,9 @@ class CycleStep(_RecordModel):
 
 
 class CycleWait(_RecordModel):
-    """An agent that cannot finish. The agents in `for_agents` never answer its questions, and those in `refused_by`
-    refuse its blocks."""
+    """An agent that cannot finish. The agents in `for_agents` never answer its questions. The agents in `refused_by`
+    refuse its blocks.
+    """
 
     agent_id: int
     for_agents: list[int] = []
@@ -132,7 +134,8 @@ class CycleWait(_RecordModel):
 
 
 class Cycle(_RecordModel):
-    """A sequence of handler runs that agents repeat without end, at the latest from mission second `since_s` on.
+    """A sequence of handler runs that agents repeat forever. The repetition begins at mission second `since_s` or
+    earlier.
 
     `period_s` is null for a standstill: no message is under way, no timer runs, and `agents` are not idle. `proven` is
     true if the global state recurs and no random draw can change it. Otherwise the same handler runs occurred `periods`
@@ -151,9 +154,10 @@ class Cycle(_RecordModel):
 
 
 class HandlerRuns(_RecordModel):
-    """Number of handler runs that an agent counted in one incarnation, until a moment between `from_s` and `until_s`.
+    """The number of handler runs in one incarnation, as the agent counted them. The count ends at a time between
+    `from_s` and `until_s`.
 
-    Both are equal if the agent reported its own mission time with the number.
+    `from_s` and `until_s` are equal if the agent reported its own mission time with the number.
     """
 
     counted: int
@@ -162,7 +166,7 @@ class HandlerRuns(_RecordModel):
 
 
 class AgentRecord(_RecordModel):
-    """The outcome of one agent: exported, not exported, killed, rebooting, crashed, hung, broken, not supported,
+    """The outcome of one agent. It is exported, not exported, killed, rebooting, crashed, hung, broken, not supported,
     paused, running or not started.
 
     Counters are sums over all incarnations of the agent. null means unknown.
@@ -195,15 +199,16 @@ class AgentRecord(_RecordModel):
 
 
 class CapturedFrames(_RecordModel):
-    """Number of frames at the interface of a vehicle (`received`), and number of those missing in its capture
-    (`dropped`)."""
+    """The number of frames at the interface of a vehicle (`received`), and the number of these frames that its capture
+    lacks (`dropped`).
+    """
 
     received: int
     dropped: int
 
 
 class ChannelLateness(_RecordModel):
-    """How late the process of a shared channel delivered messages, in mission seconds."""
+    """The lateness with which the process of a shared channel delivered messages, in mission seconds."""
 
     deliveries: int
     median_s: float
@@ -221,7 +226,9 @@ class ChannelLateness(_RecordModel):
 
     @property
     def tolerable(self) -> bool:
-        """True if at least 95 % of all deliveries were at most `TOLERATED_LATENESS_S` late, and none was missing."""
+        """True if no delivery is missing and at least 95 % of the deliveries were at most
+        `TOLERATED_LATENESS_S` late.
+        """
         return self.p95_s <= TOLERATED_LATENESS_S and not self.missed and not self.unsent
 
     def in_words(self) -> str:
@@ -243,7 +250,9 @@ class AnswerTimes(_RecordModel):
 
 
 class ChannelRecord(_RecordModel):
-    """Frames on a radio channel that all vehicles shared. `model` has the preset and all figures of the radio."""
+    """The frames on a radio channel that all vehicles shared. `model` contains the preset and all parameters of the
+    radio.
+    """
 
     model: dict[str, Any]
     frames: int
@@ -265,20 +274,23 @@ class ChannelRecord(_RecordModel):
     FRAMES: ClassVar[str] = "frames"
 
     def counts(self) -> Counter[tuple[str, int]]:
-        """Return the number of frames under (FRAMES, 0), and the losses under (reason, vehicle)."""
+        """Return the number of sent frames under the key (FRAMES, 0), and each number of losses under its key (reason,
+        vehicle).
+        """
         counts = Counter({(self.FRAMES, 0): self.frames})
         for reason, by_vehicle in (*self.lost.items(), *self.dropped.items()):
             counts.update({(reason, int(vehicle)): count for vehicle, count in by_vehicle.items()})
         return counts
 
     def total(self, reason: str) -> int:
-        """Return the number of frames or messages that were lost for this reason."""
+        """Return the number of frames or messages that were lost for the reason `reason`."""
         return sum((self.lost.get(reason) or self.dropped.get(reason, {})).values())
 
 
 class ReceiverCounters(_RecordModel):
-    """Packets to one vehicle: numbers that the kernel passed, lost, and cut off by a partition. Further keys are the
-    applied conditions."""
+    """Numbers of packets to one vehicle: packets that the kernel passed, packets that it lost, and packets cut off by a
+    partition. Further keys are the applied network conditions.
+    """
 
     model_config = ConfigDict(extra="allow")
 
@@ -296,7 +308,7 @@ class Counters(_RecordModel):
 
 
 class DatagramsRead(_RecordModel):
-    """UDP datagrams in the network of a vehicle, as the kernel counted them over the whole run.
+    """The UDP datagrams in the network of a vehicle, as the kernel counted them over the whole run.
 
     `broadcasts` datagrams arrived, also the agent's own ones. `read` datagrams were read, `before_start` of them before
     the mission began. The kernel discarded `overflowed` datagrams, because the buffer of their socket was full, and
@@ -312,8 +324,9 @@ class DatagramsRead(_RecordModel):
 
 
 class BlockHolders(_RecordModel):
-    """The vehicles that held a block directly after a loss of vehicles (`holders`), and at the end. `agent_id`
-    completed it."""
+    """The vehicles that held a block directly after a loss of vehicles (`holders`), and those that held it at the end.
+    The agent `agent_id` completed the block.
+    """
 
     block: str
     block_hash: str
@@ -323,7 +336,8 @@ class BlockHolders(_RecordModel):
 
 
 class Loss(_RecordModel):
-    """The loss of vehicles, with all their data, at mission second `at_s`. Counts are null if traces are missing.
+    """The loss of vehicles with all their data at mission second `at_s`. Numbers of blocks are null if traces are
+    missing.
 
     `completed` counts the blocks of all agents until then. Of these, `survived` counts blocks that another vehicle
     held, and `gone` those that only the lost vehicles held. `gone_at_end` counts blocks that no vehicle holds at the
@@ -342,7 +356,9 @@ class Loss(_RecordModel):
 
 
 class LeastHeld(_RecordModel):
-    """The smallest set of vehicles whose loss would lose a block: the holders of the block with the fewest holders."""
+    """The smallest set of vehicles whose loss would destroy a block. They are the holders of the block that has the
+    fewest holders.
+    """
 
     vehicles: int
     """Number of vehicles that could hold it."""
@@ -356,8 +372,8 @@ class LeastHeld(_RecordModel):
 
 
 class Survival(_RecordModel):
-    """The survival of blocks after losses of vehicles. `completed` counts all blocks, and `gone` those on no vehicle at
-    the end.
+    """The survival of blocks when vehicles are lost. `completed` counts all blocks, and `gone` counts the blocks that
+    no vehicle holds at the end.
 
     Both are null if the completed blocks of some agents are unknown.
     """
@@ -370,7 +386,7 @@ class Survival(_RecordModel):
 
 
 class InjectedMessages(_RecordModel):
-    """Messages of one type in an injection: their number, and the handler runs that they caused.
+    """The messages of one type in an injection: their number, and the handler runs that they caused.
 
     `handled` maps each branch of the handler to its number of runs. `changed` counts the runs that changed the data of
     an agent. `unhandled` counts the messages without a handler run. It is null if the names of messages in traces are
@@ -385,8 +401,8 @@ class InjectedMessages(_RecordModel):
 
 
 class RogueInjection(_RecordModel):
-    """The effect of one injection. `refused` counts datagrams that are no message, by reason. Agents drop and count
-    them.
+    """The effect of one injection. `refused` counts by reason the datagrams that are not valid messages. Agents drop
+    such datagrams and count them.
 
     `untraced` counts copies that traces do not distinguish from the originals.
     """
@@ -405,7 +421,7 @@ WRITTEN_FROM_THE_START = ("scenario", "seed", "backend", "versions", "started_at
 
 
 class JudgedRecord(_RecordModel):
-    """The part of a record that the checker needs."""
+    """The part of the record of a run that the checker needs."""
 
     schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
     roster: list[int]
@@ -430,18 +446,21 @@ class JudgedRecord(_RecordModel):
 
     @property
     def switched_off(self) -> dict[int, float]:
-        """The agents that exported their chain and ended before the end of the run, with the mission second of each."""
+        """The agents that exported their chains and ended before the end of the run, each with the mission second of
+        its end.
+        """
         off = (fault for fault in self.faults if fault.kind.exports_chain)
         return {agent_id: fault.at_s for fault in off for agent_id in fault.agents or ()}
 
     def end_of(self, agent_id: int) -> float | None:
-        """Return the mission second at which the agent ended, or None if the record does not contain it."""
+        """Return the mission second at which the agent ended. Return None if the record does not contain it."""
         return self.switched_off.get(agent_id, self.mission_s)
 
 
 class OperatorCommand(_RecordModel):
-    """A command of an operator at mission second `at_s`, repeated `times` times until `until_s`. `values` are the
-    fields of the message."""
+    """An operator's command, sent first at mission second `at_s`. It is repeated until `until_s`, and sent `times`
+    times in total. `values` are the fields of the message.
+    """
 
     at_s: float
     until_s: float
@@ -454,8 +473,9 @@ class OperatorCommand(_RecordModel):
 
 
 class GroundStationRecord(_RecordModel):
-    """Traffic between the vehicles and a ground station, in datagrams. `dropped` datagrams were too many, or
-    damaged."""
+    """Numbers of datagrams between the vehicles and a ground station. `dropped` counts datagrams that were damaged or
+    exceeded the limit.
+    """
 
     address: str
     sent: int = 0
@@ -519,7 +539,7 @@ class RunRecord(JudgedRecord):
         return sorted({*self.roster, *requested, *map(int, self.agents), *map(int, self.vehicles)})
 
     def late_answers(self) -> str | None:
-        """Return a sentence if agents took longer for their answers than the shared channel assumes, otherwise None."""
+        """Return a sentence if agents took longer to answer than the shared channel assumes. Return None otherwise."""
         answers = self.channel.answers if self.channel else None
         model = self.scenario.network.channel if self.scenario else None
         if self.scenario is None or model is None or answers is None or answers.count < ENOUGH_ANSWERS:
@@ -538,7 +558,8 @@ class RunRecord(JudgedRecord):
         return (self.scenario and self.scenario.expect) or Expect()
 
     def unmet_expectations(self, chains: Mapping[int, Sequence[str]]) -> Iterator[tuple[str, list[str]]]:
-        """Yield each kind of expectation other than verdicts, with a sentence for each one that was not met.
+        """Yield each kind of expectation except verdicts, with a sentence for each expectation of this kind that was
+        not met.
 
         `chains` has the block hashes of each agent's chain.
         """
@@ -548,7 +569,7 @@ class RunRecord(JudgedRecord):
 
     @property
     def judgements(self) -> dict[str, CharacteristicRecord | JudgementRecord]:
-        """The judgements on the characteristics by number, and those of the further checks by key."""
+        """The judgements on the characteristics by number, and the judgements of all other checks by key."""
         further = {key: judgement for key in FURTHER_CHECKS if (judgement := getattr(self, key)) is not None}
         return {**self.characteristics, **further}
 

@@ -1,4 +1,4 @@
-"""Find the traces of a run, read them, and pack large ones with gzip.
+"""Find the traces of a run, read them, and compress large traces with gzip.
 
 A trace of a process contains every received datagram, so the traces of a large swarm take gigabytes. After the run, the
 harness packs them to about a sixth. It packs them only then, because any agent must be able to append lines, and a
@@ -34,7 +34,9 @@ def trace_files(agents: Path) -> list[Path]:
 
 
 def trace_file(agents: Path, agent_id: int) -> Path:
-    """Return the path of an agent's trace. If there is none, return the path that a plain trace has."""
+    """Return the path of an agent's trace. If the agent has no trace, return the path that an uncompressed trace would
+    have.
+    """
     plain, packed = agents / f"{agent_id}{SUFFIX}", agents / f"{agent_id}{PACKED_SUFFIX}"
     return packed if packed.exists() and not plain.exists() else plain
 
@@ -44,12 +46,12 @@ def is_packed(path: Path) -> bool:
 
 
 def open_trace(path: Path) -> BoundedFile:
-    """Open a plain or packed trace for reading. Raises OSError if there is no such regular file."""
+    """Open a trace for reading, compressed or not. Raises OSError if `path` is not a regular file."""
     return BoundedFile(path, MAX_TRACE_BYTES)
 
 
 def pack_traces(agents: Path, report_progress: Callable[[str], None]) -> None:
-    """Pack the traces of an ended run with gzip if they are large together.
+    """Compress the traces of an ended run with gzip if their total size is large.
 
     Ctrl-C ends the packing, and the other traces stay plain. A trace also stays plain if the disk is full.
     """

@@ -1,4 +1,5 @@
-"""Read traces (`ucp-trace/2` and `/1`): the handler runs of one agent, and the blocks that it held after each of them.
+"""Read traces (`ucp-trace/2` and `/1`). A trace contains the handler runs of one agent, and the changes of the blocks
+that it held.
 
 A trace that ends within a line belongs to a killed agent. It is read up to that line. Other damage is reported in
 `problem`, and the lines before it are used.
@@ -36,7 +37,8 @@ Record = TypeVar("Record")
 
 
 class TraceHeader(BaseModel):
-    """The header of a trace. `initial_data` is in base64, or None in version 1, which does not record complete inputs.
+    """The header of a trace. `initial_data` is in base64. It is None in version 1 of the format, which does not record
+    complete inputs.
 
     In a `secured` mission the recorded datagrams are plain. The sent ones were longer, and a datagram that looks valid
     here may have been dropped.
@@ -101,7 +103,7 @@ ASIDE = TypeAdapter(DroppedDatagram | CommandEntry)
 
 
 def read_clock(path: Path) -> dict[str, Any]:
-    """Return the clock in the header of a trace, or an empty clock if the header cannot be read."""
+    """Return the clock in the header of a trace. Return an empty clock if the header cannot be read."""
     try:
         with open_trace(path) as file:
             return _validate(HEADER, file.readline(MAX_LINE_BYTES)).clock
@@ -110,7 +112,8 @@ def read_clock(path: Path) -> dict[str, Any]:
 
 
 class TraceGap(NamedTuple):
-    """A place in a trace at which lines are missing or damaged. `position` is the number of handler runs before it.
+    """A place in a trace at which lines are missing or damaged. `position` is the number of handler runs before this
+    place.
 
     `lines` and `lost_bytes` count the unreadable lines in the file. The number of lines that were never written is
     unknown.
@@ -144,7 +147,8 @@ class Trace:
     """Line numbers of `runs` and of `asides` in the file. None if the file has no other lines."""
 
     def incarnations(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
-        """Yield the handler runs between two restarts, with line numbers from 1, for each part of the trace.
+        """Yield the handler runs of each incarnation (the time between two restarts), together with their line numbers
+        from 1.
 
         A header line begins each incarnation.
         """
@@ -164,7 +168,7 @@ class Trace:
         )
 
     def numbered_asides(self) -> Iterator[tuple[int, DroppedDatagram | CommandEntry]]:
-        """Yield the lines about dropped datagrams and commands, with their line numbers."""
+        """Yield the lines about dropped datagrams and about commands, with their line numbers."""
         if self.lines is not None:
             yield from zip(self.lines[1], (aside for _, aside in self.asides), strict=True)
             return
@@ -172,7 +176,9 @@ class Trace:
             yield position + 1 + bisect_right(self.starts, position) + count, aside
 
     def dropped(self) -> Counter[str]:
-        """Return the number of dropped datagrams by reason, including those that the agent only counted."""
+        """Return the number of dropped datagrams by reason. It includes the datagrams that the agent counted without a
+        line for each.
+        """
         counts: Counter[str] = Counter()
         for _, aside in self.asides:
             if isinstance(aside, DroppedDatagram):
@@ -207,7 +213,7 @@ class Trace:
                 yield self.runs[position]
 
     def skimmed(self) -> "Trace":
-        """Return the trace without those handler runs that only received a message.
+        """Return the trace without the handler runs that only received a message.
 
         Line numbers of `incarnations` are then wrong.
         """
@@ -228,14 +234,16 @@ class Trace:
         return [block for run in self.runs for operation, block in run.changes if operation == "complete"]
 
     def chain_changed_at(self) -> float:
-        """Return the mission second of the last change of the chain, or 0 if there is none."""
+        """Return the mission second of the last change of the chain. Return 0 if the chain never changed."""
         return max(
             (run.t for run in self.runs if any("chain" in operation for operation, _ in run.changes)), default=0.0
         )
 
 
 class HeldBlocks:
-    """The blocks that an agent holds: where, how often, and which ones it completed itself."""
+    """The blocks that an agent holds. For each block, they show where the agent holds it, how often, and whether the
+    agent completed it.
+    """
 
     def __init__(self) -> None:
         self.places: dict[str, Counter[str]] = {place: Counter() for place in PLACES}
@@ -250,7 +258,9 @@ class HeldBlocks:
         agent did not hold."""
 
     def replay(self, run: HandlerRun) -> None:
-        """Apply the changes of the next handler run. The object covers the time between two restarts."""
+        """Apply the changes of the next handler run to the blocks. One object is valid between two restarts of the
+        agent.
+        """
         self.impossible = None
         for operation, block in run.changes:
             if operation == "complete":
@@ -285,13 +295,13 @@ def parse_line(line: bytes) -> TraceHeader | Entry:
 
 
 def _validate(kind: TypeAdapter[Record], line: bytes) -> Record:
-    """Return the record in a line. Raises ValueError."""
+    """Return the record in a line. Raises ValueError if the line is invalid."""
     check_weight(line, MAX_LINE_WEIGHT)
     return kind.validate_json(line)
 
 
 def gap_line(gap: TraceGap) -> str:
-    """Return the line that stands for lost lines in an imported trace.
+    """Return the line that an imported trace contains in place of lost lines.
 
     Programs that read only handler runs stop there.
     """
@@ -299,7 +309,9 @@ def gap_line(gap: TraceGap) -> str:
 
 
 def parse_gap(line: bytes) -> tuple[int, int] | None:
-    """Return the numbers of lost lines and lost bytes if this line stands for lost lines, otherwise None."""
+    """Return the numbers of lost lines and lost bytes if this line replaces lost lines. Return None for any
+    other line.
+    """
     match = _LOST.fullmatch(line.strip())
     return None if match is None else (int(match[1]), int(match[2]))
 
@@ -310,7 +322,7 @@ def only_receives(run: HandlerRun) -> bool:
 
 
 def why_not_a_trace(path: Path) -> str:
-    """Return the reason why the file does not begin like a trace."""
+    """Return the reason why the file does not begin as a readable trace must begin."""
     try:
         with open_trace(path) as file:
             header = parse_json(file.readline(MAX_LINE_BYTES))
@@ -383,7 +395,7 @@ class HandlerRunLine(NamedTuple):
 
 
 def read_trace_lines(path: Path) -> Iterator[HandlerRunLine]:
-    """Yield the lines with handler runs. An incomplete last line, which a killed agent left, is skipped.
+    """Yield the lines with handler runs. The last line is skipped if it is incomplete, because its agent was killed.
 
     Raises RunDirectoryError at an invalid line, or if the file cannot be read or is empty.
     """

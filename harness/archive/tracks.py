@@ -29,7 +29,7 @@ class PositionFix(NamedTuple):
 
 @dataclass(frozen=True)
 class VehicleTracks:
-    """The positions of each vehicle in order of time. There is at least one for each.
+    """The positions of each vehicle in order of time. Each vehicle has at least one position.
 
     `problems` has a sentence for each unreadable part.
     """
@@ -46,7 +46,7 @@ class VehicleTracks:
 
 
 def between(before: PositionFix, after: PositionFix, at_s: float) -> PositionFix:
-    """Return the position of a vehicle that flies straight and at constant speed between two positions."""
+    """Return the position of a vehicle that flies straight and at constant speed between two known positions."""
     share = (at_s - before.at_s) / (after.at_s - before.at_s)
     return PositionFix(
         at_s,

@@ -54,7 +54,9 @@ MAX_SHOWN = 40
 
 
 def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
-    """Return the first undefined name of each kind. A branch counts as undefined if its handler cannot take it."""
+    """Return the first undefined name of each kind. The name of a branch also counts as undefined if the handler does
+    not have this branch.
+    """
     unknown: UnknownNames = {}
     for handler, branch in dict.fromkeys((run.handler, run.branch) for run in runs):
         if handler not in HANDLERS:
@@ -97,8 +99,8 @@ def tally_is_known(run: HandlerRun) -> bool:
 
 
 def has_unknown_kind(trigger: UnknownTrigger) -> bool:
-    """Return true if the trigger names a kind that the agent contract does not define. A malformed trigger gives
-    false.
+    """Return true if the trigger has a kind that the agent contract does not define. Return false for a malformed
+    trigger.
     """
     return bool(trigger.fields) and KINDS.isdisjoint(trigger.fields)
 
@@ -118,12 +120,14 @@ def timers_are_known(run: HandlerRun) -> bool:
 
 
 def branch_is_known(run: HandlerRun) -> bool:
-    """Return true if the handler can take the branch of this run."""
+    """Return true if the handler of this run has a branch with the recorded name."""
     return run.branch in BRANCHES.get(run.handler, ())
 
 
 def first_unknown(unknown: UnknownNames, kinds: Collection[Kind] | None = None) -> str | None:
-    """Return the description of the first undefined name of these kinds (or of any kind), or None."""
+    """Return the description of the first undefined name of these kinds. If `kinds` is None, all kinds count. Return
+    None if all names are defined.
+    """
     return next((description for kind, description in unknown.items() if kinds is None or kind in kinds), None)
 
 

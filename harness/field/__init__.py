@@ -1,3 +1,3 @@
-"""Process the records of real flights: read them, replay them, reconstruct the flight, find faulty commits, and merge
+"""Process the records of real flights: read them, replay them, reconstruct flights, find faulty commits, and merge
 chains.
 """

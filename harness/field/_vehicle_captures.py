@@ -1,4 +1,6 @@
-"""The capture of one vehicle from the field: the datagrams that its agent sent, and those that reached it."""
+"""Read the packet capture of one vehicle from the field. It contains the datagrams that the agent of the vehicle sent,
+and those that reached it.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +34,7 @@ class CapturedDatagram:
 
 @dataclass
 class AgentCapture:
-    """The datagrams in the capture of a vehicle, in order. `epoch_us` is its mission second 0."""
+    """The datagrams in the capture of a vehicle, in order. `epoch_us` is the time of mission second 0 on its clock."""
 
     epoch_us: float
     speedup: float
@@ -75,5 +77,5 @@ def read_capture(
 
 
 def seconds_of(event: LoggableEvent, capture: AgentCapture) -> float:
-    """Return the mission second at which an event was logged, on the clock of the capture."""
+    """Return the mission second at which an event was logged, on the clock of the captured vehicle."""
     return (event.timestamp_us - capture.epoch_us) / MICROSECONDS

@@ -39,7 +39,7 @@ def inks(agent_ids: Iterable[int]) -> dict[int, AgentColours]:
 
 
 def ramp(first: Rgb, last: Rgb, steps: int) -> list[AgentColours]:
-    """Return a row of colours from `first` to `last` for growing values. Both should differ in lightness."""
+    """Return `steps` colours that change gradually from `first` to `last`. These two should differ in lightness."""
     fills = [_mixed(first, last, step / (steps - 1)) for step in range(steps)]
     return [AgentColours(fill, fill, _text_on(fill)) for fill in fills]
 

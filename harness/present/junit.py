@@ -25,7 +25,7 @@ class JunitCase:
 
 
 def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, cases: Iterable[JunitCase]) -> str:
-    """Return a JUnit XML file with one suite. Characters that XML does not allow become question marks."""
+    """Return a JUnit XML file with one test suite. Characters that XML does not allow become question marks."""
     all_cases = list(cases)
     failures, skipped = sum(bool(case.wrong) for case in all_cases), sum(case.skipped is not None for case in all_cases)
     counts = {"tests": str(len(all_cases)), "failures": str(failures), "errors": "0"}

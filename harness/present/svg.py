@@ -26,7 +26,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 48, 18, 34, 40  # margins of a panel around its a
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A mapping from values to pixels. With `log`, values must be above 0."""
+    """A mapping from values to pixels. If `log` is true, the mapping is logarithmic and all values must be above 0."""
 
     first: float
     last: float
@@ -63,7 +63,7 @@ class ChartArea:
 
 
 def grid(count: int, columns: int, top: float, height: float) -> list[ChartArea]:
-    """Return the rectangles for `count` charts below `top`, row by row."""
+    """Return the rectangles of `count` charts, row by row. The first row begins at the height `top`."""
     width = (WIDTH - 2 * MARGIN) / columns
     return [
         ChartArea(MARGIN + at % columns * width, top + at // columns * height, width, height) for at in range(count)
@@ -78,7 +78,7 @@ def linear_axis(first: float, last: float, place: tuple[float, float]) -> Axis:
 
 
 def share_axis(place: tuple[float, float]) -> Axis:
-    """Return an axis from 0 to 1 with a tick at each quarter. `place` is its start and end in pixels."""
+    """Return an axis for shares from 0 to 1, with a tick at each quarter. `place` is its start and end in pixels."""
     return Axis(0.0, 1.0, *place, [0.0, 0.25, 0.5, 0.75, 1.0])
 
 
@@ -99,8 +99,8 @@ def log_axis(first: float, last: float, place: tuple[float, float], most: int = 
 
 
 def step(span: float, most: int) -> float:
-    """Return the smallest round step (1, 2, 2.5 or 5 times a power of ten) that needs at most `most` steps for
-    `span`.
+    """Return the smallest round distance of ticks (1, 2, 2.5 or 5 times a power of ten) that divides `span` into at
+    most `most` parts.
     """
     unit: float = 10.0 ** math.floor(math.log10(span / most))
     return next(factor * unit for factor in (1, 2, 2.5, 5, 10) if factor * unit * most >= span * (1 - 1e-9))
@@ -147,7 +147,7 @@ def dot(x: float, y: float, number: int, tip: str) -> Markup:
 
 
 def name(x: float, y: float, anchor: str, number: int, text: str) -> Markup:
-    """Draw the name of a line."""
+    """Write the name of a line in the colour of this line."""
     return Markup('<text x="{}" y="{}" font-size="12" text-anchor="{}" fill="{}">{}</text>').format(
         n(x), n(y), anchor, COLOURS[number % len(COLOURS)], text
     )

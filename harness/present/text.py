@@ -83,7 +83,9 @@ def shown(words: str, style: str = "") -> Text:
 
 
 def did_you_mean(word: object, allowed: Iterable[object]) -> str:
-    """Return a hint such as "; did you mean `loss_15`?" with the most similar allowed word, or an empty text."""
+    """Return a hint with the most similar allowed word, such as "; did you mean `loss_15`?". Return an empty text if no
+    word is similar.
+    """
     from difflib import get_close_matches  # imported late, because only errors need it
 
     nearest = get_close_matches(str(word)[:MAX_WORD], map(str, allowed), n=1)

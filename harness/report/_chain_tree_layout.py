@@ -29,7 +29,9 @@ MARGIN = 8
 
 @dataclass(slots=True)
 class PlacedMark:
-    """A mark of the picture with its position: centre `x` and top `y` in CSS pixels. y grows downwards."""
+    """A mark of the picture with its position in CSS pixels. `x` is its centre, and `y` is its top. y grows
+    downwards.
+    """
 
     mark: ChainTreeMark
     width: float
@@ -42,7 +44,7 @@ class PlacedMark:
 
     @property
     def rows(self) -> range:
-        """The rows that the mark occupies, including the gap above each row."""
+        """The rows that the mark occupies, including the gap above the mark."""
         return range(self.row, self.row + math.ceil((self.height + ROW_GAP) / ROW_HEIGHT))
 
     def walk(self) -> Iterator["PlacedMark"]:
@@ -64,7 +66,7 @@ class ChainTreeLayout:
 
 
 class _SubtreeOutline:
-    """The leftmost and rightmost positions of a subtree in each row, relative to its root."""
+    """The outline of a subtree: its leftmost and rightmost position in each row, relative to its root."""
 
     def __init__(self) -> None:
         self.shift = 0.0
@@ -75,8 +77,8 @@ class _SubtreeOutline:
             self._rows[row] = (-width / 2 - self.shift, width / 2 - self.shift)
 
     def distance_to(self, right: "_SubtreeOutline", gap: float = COLUMN_GAP) -> float:
-        """Return the smallest distance between this root and a root on its right that leaves `gap` between the two
-        subtrees.
+        """Return the distance at which the root of the subtree `right` must be placed on the right of this root. It is
+        the smallest distance that leaves `gap` between the two subtrees.
         """
         shared = self._rows.keys() & right._rows.keys()
         return max(
@@ -85,7 +87,9 @@ class _SubtreeOutline:
         )
 
     def merged_with(self, other: "_SubtreeOutline", x: float) -> "_SubtreeOutline":
-        """Merge another outline into this one, and return the result. The root of the other is at `x`."""
+        """Merge two outlines, and return the result. The root of `other` is at `x`, relative to this root. Both
+        outlines must not be used afterwards.
+        """
         other.shift += x
         large, small = (self, other) if len(self._rows) >= len(other._rows) else (other, self)
         by = small.shift - large.shift
@@ -114,7 +118,7 @@ def lay_out(root: ChainTreeMark) -> ChainTreeLayout:
 
 
 def _sized(root: ChainTreeMark) -> PlacedMark:
-    """Return all marks with their sizes and rows, but without positions.
+    """Return the marks of the picture with their sizes and rows, but without positions.
 
     All boxes are as wide as the longest label, except the inception block's.
     """
@@ -151,7 +155,7 @@ def _width(characters: int) -> float:
 
 
 def _offsets(placed_marks: list[PlacedMark]) -> dict[int, float]:
-    """Return the horizontal distance of each mark from the mark below it, by `id` of the mark."""
+    """Return the horizontal distance between each mark and the mark below it. The keys are the values of `id(mark)`."""
     offsets: dict[int, float] = {}
     outlines: dict[int, _SubtreeOutline] = {}
     beside = {id(item.beside) for item in placed_marks}

@@ -32,7 +32,7 @@ MOMENTS = 6
 
 @dataclass(frozen=True, slots=True)
 class MapMoment:
-    """A small map of the swarm at one moment.
+    """A small map that shows the swarm at one moment.
 
     `at` is the time, `what` the event at this time or "", and `network` the network's state.
     """
@@ -57,8 +57,8 @@ class MapSection:
 def section(
     tracks: VehicleTracks, network: Connectivity, ink: Mapping[int, AgentColours], types: Mapping[int, VehicleType]
 ) -> MapSection | None:
-    """Return the map section, or None if no vehicle moved and no file is damaged. `types` contains the known vehicle
-    types.
+    """Return the map section. Return None if no vehicle moved and no file is damaged. `types` contains the vehicle
+    types that are known.
     """
     if not any(_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
         return MapSection(None, [], [], tracks.problems) if tracks.problems else None
@@ -102,7 +102,7 @@ def _drawn(
 def _notable_moments(
     known: Sequence[NetworkDivision], network: Connectivity, tracks: VehicleTracks, end_s: float
 ) -> list[tuple[float, NetworkDivision | None]]:
-    """Return up to `MOMENTS` + 1 moments to show, each with the partition of the network at that moment.
+    """Return up to `MOMENTS` + 1 moments to show. Each has the groups of connected vehicles at that moment.
 
     The moments are the start, the end, the most important network changes and the time of the worst losses. The
     importance of a change is the number of affected vehicles multiplied by the duration of the new state.
@@ -179,7 +179,7 @@ def _legend(flown: Sequence[FlightPath], *, rebooted: bool) -> list[tuple[Markup
 
 
 def _in_words(losses: Collection[float]) -> str:
-    """Return a phrase with the smallest and largest loss rate, or "" if they are negligible."""
+    """Return a phrase with the smallest and the largest loss rate. Return "" if both are negligible."""
     least, most = min(losses, default=0.0), max(losses, default=0.0)
     if not quality(most):
         return ""
@@ -188,7 +188,7 @@ def _in_words(losses: Collection[float]) -> str:
 
 
 def _legend_of_moments(moments: Sequence[MapMoment], types: set[VehicleType]) -> list[tuple[Markup, str]]:
-    """Return legend entries for links with losses, and for vehicle types if there are several."""
+    """Return the part of the legend about links with losses, and about vehicle types if there are several types."""
     drawn = "".join(moment.picture for moment in moments)
     entries = [
         (map_svg.sample(f"q{which}"), words)

@@ -39,7 +39,7 @@ class NetworkStrip:
 def strip(
     network: Connectivity, faults: Sequence[FaultRecord], end_s: float, channel: ChannelRecord | None = None
 ) -> NetworkStrip | None:
-    """Draw the recorded network conditions up to `end_s`. Return None if there are none."""
+    """Draw the recorded network conditions up to mission second `end_s`. Return None if no conditions are recorded."""
     if not network.states:
         return None
     partitions = [
@@ -58,8 +58,8 @@ def strip(
 
 
 def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.ConditionSpan]:
-    """Return the load of the shared channel over time. Neighbouring intervals with the same load in percent are
-    joined.
+    """Return the load of the shared channel over time. Neighbouring intervals that have the same load in percent become
+    one.
     """
     loads = [round(share, 2) for share in channel.load] + [0.0]
     changes = [number for number, load in enumerate(loads) if number == 0 or load != loads[number - 1]]
@@ -96,9 +96,10 @@ def _played_by(channel: ChannelRecord) -> str:
 
 
 def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[_network_strip.ConditionSpan]]]:
-    """Return a row for each group of vehicle pairs with equal losses over time. The largest losses come first.
+    """Return one row for each group of vehicle pairs that have equal losses over time. The row with the largest losses
+    is first.
 
-    Return no lanes if all pairs have equal losses.
+    Return no rows if all pairs have equal losses.
     """
     alike: defaultdict[tuple[tuple[float, float], ...], list[Pair]] = defaultdict(list)
     for pair, history in network.pair_losses.items():
@@ -128,7 +129,7 @@ def _in_words(losses: LossRates) -> str:
 
 
 def initial_state(states: Sequence[NetworkState]) -> str | None:
-    """Return a description of the network at the start, or None if it is not recorded."""
+    """Return a description of the network at the start of the run. Return None if the network is not recorded."""
     return states[0].detail if states else None
 
 
@@ -170,7 +171,9 @@ def _command_detail(command: OperatorCommand) -> str:
 
 
 def ground_station(record: RunRecord) -> str | None:
-    """Return a sentence about the messages between vehicles and the ground station, or None if there was none."""
+    """Return a sentence about the messages between the vehicles and the ground station. Return None if there was no
+    ground station.
+    """
     if (station := record.ground_station) is None:
         return None
     dropped = f", and {text.value(station.dropped)} were dropped" if station.dropped else ""

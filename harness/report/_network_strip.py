@@ -27,7 +27,9 @@ class ConditionSpan:
 
 
 def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[ConditionSpan]:
-    """Convert changes (at_s, text, level) to intervals. Each lasts until the next change. Level 0 gives no interval."""
+    """Convert changes, each as (at_s, text, level), to intervals. An interval lasts until the next change. A change to
+    level 0 gives no interval.
+    """
     spans: list[ConditionSpan] = []
     in_time = sorted(changes, key=lambda change: change[0])
     for number, (at_s, text, level) in enumerate(in_time):

@@ -50,7 +50,9 @@ class ReportSource:
 
     @property
     def unmet_expectations(self) -> list[str]:
-        """Sentences about expected results of the scenario, other than verdicts, that the run did not show."""
+        """Sentences about results that the scenario expects and that the run did not show. Expected verdicts are not
+        included.
+        """
         if not self.record.characteristics:
             return []
         return [sentence for _, unmet in self.record.unmet_expectations(self.chains) for sentence in unmet]
@@ -62,7 +64,9 @@ class ReportSource:
 
     @property
     def files_missing(self) -> list[str]:
-        """Sentences about the missing or damaged files that no other attribute describes."""
+        """Sentences about missing or damaged files. Chain exports are left out, because `chains_missing` describes
+        them.
+        """
         exports = set(self.exports.errors)
         problems = [*(problem for problem in self.archive.problems if problem not in exports), *self.archive.gaps]
         return [

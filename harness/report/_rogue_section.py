@@ -12,8 +12,8 @@ MAX_ROWS = 500
 
 @dataclass(frozen=True, slots=True)
 class InjectionRow:
-    """A table row about one result of an injection. `message` is a message type, or the reason for refused
-    datagrams.
+    """A table row about one result of an injection. `message` is a message type. For refused datagrams, it is the
+    reason.
     """
 
     at: str
@@ -27,14 +27,14 @@ class InjectionRow:
 
 @dataclass(frozen=True, slots=True)
 class RogueSection:
-    """The table of injections. `left_out` is the number of rows beyond `MAX_ROWS`."""
+    """The table of injections. `left_out` is the number of rows that were left out because of `MAX_ROWS`."""
 
     rows: list[InjectionRow]
     left_out: int
 
 
 def section(injections: Sequence[RogueInjection]) -> RogueSection | None:
-    """Return the table of injections, or None if the record contains none."""
+    """Return the table of injections. Return None if the record contains no injection."""
     rows = [row for injection in injections for row in _rows(injection)]
     return RogueSection(rows[:MAX_ROWS], max(0, len(rows) - MAX_ROWS)) if rows else None
 

@@ -86,7 +86,7 @@ def draw(left: ReportSource) -> str:
 
 
 def _again(left: ReportSource, scenario: str) -> str:
-    """Return the command that plays the run again, or an empty text if the record does not contain the scenario."""
+    """Return the command that repeats the run. Return an empty text if the record does not contain the scenario."""
     if not scenario:
         return ""
     given = SCENARIO_FILE if len(scenario) <= MAX_SCENARIO else str(left.run_dir)
@@ -96,8 +96,8 @@ def _again(left: ReportSource, scenario: str) -> str:
 def _pictures(
     exports: Mapping[int, Export], before: Mapping[int, Export], ink: Mapping[int, AgentColours]
 ) -> list[dict[str, Any]]:
-    """Return a picture of the chains at the end of the mission and one after the final reconcile. If both are equal,
-    return one.
+    """Return a picture of the chains at the end of the mission and one after the final reconcile. If the chains are
+    equal, return one picture.
     """
     if not exports:
         return []

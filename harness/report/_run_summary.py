@@ -72,8 +72,8 @@ def _happened(happened: Sequence[tuple[str, str, str]]) -> Iterator[str]:
 
 
 def _listed(sentences: Iterable[str]) -> list[str]:
-    """Return the sentences as a Markdown list, limited to `SENTENCES_SHOWN` entries. Without sentences, return no
-    lines.
+    """Return the sentences as a Markdown list of at most `SENTENCES_SHOWN` entries. Return no lines if there are no
+    sentences.
     """
     all_sentences = list(sentences)
     items = [f"- {_short(sentence)}" for sentence in all_sentences[:SENTENCES_SHOWN]]

@@ -12,7 +12,7 @@ from harness.report.chain_tree import ranges
 
 @dataclass(frozen=True, slots=True)
 class LostBlockRow:
-    """A table row about a block that a lost vehicle completed, or that no vehicle holds any more."""
+    """A table row about a block. A lost vehicle completed this block, or no vehicle holds it any more."""
 
     name: str
     ink: AgentColours | None
@@ -37,7 +37,7 @@ class SurvivalSection:
 
 
 def section(survived: Survival | None, ink: Mapping[int, AgentColours]) -> SurvivalSection | None:
-    """Return the section about lost blocks, or None if the record does not contain it."""
+    """Return the section about lost blocks. Return None if the record contains nothing about the survival of blocks."""
     if survived is None:
         return None
     return SurvivalSection(in_words(survived), [_row(loss, ink) for loss in survived.losses])

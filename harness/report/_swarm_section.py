@@ -120,7 +120,7 @@ def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
 
 
 def counts(exports: Mapping[int, Export], record: RunRecord) -> str | None:
-    """Return a sentence about completed blocks that are in no chain, and about blocks in chains that no record lists as
+    """Return a sentence about completed blocks that are in no chain, and about held blocks that no record lists as
     completed.
 
     Return None if the completed blocks are exactly the blocks in the chains.

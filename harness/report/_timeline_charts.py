@@ -1,4 +1,6 @@
-"""Draw charts below the timeline: lengths of chains, copies of blocks, and an endless cycle of the agents."""
+"""Draw charts below the timeline: lengths of chains, numbers of copies of blocks, and an endless cycle of the
+agents.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,7 +25,7 @@ Figure = Callable[[ReplicationFigures], float | None]
 
 @dataclass(frozen=True, slots=True)
 class TimelineChart:
-    """A chart. `lines` contains pairs of a line sample and its meaning."""
+    """A chart with its legend. Each element of `lines` is a sample of a line and the meaning of this line."""
 
     name: str
     lines: list[tuple[Markup, str]]
@@ -45,8 +47,8 @@ _LINE_CLASSES = ("broken", "whole")
 def draw(
     spreads: Sequence[ReplicationFigures], faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], end_s: float
 ) -> list[TimelineChart]:
-    """Return a chart for each group of figures. `spreads` contains the numbers of copies over time, with at least one
-    entry.
+    """Return a chart for each group of numeric results. `spreads` contains the spread of the blocks over time, with at
+    least one entry.
     """
     moments = thin_states(spreads, end_s)
     behind = draw_background(shades, faults, HEIGHT)
@@ -54,7 +56,7 @@ def draw(
 
 
 def thin_states(spreads: Sequence[ReplicationFigures], end_s: float) -> Sequence[ReplicationFigures]:
-    """Return those states of a long sequence that are visible when the whole run is shown.
+    """Shorten a long list of states. Return the states that are visible when the whole run is shown.
 
     Each interval of one picture column keeps the state with the shortest mutual chain and the last state.
     """
@@ -140,7 +142,7 @@ _TEXT = 28
 
 
 def cycle_chart(cycle: Cycle, end_s: float) -> TimelineChart:
-    """Draw an endless cycle of the agents up to `end_s`, the end of the run in mission seconds."""
+    """Draw an endless cycle of the agents. The run ends at mission second `end_s`."""
     start_s = max(0.0, min(cycle.since_s, end_s))
     period_s = cycle.period_s if cycle.period_s is not None and cycle.period_s > 0 else end_s - start_s
     fault_text = "; ".join(f"agent {finding.agent_id}, {finding.detail}" for finding in findings(cycle))[:MAX_TEXT]

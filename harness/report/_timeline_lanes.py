@@ -160,12 +160,12 @@ def _legend(
 
 
 def block_label(block: str, names: Mapping[str, str]) -> str:
-    """Return the name of the block, or the first 12 digits of its hash if no export contains it."""
+    """Return the name of a block. If no export contains the block, return the first 12 digits of its hash."""
     return names.get(block, block[:12])
 
 
 def phases_in_words(reconcile: AgentReconcile) -> str:
-    """Return the phases of a reconcile with their numbers of rounds, in the order in which they began."""
+    """Return the phases of a reconcile in the order in which they began. Each has its number of rounds."""
     rounds: dict[str, int] = {}
     for phase in reconcile.phases:
         rounds[phase.name] = rounds.get(phase.name, 0) + phase.rounds
@@ -173,7 +173,7 @@ def phases_in_words(reconcile: AgentReconcile) -> str:
 
 
 def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[BlockCommit]]:
-    """Combine neighbouring commits of each agent, so that about `MAX_COMMITS` marks remain.
+    """Combine commits of the same agent that are close in time, so that about `MAX_COMMITS` marks remain.
 
     Commits in one group lie close together.
     """
@@ -191,13 +191,17 @@ def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[Blo
 
 
 def _longest(spans: Sequence[Span]) -> list[Span]:
-    """Return the `MAX_BARS` longest intervals in order of time. Of two equally long ones, the earlier is kept."""
+    """Return the `MAX_BARS` longest intervals in order of time. If two intervals are equally long, the earlier one is
+    kept.
+    """
     kept = sorted(spans, key=lambda span: (round(span.start_s - span.end_s, 3), span.start_s))[:MAX_BARS]
     return sorted(kept, key=attrgetter("start_s"))
 
 
 def _css_class(outcome: str) -> str:
-    """Return the CSS class of a vote. All results except approval and disapproval count as undecided."""
+    """Return the CSS class of a vote with this result. Any result other than approval and disapproval counts as
+    undecided.
+    """
     return {"approved": "approved", "not approved": "refused"}.get(outcome, "undecided")
 
 
@@ -262,7 +266,9 @@ def _commit(group: Sequence[BlockCommit], lane_height: int, names: Mapping[str, 
 
 
 def _tie(tie: Phase2Tie, lane_height: int) -> Markup:
-    """Draw a dot as a line of length 0 with round ends. The dot stays round when the picture is stretched."""
+    """Draw a tie as a dot. The dot is a line of length 0 with round ends, so it stays round when the picture is
+    stretched.
+    """
     return Markup('<path class="tie" d="M{} {}h0"><title>{}</title></path>').format(
         format_number(tie.at_s),
         n(lane_height - 3 - _PHASES_HEIGHT / 2),
@@ -271,7 +277,9 @@ def _tie(tie: Phase2Tie, lane_height: int) -> Markup:
 
 
 def _running_background(agent: int, faults: Sequence[FaultRecord], lane_height: int, end_s: float) -> list[Markup]:
-    """Draw the background of a row while its agent runs, and a broken line while the agent is paused."""
+    """Draw the background of an agent's row for the times at which the agent runs. Draw a broken line for the times at
+    which it is paused.
+    """
     ran: list[tuple[float, float]] = []
     paused: list[tuple[float, float]] = []
     since_s: float | None = 0.0

@@ -18,7 +18,7 @@ TICK_HEIGHT = 22
 
 @dataclass(frozen=True, slots=True)
 class PartitionShade:
-    """An interval of mission time with a partition, and its description."""
+    """An interval of mission time during which the network is partitioned, with a description of the partition."""
 
     start_s: float
     end_s: float

@@ -45,7 +45,7 @@ MAX_FAULTS = 500
 
 @dataclass(frozen=True, slots=True)
 class TimelineTable:
-    """The rows of a table. `left_out` is the number of rows beyond `MAX_ROWS`."""
+    """The rows of a table. `left_out` is the number of rows that were left out because of `MAX_ROWS`."""
 
     rows: list[list[str]]
     left_out: int
@@ -53,8 +53,8 @@ class TimelineTable:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """The timeline. `messages` is JSON from which the script of the page draws arrows, or "null" if messages are left
-    out.
+    """The timeline. `messages` is JSON from which the script of the page draws arrows. It is "null" if no messages are
+    drawn.
     """
 
     end_s: float
@@ -71,14 +71,14 @@ class Timeline:
 
 @dataclass(frozen=True, slots=True)
 class TimelineSection:
-    """The timeline, with notes about the parts that were left out."""
+    """The timeline with its tables and charts, and notes about the parts that were left out."""
 
     drawn: Timeline
     notes: list[str]
 
 
 def section(left: ReportSource, names: Mapping[str, str]) -> TimelineSection | None:
-    """Return the timeline section, or None if there is no trace. `names` contains the names of blocks by hash."""
+    """Return the timeline section. Return None if there is no trace. `names` contains the names of blocks by hash."""
     traces, ink = left.traces, left.ink
     if not traces:
         return None
@@ -135,14 +135,14 @@ def end_s(left: ReportSource) -> float:
 
 
 def _planned_s(record: RunRecord) -> float:
-    """Return the planned duration in mission seconds if the run was completed, otherwise 0."""
+    """Return the planned duration in mission seconds if the run was completed. Return 0 otherwise."""
     if record.scenario is None or record.scenario.duration_s > LATEST_S or facts.outcome(record) is not None:
         return 0.0
     return record.scenario.duration_s
 
 
 def _shades(network: Connectivity, end_s: float) -> tuple[list[PartitionShade], int]:
-    """Return the partitions with their times, and the number of shorter partitions that exceed `MAX_SHADES`."""
+    """Return the longest partitions, at most `MAX_SHADES`, and the number of shorter partitions that were left out."""
     known = divisions(network.states)
     ends = [*(division.at_s for division in known[1:]), end_s]
     shades = [
@@ -157,7 +157,7 @@ def _shades(network: Connectivity, end_s: float) -> tuple[list[PartitionShade], 
 def _messages(
     messages: Sequence[BroadcastMessage] | None, agents: Sequence[int], names: Mapping[str, str]
 ) -> tuple[str, list[str]]:
-    """Return the received messages as JSON, and notes about messages that were left out.
+    """Return the messages that were received as JSON, and notes about messages that were left out.
 
     The JSON holds the message names, the agent IDs, and one list for each message: time, lane of the sender, index of
     the name, block, and a pair [lane, time] for each receipt.
@@ -213,7 +213,9 @@ def _reconcile_row(reconcile: AgentReconcile) -> list[str]:
 
 
 def _in_words(history: MissionHistory, agents: int, end_s: float, unknown: bool) -> str:
-    """Return a text that describes the timeline. `unknown` adds that undefined names in traces may hide events."""
+    """Return a text that describes the timeline. If `unknown` is true, the text adds that traces contain undefined
+    names and may hide events.
+    """
     approved = sum(vote.outcome == "approved" for vote in history.votes)
     return (
         f"Timeline of {agents} agents over {text.duration(round(end_s, 1))}: {len(history.votes)} votes, {approved} of"

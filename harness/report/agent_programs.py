@@ -1,4 +1,4 @@
-"""List the programs that the agents of a run executed, if they are not the harness's own agent."""
+"""List the programs that ran as agents in a run, if they are not the harness's own agent."""
 
 import shlex
 from collections.abc import Iterable, Mapping
@@ -13,7 +13,7 @@ from harness.scenario import Scenario
 
 @dataclass(frozen=True)
 class AgentProgram:
-    """The program of one or more agents. `command` is None for the harness's own agent.
+    """The program that one or more agents ran. `command` is None for the harness's own agent.
 
     `version` is the version that the agents reported, or None.
     """
@@ -34,12 +34,14 @@ class AgentProgram:
 
 
 def programs(record: RunRecord) -> list[AgentProgram]:
-    """Return the programs in the order of their first agents. The list is empty if all agents are the harness's own."""
+    """Return the programs, ordered by the first agent that ran each. The list is empty if all agents ran the harness's
+    own program.
+    """
     return [] if record.scenario is None else asked_for(record.scenario, record.agents)
 
 
 def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[AgentProgram]:
-    """Return the programs that a scenario requests for its agents.
+    """Return the programs that a scenario names for its agents.
 
     `agents` are the records of the agents, if the scenario was played.
     """

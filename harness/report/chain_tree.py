@@ -1,4 +1,4 @@
-"""Combine the chains of all agents into a tree. Chains with equal beginnings share a branch.
+"""Combine the chains of all agents into a tree. Chains that begin with the same blocks share the marks of these blocks.
 
 A block appears once for each history that it follows. If diverged agents hold the same block, it is therefore on two
 branches (Figure 4.4). `marks` turns the tree into marks to draw: a box for each block, an oval where chains end and, on
@@ -24,7 +24,7 @@ OVAL_LINE_CHARACTERS = 14
 
 @dataclass(slots=True)
 class ChainTreeNode:
-    """A block in the tree. In the inception block, `block` is None."""
+    """A block in the tree. `block` is None for the inception block."""
 
     block: ExportedBlock | None
     holders: list[int] = field(default_factory=list)
@@ -67,7 +67,7 @@ def chain_tree(exports: Mapping[int, Export]) -> ChainTreeNode:
 
 
 def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
-    """Return the agents whose chains contain each block, by block hash."""
+    """Return, for each block hash, the agents whose chains contain the block."""
     held_by: dict[str, list[int]] = {}
     for agent_id, export in sorted(exports.items()):
         for block_hash in dict.fromkeys(export.chain_of_block_hashes):
@@ -76,7 +76,8 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool) -> ChainTreeMark:
-    """Return the mark of the inception block with all marks above it. `names` contains the names of blocks.
+    """Return the mark of the inception block. All other marks stand above it. `names` contains the names of blocks by
+    hash.
 
     The marks above a block are ordered by their lowest agent ID.
     """
@@ -100,7 +101,8 @@ def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool)
 def _stretch(
     below: ChainTreeMark, first: ChainTreeNode, names: Mapping[str, str], abridged: bool
 ) -> tuple[ChainTreeMark, ChainTreeNode]:
-    """Add marks above `below`, from the block `first` to the next block where the tree branches or a chain ends.
+    """Add the marks of consecutive blocks above the mark `below`. They begin with `first` and end where the tree
+    branches or a chain ends.
 
     Return the topmost mark and its node.
     """

@@ -34,7 +34,7 @@ _DOTS_LENGTH = 2 * _DOT_SPACING + 1  # three dots; the last one lies just before
 
 
 class ChainTreePicture:
-    """A picture of the tree of chains, either shortened or with all blocks.
+    """A picture of the tree of chains. It can be drawn shortened or with all blocks.
 
     `key` keeps the identifiers of several pictures on one page distinct. `names` maps block hashes to names, if the
     caller knows more names than these exports contain.
@@ -59,7 +59,9 @@ class ChainTreePicture:
         """Number of blocks that the abridged form omits."""
 
     def draw(self, form: Literal["abridged", "full"]) -> Markup:
-        """Return the picture as SVG for a page that includes STYLE. One page may contain both forms."""
+        """Return the picture as SVG. The page around it must include STYLE, and may contain both forms of the
+        picture.
+        """
         if form == "abridged":
             return self._draw(self._abridged, form, Markup(""))
         return self._draw(lay_out(marks(self._tree, self._names, abridged=False)), form, Markup(""))
@@ -129,7 +131,7 @@ class ChainTreePicture:
         )
 
     def _shape(self, placed: PlacedMark) -> Markup:
-        """Draw one mark with a tooltip that lists the agents holding it."""
+        """Draw one mark. Its tooltip lists the agents that hold the block."""
         mark = placed.mark
         text = _text(placed, "#1c2126")
         if mark.kind == "ellipsis":
@@ -173,8 +175,8 @@ class ChainTreePicture:
 
 
 def _path(below: PlacedMark, above: PlacedMark) -> str:
-    """Return an SVG path from the top of one mark to the bottom of another. The path has two corners if the marks are
-    not aligned.
+    """Return an SVG path from the top of one mark to the bottom of the mark above it. The path has two corners if the
+    marks are not aligned.
     """
     start, end = below.y, above.y + above.height
     if above.x == below.x:
@@ -189,13 +191,13 @@ def _path(below: PlacedMark, above: PlacedMark) -> str:
 
 
 def _path_beside(block: PlacedMark, oval: PlacedMark) -> str:
-    """Return an SVG path from the right side of a block to an oval beside it."""
+    """Return an SVG path from the right side of a block to the oval on its right."""
     middle = block.y + block.height / 2
     return f"M{_n(block.x + block.width / 2)} {_n(middle)}H{_n(oval.x - oval.width / 2)}"
 
 
 def _rectangle(placed: PlacedMark) -> Markup:
-    """Return the beginning of a <rect> element."""
+    """Return the beginning of a `<rect>` element."""
     return Markup('<rect x="{}" y="{}" width="{}" height="{}"').format(
         _n(placed.x - placed.width / 2), _n(placed.y), _n(placed.width), _n(placed.height)
     )

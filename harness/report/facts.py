@@ -1,4 +1,6 @@
-"""Collect the facts that report.html and report.md share: settings, result, figures, and gaps in captures."""
+"""Collect the facts that both report.html and report.md contain: settings, result, numeric results, and missing frames
+of captures.
+"""
 
 import shlex
 from collections.abc import Mapping
@@ -71,7 +73,7 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
 
 
 def outcome(record: RunRecord) -> tuple[str, str] | None:
-    """Return a headline and details if the run was not completed, otherwise None."""
+    """Return a headline and details about a run that was not completed. Return None if the run was completed."""
     if record.outcome == "completed":
         return None
     detail = record.outcome_detail
@@ -83,12 +85,12 @@ def outcome(record: RunRecord) -> tuple[str, str] | None:
 
 
 def figures(record: RunRecord) -> list[tuple[str, str]]:
-    """Return the figures of the run as pairs of label and value."""
+    """Return the numeric results of the run as pairs of label and value."""
     return [(FIGURES.get(key, text.label(key)), text.value(figure)) for key, figure in record.figures.items()]
 
 
 def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
-    """Return a sentence about frames that packet captures missed, or None."""
+    """Return a sentence about frames that are missing in packet captures. Return None if no frames are missing."""
     lacking = sorted(int(vehicle) for vehicle, frames in captured.items() if frames.dropped)
     if not lacking:
         return None
@@ -99,13 +101,13 @@ def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
 
 
 def link_qualities() -> list[str]:
-    """Return the legend text for each quality of a link. The best quality has number 0."""
+    """Return the legend texts for the qualities of a link. The text at index 0 describes the best quality."""
     limits = map(text.percent, QUALITY_LIMITS)
     return ["link", *(f"link that loses {low} to {high}" for low, high in pairwise(limits))]
 
 
 def command_again(record: RunRecord, scenario: str) -> str:
-    """Return the command that plays the run again. `scenario` is the path of its scenario file.
+    """Return the command that repeats the run. `scenario` is the path of its scenario file.
 
     In virtual time, the command gives the same exports and traces, to the byte.
     """
@@ -116,7 +118,7 @@ def command_again(record: RunRecord, scenario: str) -> str:
 
 
 def scenario_text(record: RunRecord) -> str:
-    """Return the recorded scenario as YAML without default values, or an empty text if no scenario is recorded."""
+    """Return the recorded scenario as YAML without default values. Return an empty text if no scenario is recorded."""
     if record.scenario is None:
         return ""
     return to_yaml(record.scenario.model_dump(mode="json", exclude_defaults=True), [])

@@ -21,7 +21,9 @@ PAGE_STYLE = PALETTE + (_HERE / "page.css").read_text(encoding="utf-8")
 
 
 def render(template: Path, *, styles: Sequence[str], script: str = "", **content: Any) -> str:
-    """Return the page made from `template`. The page allows its styles and its script by their digests."""
+    """Return the page made from `template`. The Content-Security-Policy of the page permits its styles and its script
+    by their digests.
+    """
     environment = Environment(
         loader=FileSystemLoader([template.parent, _HERE]),
         autoescape=True,

@@ -25,7 +25,8 @@ MAX_NAMED = 6
 
 @dataclass(frozen=True, slots=True)
 class NetworkDivision:
-    """The groups of connected vehicles from `at_s` on, by number from 0. All other living vehicles are alone.
+    """The division of the vehicles into numbered groups (`parts`) from `at_s` on. The vehicles of a group are
+    connected. All other living vehicles are alone.
 
     If all vehicles reach each other, all are in `together`, and there are no parts.
     """
@@ -45,7 +46,7 @@ class NetworkDivision:
         return self.part_of(vehicle), self.reachable_from(vehicle)
 
     def part_of(self, vehicle: int) -> int | None:
-        """Return the number of the vehicle's group, or None if it has none."""
+        """Return the number of the vehicle's group. Return None if the vehicle is in no group."""
         return next((number for number, members in self.parts.items() if vehicle in members), None)
 
     def reachable_from(self, vehicle: int) -> frozenset[int]:
@@ -56,7 +57,8 @@ class NetworkDivision:
         return self.together if vehicle in self.together else frozenset({vehicle})
 
     def changed_since(self, before: "NetworkDivision") -> int:
-        """Return the number of vehicles that were lost, came back, or reach different vehicles than before.
+        """Return the number of vehicles that differ from the division `before`: they were lost, came back, or reach
+        different vehicles.
 
         Vehicles that live in only one of the two states are ignored in the comparison of reached vehicles.
         """
@@ -80,9 +82,9 @@ class NetworkDivision:
 
 @dataclass(frozen=True, slots=True)
 class TrackSegment:
-    """A section of a flight path in which the vehicle belongs to the same group.
+    """A section of a flight path on which the vehicle stays in the same group.
 
-    `division` is the one at its start.
+    `division` is the division of the network at its start.
     """
 
     vehicle: int
@@ -92,7 +94,9 @@ class TrackSegment:
 
 @dataclass(frozen=True, slots=True)
 class FlightPath:
-    """The path of a vehicle from its start, or its first known position, to its loss or the end of the run."""
+    """The path of a vehicle from its start to its loss or the end of the run. If the start is unknown, it begins at the
+    first known position.
+    """
 
     vehicle: int
     segments: list[TrackSegment]
@@ -132,7 +136,8 @@ def divisions(states: Sequence[Topology]) -> list[NetworkDivision]:
 
 
 def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]) -> dict[int, frozenset[int]]:
-    """Number the groups. A group keeps the number of an earlier group if it contains more than half of its vehicles.
+    """Number the groups. A group gets the number of an earlier group if it contains more than half of the earlier
+    group's vehicles.
 
     Other parts get the lowest free numbers.
     """
@@ -148,8 +153,8 @@ def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]
 
 
 def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, most: int) -> list[NetworkDivision]:
-    """Return the first division of the vehicles into groups, and those that lasted longest: at most `most` divisions.
-    Each counts as lasting until the next returned one.
+    """Return the first division of the vehicles into groups and the divisions that lasted longest, at most `most`
+    divisions in total. Each is then shown until the next one in the result.
     """
     if len(all_divisions) <= most:
         return list(all_divisions)
@@ -161,7 +166,7 @@ def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, mo
 def flights(
     vehicle: int, tracks: VehicleTracks, network: Connectivity, all_divisions: Sequence[NetworkDivision], end_s: float
 ) -> Iterator[FlightPath]:
-    """Yield the paths of a vehicle, and of the vehicles that replaced it after a loss."""
+    """Yield the path of a vehicle. If vehicles replaced it after a loss, yield their paths too."""
     wreck: PositionFix | None = None
     for begin_s, until_s, lost in network.airborne_intervals(vehicle, end_s):
         flown = [fix for fix in tracks.by_vehicle[vehicle] if begin_s <= fix.at_s <= until_s]
@@ -235,8 +240,8 @@ def _widen(low: float, high: float, shortest: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class MapProjection:
-    """Converts positions in the area `land` to pixels of a rectangle. `left` and `top` are the upper left corner of the
-    rectangle.
+    """A converter from positions in the area `land` to pixels of a rectangle. `left` and `top` are the upper left
+    corner of the rectangle.
     """
 
     land: GroundRectangle
@@ -267,14 +272,16 @@ class MapProjection:
         return self.x(fix.east_m), self.y(fix.north_m)
 
     def ticks_m(self) -> tuple[list[float], list[float]]:
-        """Return round numbers of metres north and east, in equal steps, for the axes."""
+        """Return round numbers of metres for the ticks of both axes, first north and then east. The steps of both axes
+        are equal.
+        """
         every = svg.step(max(self.land.width_m, self.land.height_m), 9)
         return _multiples(every, self.land.south_m, self.land.north_m), _multiples(
             every, self.land.west_m, self.land.east_m
         )
 
     def scale_bar_m(self) -> float:
-        """Return a round length for the scale bar, at least about a fifth of the map's width."""
+        """Return a round length in metres for the scale bar. It is at least a fifth of the map's width."""
         return svg.step(self.land.width_m, 5)
 
 
@@ -283,7 +290,7 @@ def _multiples(every: float, low: float, high: float) -> list[float]:
 
 
 def thin(lines: Sequence[Sequence[Point]], most: int) -> list[list[Point]]:
-    """Simplify the lines to an accuracy of half a pixel, or less until they have at most `most` points in all.
+    """Simplify the lines to an accuracy of half a pixel. If more than `most` points remain, reduce the accuracy.
 
     Each line keeps both its ends.
     """
@@ -295,7 +302,7 @@ def thin(lines: Sequence[Sequence[Point]], most: int) -> list[list[Point]]:
 
 
 def simplify(line: Sequence[Point], tolerance: float) -> list[Point]:
-    """Remove points as long as the line moves by at most `tolerance` (Douglas and Peucker, 1973)."""
+    """Remove points from the line. The line moves by at most `tolerance` (Douglas and Peucker, 1973)."""
     half = tolerance / 2
     apart = [line[0]]
     for point in line[1:-1]:

@@ -40,7 +40,7 @@ Box = tuple[float, float, float, float]
 def tags(
     tagged: Sequence[tuple[int, Point]], crosses: Sequence[Point], to_px: MapProjection, ink: Mapping[int, AgentColours]
 ) -> Markup:
-    """Draw tags with vehicle IDs that overlap neither each other nor the `crosses`.
+    """Draw tags with vehicle IDs. No tag overlaps another tag or one of the points `crosses`.
 
     A vehicle without room for a tag has only its tooltip.
     """
@@ -56,7 +56,7 @@ def tags(
 
 
 def _boxes(digits: int, place: Point) -> list[Box]:
-    """Return possible boxes for a tag. The best is first."""
+    """Return possible rectangles for a tag. The best one is first."""
     width = digits * DIGIT + PADDING
     boxes = []
     for distance in (NEAR, FAR):
@@ -121,7 +121,7 @@ _MOMENT_WIDTH, _MOMENT_HEIGHT = 300, 240
 
 
 def css_class(division: NetworkDivision | None, vehicle: int) -> str:
-    """Return the CSS class of a vehicle in this grouping of the network."""
+    """Return the CSS class of a vehicle. It depends on the group of the vehicle in this division of the network."""
     if division is None:
         return "unknown"
     if vehicle in division.together:
@@ -137,7 +137,9 @@ def draw_tracks(
     ink: Mapping[int, AgentColours],
     description: str,
 ) -> Markup:
-    """Draw the map. `reboots` contains positions and agents of reboots, and `description` describes the picture."""
+    """Draw the map. `reboots` contains the position and the agent of each reboot. `description` is a text about the
+    picture.
+    """
     to_px = MapProjection(land, _LEFT, _TOP, _ROOM_WIDTH, _ROOM_HEIGHT)
     return Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" class="map" role="img" width="{w}" height="{h}" viewBox="0 0 {w} {h}"'
@@ -189,7 +191,7 @@ def draw_moment(
 
 
 def _links(at: Mapping[int, Point], links: Mapping[tuple[int, int], float], division: NetworkDivision | None) -> Markup:
-    """Draw the links. Those with small loss rates are drawn last, so that they are on top."""
+    """Draw the links. Links with small loss rates are drawn last, so that they are on top of the others."""
     drawn: dict[tuple[int, str], list[str]] = {}
     shortest = sorted(links, key=lambda pair: math.dist(at[pair[0]], at[pair[1]]))
     for vehicle, neighbour in shortest[:MAX_LINKS]:
@@ -284,7 +286,7 @@ def frame(to_px: MapProjection) -> Markup:
 
 
 def _track_paths(segments: Sequence[TrackSegment], to_px: MapProjection) -> Markup:
-    """Draw the flight paths. Those in groups of connected vehicles are on top."""
+    """Draw the flight paths. Path sections in which the vehicle belongs to a group are on top."""
     lines = thin([[to_px(fix) for fix in segment.fixes] for segment in segments], MAX_POINTS)
     classes = [css_class(segment.division, segment.vehicle) for segment in segments]
     drawn = sorted(zip(classes, segments, lines, strict=True), key=lambda way: TRACK_CLASSES.index(way[0]))

@@ -63,9 +63,9 @@ class VerdictEntry:
 
 
 def verdicts(record: RunRecord) -> list[VerdictEntry]:
-    """Return all verdicts of a judged run, including characteristics without a recorded verdict.
+    """Return all verdicts of a judged run. A characteristic without a recorded verdict is "not judged".
 
-    Return none otherwise.
+    Return no verdicts if the run was not judged.
     """
     if not record.characteristics:
         return []
@@ -93,7 +93,7 @@ def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None, ex
 
 
 def headline(verdicts: list[VerdictEntry], *, completed: bool) -> tuple[str, str]:
-    """Return a one-line summary of the verdicts, and its kind (the CSS class).
+    """Return a one-line summary of the verdicts, and the CSS class of this summary.
 
     A run that did not complete is never "holds". A run whose bad verdicts are all expected is "unknown".
     """

@@ -57,7 +57,7 @@ class ProcessResult:
 def run_python(
     arguments: Sequence[str], *, first: Sequence[Path], cwd: Path, limit_s: float | None, stdin: str | None = None
 ) -> ProcessResult:
-    """Run this Python interpreter with the directories `first` at the beginning of its module path.
+    """Run a Python program with this interpreter. The directories `first` come first on its module search path.
 
     The process has its own session. If the caller is interrupted, the process receives SIGTERM, and SIGKILL after
     GRACE_S.
@@ -157,13 +157,17 @@ class GitCommit:
 
 @dataclass(frozen=True)
 class SuspectCommits:
-    """The result of a search: the first bad commit, or several candidates if some commits could not be tested."""
+    """The result of a search for the first bad commit: this commit, or several candidates if some commits could not be
+    tested.
+    """
 
     first: tuple[str, ...]
 
 
 class GitBisection:
-    """A clone of the repository. `tree` is its working directory."""
+    """A clone of the repository, in which `git bisect` searches for the first bad commit. `tree` is its working
+    directory.
+    """
 
     def __init__(self, repository: Path, tree: Path) -> None:
         self._repository = repository
@@ -193,17 +197,17 @@ class GitBisection:
         self._git(self.tree, "clean", "--quiet", "-xffd")
 
     def between(self, good: str, bad: str) -> int:
-        """Return the number of commits after the good one, up to and including the bad one."""
+        """Return the number of commits after the commit `good`, up to and including the commit `bad`."""
         return int(self._git(self.tree, "rev-list", "--count", f"{good}..{bad}"))
 
     def begin(self, good: str, bad: str) -> "str | SuspectCommits":
-        """Start the search for a commit. Check out the first commit to test, and return its hash."""
+        """Start the search for the first bad commit. Check out the first commit to test, and return its hash."""
         return self._next(self._git(self.tree, "bisect", "start", bad, good, accept=(0, 2)))
 
     def mark(self, mark: Mark) -> "str | SuspectCommits":
-        """Record the verdict on the present commit, and check out the next one to test.
+        """Record the verdict on the commit that is checked out, and check out the next commit to test.
 
-        Returns its hash, or the result of the bisection.
+        Returns the hash of the next commit, or the result of the search.
         """
         return self._next(self._git(self.tree, "bisect", mark, accept=(0, 2)))
 

@@ -1,4 +1,4 @@
-"""Run many tasks on all processor cores of this machine, with a progress bar. Afterwards no process remains.
+"""Run many tasks on all processor cores of this machine, with a progress bar. No worker process remains afterwards.
 
     with sweep(tasks, work, jobs, what="runs") as outcomes:
         for task, outcome in outcomes:
@@ -58,7 +58,8 @@ def cores() -> int:
 def sweep(
     tasks: Iterable[T], work: Callable[[T], R], jobs: int, *, what: str | None = None, in_order: bool = True
 ) -> Iterator[Iterator[tuple[T, R | FailedTask]]]:
-    """Yield each task with its result, in the order of `tasks`, or as soon as it is known if `in_order` is false.
+    """Execute the tasks in `jobs` processes, and yield each task with its result. If `in_order` is true, the results
+    have the order of `tasks`. Otherwise each result is yielded as soon as it is known.
 
     - `jobs`: number of processes. With 1, the tasks run in this process.
     - `what`: name of the tasks for a progress bar on standard error. None shows no bar.
@@ -91,7 +92,7 @@ def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError
 
 
 def raise_error(outcome: R | HarnessError) -> R:
-    """Raise the result of a task if the result is an error. Otherwise return the result."""
+    """Raise the result of a task if this result is an error. Otherwise return the result."""
     if isinstance(outcome, HarnessError):
         raise outcome
     return outcome
@@ -214,7 +215,7 @@ def sigterm_as_ctrl_c() -> Iterator[None]:
 
 @contextlib.contextmanager
 def progress_bar(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]]:
-    """Yield a function that counts the results passed to it and shows their number.
+    """Show a progress bar. Yield a function that counts the results passed to it.
 
     It shows a bar on a terminal, and otherwise a line every few seconds. It draws without a thread, because forking a
     process with threads is unsafe.

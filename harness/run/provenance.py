@@ -43,7 +43,9 @@ MODIFIED = "-dirty"
 
 
 def same_judge(recorded: Mapping[str, str]) -> bool:
-    """Return true if the recorded versions and the present ones belong to the same, unmodified checker."""
+    """Return true if the installed checker is unmodified and has the recorded versions, so that it is the checker that
+    judged the run.
+    """
     present = versions()
     return not present.get("commit", "").endswith(MODIFIED) and all(
         recorded.get(key) == present.get(key) for key in JUDGE
@@ -68,7 +70,7 @@ def _reference_version() -> str:
 
 @cache
 def _commit() -> str | None:
-    """Return the git commit of the running harness, or None for an installed package."""
+    """Return the git commit of the running harness. Return None for an installed package."""
     if not (ROOT / ".git").exists():
         return None
     try:

@@ -40,8 +40,8 @@ REPLAY_FILE = "replay.yaml"
 
 
 def replay_of(record: RunRecord, by_hand_s: Collection[float]) -> str:
-    """Return the text of a scenario file that repeats the run. `by_hand_s` contains the times of entries that a user
-    added.
+    """Return the text of a scenario file that repeats the run. `by_hand_s` contains the times of timeline entries that
+    a user added.
     """
     assert record.scenario is not None
     document = record.scenario.model_dump(mode="json", exclude_defaults=True)

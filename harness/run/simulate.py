@@ -67,7 +67,9 @@ def simulate(
 def simulate_in_memory(
     memory: "MemoryRecorder", scenario: Scenario, seed: int, *, again: bool = False, **options: Any
 ) -> Simulated:
-    """Play and check a scenario like `simulate`. `memory` stores the run, and `options` are those of the simulation."""
+    """Play and check a scenario as `simulate` does. `memory` stores the records of the run, and `options` are the
+    options of the simulation.
+    """
     SimulationBackend().refuse(scenario)
     simulation = Simulation(scenario, seed, memory, **options)
     with closing(simulation):
@@ -85,10 +87,11 @@ def simulate_in_memory(
 
 
 def check_determinism(scenario: Scenario, seed: int) -> None:
-    """Check that foreign agents (separate programs) give the same answers to the same inputs again.
+    """Check that foreign agents (separate programs) give the same answers if they receive the same inputs a second
+    time.
 
-    Raises HarnessError if an agent does not, or does not support the mission. A crashed or hung agent raises no error
-    here, because its run reports it.
+    Raises HarnessError if an agent gives different answers or does not support the mission. A crashed or hung agent
+    raises no error here, because its run reports it.
     """
     with suppress(AgentFailedError):
         simulate(scenario, seed, tracing=True, again=True)
@@ -112,7 +115,7 @@ def _header(incarnation: SimulatedIncarnation) -> TraceHeader:
 
 
 class MemoryRecorder:
-    """Stores traces and records of a simulated run in memory for the checker."""
+    """A recorder that stores the traces and records of a simulated run in memory for the checker."""
 
     def __init__(self, tracing: bool) -> None:
         self.tracing = tracing
@@ -205,7 +208,9 @@ ENDED = "ended"
 
 @gc_paused()
 def simulated(scenario: Scenario, seed: int) -> Result:
-    """Simulate a scenario with traces, and return the verdict. After a crash of an agent, it only covers the crash."""
+    """Simulate a scenario with traces, and return the verdict. If an agent crashes, the verdict covers only
+    this crash.
+    """
     try:
         return simulate(scenario, seed, tracing=True).result
     except AgentFailedError as error:
@@ -234,7 +239,9 @@ def evidence_lines(violated: dict[str, Judgement]) -> list[str]:
 
 
 def choose_path(out: Path | None, name: str) -> Path:
-    """Return the path for a new file: `out`, or a new name under `runs/`. Raises RunDirectoryError if `out` exists."""
+    """Return the path for a new file: the path `out` if it is given, otherwise a new name under `runs/`. Raises
+    RunDirectoryError if `out` exists.
+    """
     if out is not None and out.exists():
         raise RunDirectoryError(f"{out} exists: choose another --out; existing files are not overwritten")
     path = out or default_path(f"{name} shrunk").with_suffix(".yaml")
@@ -246,8 +253,8 @@ def choose_path(out: Path | None, name: str) -> Path:
 
 
 def write_new_file(path: Path, text: str) -> Path:
-    """Write a new file and return its path. A number is appended if another process took the name. Raises
-    MachineError.
+    """Write a new file and return its path. If another process has created a file with this name, a number is appended
+    to the name. Raises MachineError.
     """
     free, number = path, 2
     while True:

@@ -14,8 +14,8 @@ from harness.play.variant import Variant, core_in_force, load_variant, replaced
 
 @contextmanager
 def in_force(variant: Variant | Path | None) -> Iterator[Variant | None]:
-    """Play and judge with a variant, or with the variant in a file, inside the context. None means the original
-    protocol.
+    """Inside the context, let the agents and the checker use a protocol variant, or the variant in a file. If `variant`
+    is None, they use the original protocol.
 
     Processes that are forked meanwhile have the variant as well. Raises VariantError.
     """

@@ -1,4 +1,5 @@
-"""Name blocks and chains in output: `3.12` if the name is known, or else the first digits of the hash.
+"""Name blocks and chains in output. A block is called `3.12` if its name is known, and otherwise by the first digits of
+its hash.
 
 The exports of a run give the names. Without exports, the order of an agent's first proposals gives them, because an
 agent proposes its blocks in the order in which it completed them. That requires a capture from the agent's first
@@ -43,7 +44,7 @@ class BlockNames:
         return self._blocks.get(block_hash)
 
     def chain(self, chain_hash: bytes) -> str:
-        """Return the first digits of a chain hash, with the top block of the chain if it is known."""
+        """Return the first digits of a chain hash, followed by the top block of the chain if this block is known."""
         digits = chain_hash.hex()[:DIGITS]
         if chain_hash not in self._top_of:
             return digits
@@ -51,7 +52,7 @@ class BlockNames:
         return f"{digits} ({'inception' if top is None else self.block(top)})"
 
     def find(self, query: str) -> bytes:
-        """Return the hash of the block with this name, or whose hash begins with this text.
+        """Return the hash of the block with this name, or of the block whose hash begins with this text.
 
         Raises CaptureError if no block or several blocks match.
         """
@@ -101,7 +102,7 @@ class BlockNames:
 
 
 def run_directories(paths: Iterable[Path]) -> list[Path]:
-    """Return the run directories among `paths`, and those that contain captures among `paths`."""
+    """Return the run directories in `paths`, and the run directories that contain a capture in `paths`."""
     runs = [
         path if path.is_dir() else path.resolve().parent.parent
         for path in paths

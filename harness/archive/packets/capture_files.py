@@ -1,4 +1,4 @@
-"""Find packet capture files, and read those of one mission together with a common clock."""
+"""Find packet capture files. Read all captures of one mission, and convert their times with a common clock."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,7 +16,7 @@ SUFFIXES = (".pcapng", ".pcap")
 
 
 class CaptureClock(NamedTuple):
-    """The conversion of capture times to mission seconds. `epoch_ns` is mission second 0.
+    """A converter from capture times to mission seconds. `epoch_ns` is the capture time of mission second 0.
 
     `of_run` is false if no capture has a comment with the start of the run. Then `epoch_ns` is the time of the first
     packet. Captures from the field differ by the errors of the vehicles' clocks.
@@ -45,7 +45,8 @@ class Captures(NamedTuple):
 
 
 def capture_files(paths: Iterable[Path]) -> list[Path]:
-    """Return the captures in run directories and directories of captures, and the files among `paths`, each once.
+    """Return the captures in run directories and in directories of captures, and the captures among `paths`. Each is
+    listed once.
 
     Raises RunDirectoryError if a path does not exist, or a directory holds no capture.
     """
@@ -65,7 +66,7 @@ def capture_files(paths: Iterable[Path]) -> list[Path]:
 
 
 def read_captures(paths: Iterable[Path], opener: "DatagramOpener | None" = None) -> Captures:
-    """Read all captures of one mission, which is the mission of the first capture with a comment.
+    """Read all captures of one mission. This is the mission named in the first capture that has a comment.
 
     Captures from the field have no comment and are always used. `opener` decrypts the sealed datagrams of a secured
     mission.

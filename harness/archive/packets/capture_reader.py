@@ -1,4 +1,4 @@
-"""Read one packet capture file: the datagrams that one vehicle, or another observer, sent or received.
+"""Read one packet capture file. It contains the datagrams that one vehicle, or a separate observer, sent or received.
 
 The capture of a run names its vehicle in a comment (`ucp-harness run --capture`). A capture from the field has no
 comment. It belongs to the sender of its outbound datagrams, else to the vehicle in its file name, such as `7.pcap`.
@@ -34,7 +34,9 @@ ListenerName = int | str
 
 
 class CaptureComment(BaseModel):
-    """The comment of the harness in a packet capture, as JSON in the section header. `epoch_us` is mission second 0."""
+    """The comment that the harness writes into a packet capture, as JSON in the section header. `epoch_us` is the time
+    of mission second 0.
+    """
 
     ucp_harness: Literal[1]
     vehicle: AgentId
@@ -58,13 +60,13 @@ class Datagram:
         self.seen = array("q")
 
     def sightings(self) -> Iterable[tuple[int, int, int]]:
-        """Return (time in ns, number of the capture, direction) for each occurrence."""
+        """Return (time in ns, number of the capture, direction) for each occurrence of the datagram in a capture."""
         seen = self.seen
         return ((seen[i], seen[i + 1] >> 2, seen[i + 1] & 3) for i in range(0, len(seen), 2))
 
 
 class Capture:
-    """A packet capture file. It covers the time from `began_ns` to `ended_ns`, which are None if unknown.
+    """A packet capture file. It covers the time from `began_ns` to `ended_ns`. Both are None if this time is unknown.
 
     `sees_itself` is true if the file also contains the datagrams that its vehicle sent.
     """
@@ -162,8 +164,8 @@ class Capture:
             return None
 
     def direction(self, sender: int, direction: int) -> int:
-        """Return the direction of a datagram. If the file lacks it, datagrams from the vehicle itself count as
-        outbound.
+        """Return the direction of a datagram. If the file does not record directions, datagrams of the vehicle itself
+        count as outbound.
         """
         return direction or (OUTBOUND if sender == self.vehicle else INBOUND)
 

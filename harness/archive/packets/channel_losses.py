@@ -16,7 +16,7 @@ DROPS = ("queue", "too_long")
 
 
 def channel_losses(runs: Iterable[Path]) -> ChannelLosses:
-    """Return the losses in these run directories. Unreadable lines are ignored."""
+    """Return the losses recorded in these run directories. Unreadable lines are ignored."""
     return {
         (line.sender, line.sequence): {line.dropped: []} if line.dropped else line.lost
         for run in runs
@@ -26,8 +26,8 @@ def channel_losses(runs: Iterable[Path]) -> ChannelLosses:
 
 
 def loss_reasons(losses: ChannelLosses, transmission: Transmission) -> dict[str, list[ListenerName]]:
-    """Return the vehicles that lost the message on the channel, by reason. If the radio dropped it, these are all
-    vehicles.
+    """Return, for each reason, the vehicles that did not receive the message on the channel. If the radio of the sender
+    dropped the message, these are all vehicles.
     """
     named = {
         reason: [name for name in transmission.lost_by if reason in DROPS or name in vehicles]

@@ -38,7 +38,7 @@ _ENDS = struct.Struct("!4H")
 
 
 class NotUcpError(ValueError):
-    """An error: the frame does not contain a valid UCP datagram. `reason` is one of a few fixed texts."""
+    """An error: the frame does not contain a valid UCP datagram. `reason` is one of a small number of fixed texts."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -71,7 +71,7 @@ def unwrap(frame: Frame) -> tuple[bytes, int]:
 
 
 def _network_layer(frame: Frame) -> tuple[int, bytes, int]:
-    """Return (Ethertype, packet, direction)."""
+    """Return (Ethertype, packet, direction) of a frame."""
     data, link_type, direction = frame.data, frame.link_type, frame.direction
     if link_type == _ETHERNET:
         start = 14
@@ -144,8 +144,8 @@ class MessageSummary(NamedTuple):
 
     @property
     def request_key(self) -> tuple[str, bytes | None] | None:
-        """The type and subject of the answers to this request, for comparison with `answers`. None if it is not a
-        request.
+        """The type and the subject that an answer to this request has. They can be compared with `answers`. The value
+        is None if the message is not a request.
 
         Responses do not name the agent that asked.
         """
@@ -154,14 +154,14 @@ class MessageSummary(NamedTuple):
 
     @property
     def answers(self) -> tuple[str, bytes | None] | None:
-        """The type of the answer in this datagram, and the chain or block that it is about. None if the datagram is not
-        an answer.
+        """The type of this answer, and the chain or block that it is about. The value is None if the message is not an
+        answer.
         """
         return None if self.answer is None else (self.message, self._subject)
 
     @property
     def _subject(self) -> bytes | None:
-        """The chain or block that both the request and its answer name.
+        """The chain or block that a request and its answer have in common.
 
         A Next In Sequence response names the found block too, but the request named only the chain.
         """

@@ -18,7 +18,8 @@ _Asked = tuple[float, int]
 
 
 class RequestOutcome(NamedTuple):
-    """The result of a request at vehicle `by`. `response` is the first answer of this vehicle, or None.
+    """The result of a request at the vehicle `by`. `response` is the first answer of this vehicle. It is None without
+    an answer.
 
     The outcome is "answered" unless the response is known to be lost on its way to the agent that asked.
     """
@@ -41,7 +42,7 @@ class RequestAnswers:
         return self._responses.get(request.number, ())
 
     def answers(self, request: Transmission) -> list[RequestOutcome]:
-        """Return the result of a request at each vehicle that received or lost it."""
+        """Return the result of a request at each vehicle that received the request or should have received it."""
         first: dict[int, Transmission] = {}
         for response in self.responses(request):
             first.setdefault(response.sender, response)
@@ -112,7 +113,9 @@ def count_losses(transmissions: Iterable[Transmission]) -> list[LinkLosses]:
 
 
 def loss_matrix(pairs: list[LinkLosses]) -> Iterator[str]:
-    """Yield the lines of a table of lost/sent, with a row for each sender and a column for each receiver."""
+    """Yield the lines of a table with a row for each sender and a column for each receiver. A cell has the form
+    lost/sent.
+    """
     receivers = sorted({pair.receiver for pair in pairs}, key=lambda name: (isinstance(name, str), name))
     cells = {(pair.sender, pair.receiver): f"{pair.lost}/{pair.sent}" for pair in pairs}
     width = max(map(len, [*cells.values(), *map(str, receivers)]), default=0)

@@ -23,8 +23,9 @@ _ListenerName = Annotated[
 
 
 class CaptureRecord(BaseModel):
-    """One capture file. It covers the time from `began_s` to `ended_s`, null if it is empty, and lacks `dropped`
-    frames."""
+    """One capture file. It covers the mission seconds `began_s` to `ended_s`, which are null if the file is empty.
+    `dropped` frames are missing in it.
+    """
 
     file: str
     vehicle: int | None
@@ -38,8 +39,9 @@ class CaptureRecord(BaseModel):
 
 
 class PairRecord(BaseModel):
-    """Datagrams from one sender that one receiver should have received: their number (`sent`), and the number of `lost`
-    ones."""
+    """The datagrams from one sender to one receiver. `sent` counts the datagrams that should have been received, and
+    `lost` those of them that were not.
+    """
 
     sender: int
     receiver: _ListenerName
@@ -48,7 +50,7 @@ class PairRecord(BaseModel):
 
 
 class ReceptionRecord(BaseModel):
-    """The reception of a datagram: the number of copies, and the times of the first (`at_s`) and the last copy."""
+    """The reception of a datagram: the number of copies, and the times of the first copy (`at_s`) and the last copy."""
 
     by: _ListenerName
     at_s: float
@@ -57,8 +59,9 @@ class ReceptionRecord(BaseModel):
 
 
 class AnswerRecord(BaseModel):
-    """The outcome of a request at vehicle `by`: its answer, and the number of the datagram with the answer. null
-    without one."""
+    """The result of a request at vehicle `by`: its answer, and the number of the datagram that contains the answer. The
+    number is null without an answer.
+    """
 
     by: int
     outcome: Outcome
@@ -67,7 +70,8 @@ class AnswerRecord(BaseModel):
 
 
 class DatagramRecord(BaseModel):
-    """One sent datagram. `number` counts in the order of sending. `answers` is null if the message is no request.
+    """One datagram, sent once. `number` is its position in the order of sending. `answers` is null if the message is
+    not a request.
 
     `origin` is `captured` (the capture of its sender has it), `inferred` (its sender had no capture then, and `at_s` is
     the time of the first reception) or `forged` (the named agent did not send it). The vehicles in `lost_by` had a
@@ -94,8 +98,9 @@ class DatagramRecord(BaseModel):
 
 
 class PacketsRecord(BaseModel):
-    """The datagrams of several captures. Times are mission seconds from `epoch_us` on. Without a run, `epoch_us` is the
-    time of the first packet."""
+    """The datagrams in several captures. All times are mission seconds, and `epoch_us` is the time of mission second 0.
+    If the captures belong to no run, `epoch_us` is the time of the first packet.
+    """
 
     model_config = ConfigDict(populate_by_name=True)
 

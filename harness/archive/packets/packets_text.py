@@ -31,7 +31,7 @@ Paint = Callable[[str], str]
 
 
 class TransmissionFormatter:
-    """Formats messages and the results of requests. `paint` highlights losses."""
+    """A formatter for messages and the results of requests. `paint` highlights losses."""
 
     def __init__(self, names: BlockNames, paint: Paint, losses: ChannelLosses) -> None:
         self._names = names
@@ -59,7 +59,9 @@ class TransmissionFormatter:
         return "  ".join(parts)
 
     def _reasons(self, transmission: Transmission) -> str:
-        """Return the reason why the shared radio channel lost the message, or an empty text."""
+        """Return the reasons why vehicles lost the message on the shared radio channel. Return an empty text if there
+        is none.
+        """
         words = [
             reason.replace("_", " ") + ("" if reason in DROPS else f": {_list(names)}")
             for reason, names in loss_reasons(self._losses, transmission).items()
@@ -107,7 +109,7 @@ class TransmissionFormatter:
 
 
 def header(captures: Captures) -> str:
-    """Return a line with the captured vehicles and the start of mission time."""
+    """Return a line that names the captured vehicles and the start of mission time."""
     vehicles = sorted({capture.vehicle for capture in captures.used if capture.vehicle is not None})
     points = [capture.path.name for capture in captures.used if capture.vehicle is None]
     clock = captures.clock
@@ -123,7 +125,9 @@ def transmission_lines(
     text: TransmissionFormatter,
     answers_of: int | None,
 ) -> Iterator[str]:
-    """Yield a line for each message, and below each request its results at all vehicles or only at `answers_of`."""
+    """Yield a line for each message. Below each request, yield the results at all vehicles, or only at the vehicle
+    `answers_of`.
+    """
     for transmission in transmissions:
         yield text.transmission(transmission)
         if transmission.summary.request_key:
@@ -135,7 +139,7 @@ def transmission_lines(
 def exchange_lines(
     exchanges_shown: Sequence[AnsweredMessage], exchanges: RequestAnswers, text: TransmissionFormatter
 ) -> Iterator[str]:
-    """Yield lines about a block's messages, each with its answers and its missing answers.
+    """Yield lines about the messages that concern a block, each with its answers and its missing answers.
 
     The last line lists the vehicles that the block reached.
     """
@@ -153,7 +157,7 @@ def exchange_lines(
 
 
 def totals(captures: Captures, transmissions: Sequence[Transmission]) -> Iterator[str]:
-    """Yield lines with the totals of the captures, and with contents that are not UCP messages."""
+    """Yield lines with the totals of the captures, and with the number of datagrams that are not UCP messages."""
     lost = sum(len(transmission.lost_by) for transmission in transmissions)
     received = sum(len(transmission.received) for transmission in transmissions)
     counted = [

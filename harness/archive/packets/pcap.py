@@ -1,4 +1,5 @@
-"""Read packet capture files of any origin frame by frame (pcapng and pcap, both byte orders).
+"""Read packet capture files frame by frame, in the formats pcapng and pcap with any byte order. The files may have any
+origin.
 
 scapy is not used, because its reader drops the comment and the statistics of a section, does not report where a file is
 damaged, and trusts any length in a file. Formats: draft-ietf-opsawg-pcapng, draft-ietf-opsawg-pcap.
@@ -61,7 +62,7 @@ class _BrokenCaptureError(Exception):
 
 
 class CaptureFile:
-    """A packet capture file. Iteration yields its frames, and sets the attributes.
+    """A packet capture file. Iterate over the object to read its frames. The iteration also sets the attributes.
 
     `comment` is the comment of the first section. `started_ns`, `ended_ns` and `dropped` (the number of frames that the
     capture missed) come from the statistics and are None without them. `problem` describes where the reading ended
@@ -200,8 +201,8 @@ def _halves(order: str, value: bytes) -> int:
 
 
 def _options(order: str, data: bytes) -> dict[int, bytes]:
-    """Return the options of a block in a pcapng file by their code. Of several options with the same code, the first
-    counts.
+    """Return the options of a block in a pcapng file, by their code. If a code occurs several times, its first option
+    is used.
     """
     options: dict[int, bytes] = {}
     position, head = 0, struct.Struct(order + "2H")

@@ -16,8 +16,8 @@ MESSAGES = [message.NAME for message in TYPE_CODES]
 
 @dataclass(frozen=True)
 class MessageFilter:
-    """Conditions on messages. A condition that is None accepts every message. The case of letters in `message` is
-    ignored.
+    """A filter for messages by sender, receiver, type, time and other properties. A property that is None accepts every
+    message. Upper and lower case are equal in `message`.
 
     Raises CaptureError for an unknown message or an empty time interval.
     """
@@ -34,7 +34,8 @@ class MessageFilter:
             raise CaptureError("--between {:g} {:g}: the first second is not before the last".format(*self.between_s))
 
     def filter(self, transmissions: Iterable[Transmission], captures: Captures) -> Iterator[Transmission]:
-        """Yield the messages that meet the conditions. With a receiver, other receivers are removed from the results.
+        """Yield the messages that the filter accepts. If the filter has a receiver, all other receivers are removed
+        from the yielded messages.
 
         Raises CaptureError if the receiver has no capture.
         """
@@ -60,7 +61,7 @@ class MessageFilter:
 
 
 class AnsweredMessage(NamedTuple):
-    """A message that is not an answer, together with those answers to it that concern the selected block."""
+    """A message that is not an answer. `answers` contains the answers to it that concern the selected block."""
 
     first: Transmission
     answers: Sequence[Transmission]
@@ -79,7 +80,7 @@ def exchanges_about(
 
 
 def in_order(exchanges: Iterable[AnsweredMessage]) -> list[Transmission]:
-    """Return all messages in these groups, each once, in the order of sending."""
+    """Return all messages in these exchanges, each once, in the order of sending."""
     by_number = {
         transmission.number: transmission
         for exchange in exchanges
@@ -89,7 +90,7 @@ def in_order(exchanges: Iterable[AnsweredMessage]) -> list[Transmission]:
 
 
 def block_arrivals(exchanges: Iterable[AnsweredMessage]) -> dict[int, float]:
-    """Return the mission second at which the block itself first reached each vehicle."""
+    """Return the mission second at which each vehicle first received a message that contains the block."""
     first: dict[int, float] = {}
     for transmission in in_order(exchanges):
         if transmission.summary.message in CARRY_A_BLOCK:

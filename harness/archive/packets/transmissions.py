@@ -1,4 +1,4 @@
-"""Combine the packets in all captures into messages, each with its receivers.
+"""Find the same packets in all captures, and combine them into messages with their receivers.
 
 A datagram is identified by its bytes. A restarted agent may send the same bytes again. Therefore each reception belongs
 to the latest transmission of the datagram before it. If a complete capture of the sender does not contain the
@@ -20,8 +20,8 @@ captured then, and `at_s` is the time of the first reception. `forged`: the agen
 
 
 class DatagramReception(NamedTuple):
-    """The reception of a datagram at one vehicle: the number of copies, and the mission seconds of the first and last
-    one.
+    """The reception of a datagram at one vehicle: the number of copies, and the mission seconds of the first and the
+    last copy.
     """
 
     by: ListenerName
@@ -31,7 +31,8 @@ class DatagramReception(NamedTuple):
 
 
 class Transmission(NamedTuple):
-    """A datagram that was sent once at mission second `at_s`. `number` counts all of them in order, from 0.
+    """A datagram that was sent once, at mission second `at_s`. `number` is its position in the order of sending, from
+    0.
 
     `seen_leaving` is the listener whose capture contains the sending. The listeners in `lost_by` captured at that time
     but did not receive the datagram. Those in `absent` did not capture at that time, so their reception is unknown.
@@ -53,7 +54,7 @@ class Transmission(NamedTuple):
         return [reception.by for reception in self.received]
 
     def for_receiver(self, receiver: ListenerName) -> "Transmission":
-        """Return a copy of the transmission that has only this receiver."""
+        """Return a copy of this transmission in which `receiver` is the only receiver."""
         return self._replace(
             received=tuple(reception for reception in self.received if reception.by == receiver),
             lost_by=tuple(name for name in self.lost_by if name == receiver),
@@ -99,7 +100,7 @@ def join(captures: Captures) -> list[Transmission]:
 def _transmissions(
     datagram: Datagram, captures: Mapping[int, Capture], listeners: _Listeners, clock: CaptureClock
 ) -> Iterator[Transmission]:
-    """Yield each sending of one datagram."""
+    """Yield one transmission for each time that the datagram was sent."""
     left: list[tuple[int, ListenerName]] = []
     arrived: list[tuple[int, ListenerName]] = []
     for time_ns, number, direction in sorted(datagram.sightings()):

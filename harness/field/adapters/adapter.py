@@ -1,4 +1,4 @@
-"""Define the interface of an adapter (a reader for another file format), and load adapters that users write.
+"""Define an adapter, which reads another file format, and load adapters that users write.
 
 An adapter reads the records of another implementation, or of a separate recorder, and yields their contents one
 observation after another. It invents nothing. For example, an agent that did not record its handler runs gets no trace,
@@ -42,7 +42,7 @@ class Datagram:
 
 @dataclass(frozen=True, slots=True)
 class LoggedEvent:
-    """An event that the agent received for logging at `time_ns`, in nanoseconds since the Unix epoch (Section 3.1)."""
+    """An event that the agent received at `time_ns` to log it, in nanoseconds since the Unix epoch (Section 3.1)."""
 
     agent_id: int
     time_ns: int
@@ -53,7 +53,7 @@ class LoggedEvent:
 
 @dataclass(frozen=True, slots=True)
 class ChainExport:
-    """A chain export, `ucp-chain-export/1`, as JSON."""
+    """A chain export in the format `ucp-chain-export/1`, as JSON."""
 
     text: str | bytes
     where: int | None = None
@@ -94,9 +94,10 @@ class Adapter:
         return True
 
     def part_of(self, source: Path) -> Path:
-        """Return the recording to which a file belongs, if a recording may consist of several files.
+        """Return the path of the recording to which a file belongs. Several files, for example all files of a
+        directory, may belong to one recording.
 
-        The default is the file.
+        By default, each file is a recording of its own.
         """
         return source
 

@@ -40,7 +40,7 @@ _BOM = "\ufeff"
 
 
 class CsvAdapter(Adapter):
-    """The adapter that reads CSV files."""
+    """The adapter for CSV files."""
 
     counts = "row"
 
@@ -74,9 +74,7 @@ class _ColumnLayout:
         self._places = places
 
     def cells(self, row: str) -> dict[str, str] | None:
-        """Return the cells of a row by column name, or None if the row has a different number of columns than the first
-        one.
-        """
+        """Return the cells of a row by column name. Return None if the row has fewer cells than the first row."""
         last = max(self._places.values())
         try:
             cells = next(csv.reader([row], delimiter=self._separator, strict=True), [])

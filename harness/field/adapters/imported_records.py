@@ -1,4 +1,5 @@
-"""Import records of any format: read them with adapters, and write them as files of the harness into one directory.
+"""Import records of any format. Adapters read the records, and this module writes them into one directory as files of
+the harness.
 
 The import never invents records. An agent with recorded handler runs gets a trace. An agent of which only datagrams
 were recorded gets a capture.
@@ -85,8 +86,8 @@ class ImportedFlight(BaseModel):
 
 
 class ImportRemark(BaseModel):
-    """A remark on a source file, or on a part of it. `counts` is the unit of its position, such as lines. `why` ends a
-    sentence.
+    """A remark on a source file or on a part of it. `counts` is the unit of positions in the file, such as lines. `why`
+    completes a sentence.
     """
 
     path: str
@@ -100,8 +101,8 @@ class ImportRemark(BaseModel):
 
 
 class ImportRecord(BaseModel):
-    """The result of an import: the flights (largest first), the files that were left out, and remarks on the other
-    files.
+    """The result of an import: the flights (the largest is first), the files that were left out, and remarks on the
+    imported files.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -124,8 +125,8 @@ _COPY_BYTES = 1024 * 1024
 
 
 def write_import(result: IngestResult, sources: Sequence[Path], out: Path) -> ImportRecord:
-    """Write the largest flight to `out`, and further flights to directories in it. Return the record. Raises
-    RunDirectoryError.
+    """Write the largest flight to `out`, and every other flight to a directory in `out`. Return the record of the
+    import. Raises RunDirectoryError.
     """
     claim(out)
     try:
@@ -201,7 +202,7 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
 
 
 def _survived_trace(trace: Trace, export: Export | None) -> bool:
-    """Return true if the agent was alive after the end of its trace, because its export is later."""
+    """Return true if the agent still ran after the end of its trace, because its export has a later time."""
     if export is None:
         return False
     at_s = mission_s(export.exported_at_us, trace.header)
@@ -209,7 +210,7 @@ def _survived_trace(trace: Trace, export: Export | None) -> bool:
 
 
 def _trace_lines(trace: Trace, *, survived_trace: bool) -> Iterator[str]:
-    """Yield the lines of a trace. For each gap, yield a line that stands for the lost lines.
+    """Yield the lines of a trace. Each gap gives one line that replaces the lost lines.
 
     A trace that ends within a line gets an incomplete last line, because the agent may have been killed there. If it
     survived, a gap is written instead.
@@ -254,7 +255,7 @@ def import_records(
     *,
     by_content: bool = True,
 ) -> ImportRecord:
-    """Read `sources` with `adapters`, and write all flights in them to the empty or new directory `out`.
+    """Read `sources` with `adapters`, and write all flights in them to `out`, which is an empty or new directory.
 
     A file that no adapter recognises is read as a file of the harness. With `by_content=False` the first adapter reads
     all files. `report_progress` receives a text at each step. Raises FieldError if a source does not exist or nothing
@@ -383,7 +384,7 @@ class _RecordingReader:
         capture.packet(datagram.time_ns, udp_broadcast(sender, PORT, datagram.data), outbound=datagram.sent)
 
     def end(self, sorter: RecordSorter) -> None:
-        """Give the records to the sorter after the last file was read."""
+        """Pass the records to the sorter after the last file was read."""
         for agent_id, capture in self._captures.items():
             capture.close()
             seen = summarise_capture(self._scratch / f"{agent_id}.pcapng", self._left_out)

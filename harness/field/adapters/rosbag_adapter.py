@@ -39,8 +39,8 @@ _MAX_TOPICS_LISTED = 5
 
 
 class RosBag(Adapter):
-    """The adapter that reads ROS bags. `topics` states the content of each topic name, in which `{agent}` stands for an
-    ID.
+    """The adapter for ROS bags. `topics` maps each topic name to its content. In a topic name, `{agent}` stands for an
+    agent ID.
 
     The contents of a topic are `trace`, `sent`, `received`, `event` or `chain`.
     """

@@ -1,4 +1,4 @@
-"""Find the commit after which a scenario or a record gives a different result, or compare agents in the same way.
+"""Find the commit that changed the result of a scenario or of a record. Also compare two agent programs in this way.
 
 A subject is a scenario, a run, or the records of a flight (`outcome`). `harness.run.code_state` checks out a commit in
 a separate clone, and runs processes with it. `_playing` plays the subject with it and returns the outcome.

@@ -1,4 +1,4 @@
-"""Search for the first commit that changes the result."""
+"""Search the history of a repository for the first commit that changes the result of a scenario or a record."""
 
 import shutil
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from harness.run.code_state import GitBisection, GitCommit, RepositoryError, Sus
 
 @dataclass(frozen=True)
 class CommitTrial:
-    """The result of testing one commit: unchanged (good), changed (bad), or not testable (skip).
+    """The result of testing one commit: `good` (unchanged result), `bad` (changed result), or `skip` (not testable).
 
     `why` gives the reason.
     """
@@ -27,10 +27,11 @@ class CommitTrial:
 
 @dataclass
 class BisectionResult:
-    """The result of a search. `first` is the first commit that changes the result.
+    """The result of a search for a commit. `first` is the first commit that changes the result of a scenario or a
+    record.
 
-    It has several commits if some of them cannot be played, and none if the outcomes of the good and the bad commit are
-    equal.
+    `first` has several commits if some of them cannot be played. It is empty if the outcomes of the good and the bad
+    commit are equal.
     """
 
     good: Outcome
@@ -61,7 +62,8 @@ def bisect(
     directory: Path,
     report_progress: Callable[[str], None],
 ) -> BisectionResult:
-    """Test commits between `good` and `bad`. The repository is cloned into `directory`, which the caller removes.
+    """Test commits between `good` and `bad`. The repository is cloned into `directory`. The caller must remove
+    `directory`.
 
     `report_progress` receives a line for each commit. Raises HarnessError.
     """

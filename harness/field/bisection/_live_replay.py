@@ -1,4 +1,5 @@
-"""Send the recorded inputs of one agent to another agent program over UDP, and compare the answers.
+"""Send the recorded inputs of one agent to a different agent program over UDP, and compare its messages with the
+recorded ones.
 
 The agent runs in a lab with only one other node, which plays all peers. This node sends the datagrams that the peers
 sent according to the record, at the same times.
@@ -63,12 +64,12 @@ class NotStartedError(HarnessError):
 
 
 class ReplayFailedError(HarnessError):
-    """An error: the agent program ended by itself, or refused a command."""
+    """An error: the agent program ended unexpectedly, or refused a command."""
 
 
 @dataclass(frozen=True)
 class ExpectedMessage:
-    """A message that the recorded agent sent, and that the other agent program should also send."""
+    """A message that the recorded agent sent. The program under test should also send it."""
 
     t: float
     line: int
@@ -95,8 +96,8 @@ class ScriptedDatagram:
 
 @dataclass(frozen=True)
 class PeerScript:
-    """The datagrams and commands to send at each mission second, and the messages that the agent program should
-    send.
+    """The datagrams and commands to send to the agent program at each mission second, and the messages expected from
+    it.
     """
 
     datagrams: list[ScriptedDatagram]
@@ -111,7 +112,7 @@ class PeerScript:
     ends_s: float
 
     def line_at(self, at_s: float) -> int:
-        """Return the number of the last record line at that time."""
+        """Return the number of the last line in the record at or before mission second `at_s`."""
         return self.lines[max(0, bisect_right(self.lines, at_s, key=itemgetter(0)) - 1)][1] if self.lines else 0
 
     def is_near_reconcile_end(self, at_s: float, slack_s: float) -> bool:
@@ -124,7 +125,9 @@ class PeerScript:
 
 
 def script_of(record: RecordedTrace) -> PeerScript:
-    """Return the inputs up to the first restart of the agent. Later inputs would need the content of its disk."""
+    """Return the inputs before the first restart of the agent. Inputs after a restart would depend on the content of
+    its disk.
+    """
     datagrams: list[ScriptedDatagram] = []
     reconciles: list[float] = []
     expected: list[ExpectedMessage] = []
@@ -166,8 +169,8 @@ def script_of(record: RecordedTrace) -> PeerScript:
 
 
 def _question_key(message: Message) -> tuple[type, bytes] | None:
-    """Return the type of the answer to a query, and the subject of the query. Return None if the message is not a
-    query.
+    """Return the type of the answer to a query, together with the chain or block that is queried. Return None if the
+    message is not a query.
     """
     match message:
         case ChainContainQuery():
@@ -200,7 +203,7 @@ def _starts_locally(run: HandlerRun) -> bool:
 
 
 def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:
-    """Yield each message that the agent sent, with its datagram in base64."""
+    """Yield each message that the agent sent, together with its datagram in base64."""
     for sent in run.sent:
         if sent.datagram is not None:
             with suppress(MalformedDatagramError):
@@ -210,7 +213,7 @@ def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:
 def play_live(
     record: RecordedTrace, command: Sequence[str], directory: Path, *, speedup: float
 ) -> list[RecordDifference]:
-    """Send the recorded inputs to an agent program, and return the differences of its answers.
+    """Send the recorded inputs to an agent program. Return the differences between its messages and the recorded ones.
 
     Raises MachineError, NotStartedError, ReplayFailedError, or FieldError if the record has unknown names.
     """
@@ -365,7 +368,7 @@ def _last_line(log: Path) -> str:
 def _compare(
     script: PeerScript, received: list[tuple[float, Message]], slack_s: float
 ) -> Iterator[tuple[float, RecordDifference]]:
-    """Yield missing, different and unexpected messages, each with its mission second.
+    """Yield the messages that are missing, different or unexpected, each with its mission second.
 
     An agent does not answer during a reconcile. Messages about the end of a reconcile are therefore not compared.
     """
@@ -396,7 +399,7 @@ def _compare(
 
 
 def _subject(message: Message) -> tuple[type, Any]:
-    """Return the type of a message, and the block or chain that it concerns."""
+    """Return the type of a message and the block or chain that the message concerns."""
     for name in ("chain_hash", "block_hash"):
         if type(message).__name__ == "BlockAddResponse" and name == "chain_hash":
             continue

@@ -36,8 +36,8 @@ class UntestableError(HarnessError):
 
 
 class SubjectPlayer:
-    """Plays one scenario or record repeatedly. Each play has a new directory in `directory` and at most `limit_s`
-    seconds.
+    """A player that can play one scenario or record many times. Each time has its own directory in `directory`, and a
+    limit of `limit_s` seconds.
 
     Without `command`, the code under test plays a scenario in virtual time, and its core plays records. With `command`,
     the installed harness plays a scenario with agent processes, and an agent process replays the record of one agent.
@@ -61,13 +61,14 @@ class SubjectPlayer:
 
     @property
     def is_deterministic(self) -> bool:
-        """True if the same code always gives the same run, so that the first difference between two runs has a
-        meaning.
+        """True if the same code always gives the same run. Only then is the first difference between two runs
+        meaningful.
         """
         return self.subject.scenario is not None and self._command is None
 
     def play(self, code: Path) -> tuple[Outcome, Path]:
-        """Play with the code in this directory. Return the result and the run directory.
+        """Play the scenario or the record with the code in the directory `code`. Return the result and the run
+        directory.
 
         Raises UntestableError.
         """
@@ -121,7 +122,8 @@ class SubjectPlayer:
         return self._judge(played, run_dir, exact=False), run_dir
 
     def _judge(self, played: ProcessResult, run_dir: Path, *, exact: bool) -> Outcome:
-        """Return the result of a run. The installed checker judges it, and not that of the tested commit.
+        """Return the result of a run. The installed checker judges the run, and the checker of the tested commit is not
+        used.
 
         Raises UntestableError.
         """
@@ -196,7 +198,9 @@ class MachineCannotError(HarnessError):
 
 
 def _scenario_file(scenario: Scenario, directory: Path) -> Path:
-    """Write the scenario without `expect` and without default values, which other commits may not support."""
+    """Write the scenario to a file without `expect` and without default values, because the tested commit may not
+    support them.
+    """
     document = scenario.model_dump(mode="json", exclude_defaults=True, exclude={"expect"})
     file = directory / "scenario.yaml"
     file.write_text(json.dumps(document), encoding="utf-8")  # JSON is YAML

@@ -20,8 +20,8 @@ MAX_DIFFERENCES = 10_000
 
 
 def differences(path: Path, agent: int | None) -> list[dict[str, Any]]:
-    """Return the differences between the agent core and one record. Raises HarnessError if the record cannot be
-    played.
+    """Return the differences between the agent core and the record at `path`. Raises HarnessError if the record cannot
+    be played.
     """
     record = open_record(path, agent)
     result, names = RecordPlayer(record, implementation=IN_USE).to_end(), ReplayNames(record)
@@ -49,7 +49,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _agents(path: Path) -> list[int]:
-    """Return the agents that have a record in the largest flight."""
+    """Return the IDs of the agents that have a trace in the largest flight."""
     return sorted(ingest_files([path]).largest().traces)
 
 

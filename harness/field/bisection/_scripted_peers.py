@@ -1,5 +1,4 @@
-"""Play all other agents for one agent: `python -m harness.field.bisection._scripted_peers SCRIPT HEARD EPOCH_US
-SPEEDUP`.
+"""Play the peers of one agent: `python -m harness.field.bisection._scripted_peers SCRIPT HEARD EPOCH_US SPEEDUP`.
 
 Each line of SCRIPT is a datagram to send, `{"t": mission seconds, "datagram": base64}`, in order of time. A process is
 some milliseconds later than the record, and during a reconcile the delay grows. Fixed sending times would therefore
@@ -44,7 +43,7 @@ MAX_QUESTION_GAP_S = 6.0
 
 
 class AgentLateness:
-    """The number of mission seconds by which the agent is later than in the record during a reconcile.
+    """The lateness of the agent during a reconcile, compared with the record, in mission seconds.
 
     `margin_s` is the additional delay of its next timer.
     """
@@ -55,13 +54,15 @@ class AgentLateness:
         self._asked_s = -math.inf
 
     def note_question(self, now: float, in_record: Iterable[float]) -> None:
-        """Process a query that the agent sent. `in_record` contains the times of the same query in the record."""
+        """Process a query that the agent sent. `in_record` contains the times at which the record has the
+        same query.
+        """
         nearest = min(in_record, key=lambda at_s: abs(now - at_s), default=None)
         if nearest is not None and abs(now - nearest) < MAX_QUESTION_GAP_S:
             self._late_s, self._asked_s = max(0.0, now - nearest), nearest
 
     def at(self, mission_s: float) -> float:
-        """Return the delay for a datagram that the record contains at this mission second."""
+        """Return the delay for a datagram that the record has at this mission second."""
         return self._late_s + self._margin_s if mission_s - self._asked_s < MAX_QUESTION_GAP_S else 0.0
 
 

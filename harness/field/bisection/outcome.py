@@ -1,4 +1,6 @@
-"""Represent the object of a search for a commit, the result of one play, and the differences between two results."""
+"""Define the scenario or records that a bisection plays, the result of playing them once, and the differences between
+two results.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -34,7 +36,7 @@ class RecordDifference(_OutcomeModel):
 
 
 class AgentResult(_OutcomeModel):
-    """The result of one agent. A part that is None is not compared.
+    """The result of one agent. A field that is None is not compared.
 
     `chain` has the names of its blocks, oldest first, and `top` its top chain hash. `deviates` is the handler of its
     first deviation, "" if that is no handler of the protocol. `differences` are those from its record.
@@ -59,13 +61,13 @@ class Outcome(_OutcomeModel):
     crashed: str | None = None
 
     def as_recorded(self) -> "Outcome":
-        """Return the result of an agent core that does not differ from the records."""
+        """Return the result that an agent core has if it does not differ from the records."""
         agents = {agent: AgentResult(differences=[]) for agent in self.agents}
         return self.model_copy(update={"agents": agents, "crashed": None})
 
     @property
     def sentence(self) -> str:
-        """Describe the result of one play in one line."""
+        """The result of one play, described in one line."""
         if self.crashed:
             return f"it crashes: {self.crashed}"
         bad = [key for key, verdict in self.verdicts.items() if kind_of(verdict) == "bad"]
@@ -164,7 +166,7 @@ def _at(chain: list[str], place: int) -> str:
 
 
 def read(path: Path) -> Outcome:
-    """Read a result that was saved in a file. Raises RunDirectoryError."""
+    """Read a result from a file. Raises RunDirectoryError."""
     try:
         return Outcome.model_validate(read_json(path, MAX_OUTCOME_BYTES))
     except OSError as error:
@@ -178,8 +180,8 @@ YAML = (".yaml", ".yml")
 
 @dataclass(frozen=True)
 class BisectionSubject:
-    """The scenario or the records to play. `scenario` is None for the records in `path`. `agent` selects one of
-    them.
+    """The scenario or the records to play. If `scenario` is None, the records in `path` are played. `agent` selects the
+    records of one agent.
     """
 
     path: Path
@@ -226,7 +228,7 @@ def _is_scenario(path: Path) -> bool:
 
 
 def _played(path: Path) -> tuple[Scenario, int] | None:
-    """Return the scenario and the seed of a run, if playing them gives the same run again. Otherwise return None."""
+    """Return the scenario and the seed of a run if playing them gives the same run again. Return None otherwise."""
     record = RunArchive(path).record
     if record.backend != "sim" or record.scenario is None or record.seed is None:
         return None

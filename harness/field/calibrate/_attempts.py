@@ -1,4 +1,4 @@
-"""Find out which messages reached which vehicles, and how far apart these were at that time.
+"""Find out which messages reached which vehicles, and the distance between sender and receiver at that time.
 
 A capture shows each frame of its vehicle, so captures are preferred. A trace shows the messages that its agent handled.
 An agent in virtual time is not given messages without effect, so only some types count there, and only while the agent
@@ -30,7 +30,9 @@ _NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, Commit
 
 
 class _SentMessage(NamedTuple):
-    """A message and the vehicles that are known to have received it."""
+    """A message, with the vehicles that received it (`reached`) and those that did not (`lost`), as far as the records
+    show.
+    """
 
     at_s: float
     sender: int
@@ -40,8 +42,8 @@ class _SentMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class ObservedTransmissions:
-    """All transmissions of messages to receivers, the source of these data, and a sentence for each part that cannot be
-    used.
+    """All transmissions of messages to receivers, the source of these data, and a sentence for each part of the records
+    that cannot be used.
     """
 
     attempts: list[TransmissionAttempt]
@@ -119,7 +121,9 @@ def _from_traces(traces: dict[int, Trace], problems: list[str]) -> Iterator[_Sen
 
 
 class _ReceivingAgent:
-    """The messages that an agent handled, and the intervals in which its trace would show every message."""
+    """The messages that an agent handled, and the intervals in which its trace contains every message that it
+    handled.
+    """
 
     def __init__(self, trace: Trace) -> None:
         triggers = (run.trigger for run in trace.runs)
@@ -147,11 +151,13 @@ class _ReceivingAgent:
         return message in _NEVER_WITHHELD and not any(around)
 
     def takes(self, key: tuple[int, str, int]) -> bool:
-        """Return true if the message was handled. Each handled message is counted once."""
+        """Return true if the agent handled the message. If the agent handled a message once, only the first call for it
+        returns true.
+        """
         self._handled[key] -= 1
         return self._handled[key] >= 0
 
 
 def pairs_of(attempts: Iterable[TransmissionAttempt]) -> list[frozenset[int]]:
-    """Return the pairs of vehicles with transmissions, in the order of their IDs."""
+    """Return the pairs of vehicles between which messages were transmitted, in the order of their IDs."""
     return sorted({attempt.link for attempt in attempts}, key=sorted)

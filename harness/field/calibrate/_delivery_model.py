@@ -1,4 +1,5 @@
-"""Model the probability that a message arrives over a distance, and fit the model to data by maximum likelihood.
+"""Model the probability that a message arrives as a function of the distance. Fit the model to data by maximum
+likelihood.
 
 A receiver at d metres gets a message with probability
 
@@ -67,7 +68,7 @@ class TransmissionAttempt(NamedTuple):
 
 @dataclass(frozen=True)
 class DeliveryModel:
-    """The parameters of the model. The docstring of the module explains them."""
+    """The parameters of the model of delivery. The docstring of the module explains them."""
 
     range_m: float
     spread: float
@@ -75,13 +76,17 @@ class DeliveryModel:
     load: float = 0.0
 
     def delivery(self, distance_m: float, others: int = 0) -> float:
-        """Return the probability that a message arrives."""
+        """Return the probability that a message arrives over this distance, with `others` messages on the air at the
+        same time.
+        """
         deviation = math.log(self.range_m / max(distance_m, MIN_DISTANCE_M)) / self.spread
         return (1 - self.floor) * math.exp(-self.load * others) * _phi(deviation)
 
     @property
     def wide(self) -> float:
-        """Return the distance at which 10 % arrive divided by the distance at which 90 % arrive, without `floor`."""
+        """Return the distance at which 10 % of the messages arrive divided by the distance at which 90 % arrive.
+        `floor` counts as 0.
+        """
         return math.exp(2 * _NORMAL.inv_cdf(0.9) * self.spread)
 
 
@@ -109,7 +114,7 @@ class FittedModel:
 
 
 class _TransmissionCluster(NamedTuple):
-    """Transmissions of one cluster over about the same distance."""
+    """Transmissions that belong to one cluster and have about the same distance."""
 
     log_m: float
     others: int
@@ -156,7 +161,9 @@ def _rows(attempts: Iterable[TransmissionAttempt]) -> list[_TransmissionCluster]
 
 
 def _cells(rows: Iterable[_TransmissionCluster]) -> list[_TransmissionCluster]:
-    """Return the transmissions without their division into clusters, to compute the likelihood."""
+    """Combine transmissions of different clusters. The likelihood of the combined transmissions is the same and faster
+    to compute.
+    """
     counts: dict[tuple[float, int], list[int]] = defaultdict(lambda: [0, 0])
     for row in rows:
         count = counts[row.log_m, row.others]
@@ -179,7 +186,7 @@ def _starts(rows: Sequence[_TransmissionCluster], free: Sequence[int]) -> list[V
 
 
 def _terms(row: _TransmissionCluster, values: Vector) -> tuple[float, Vector]:
-    """Return the probability of arrival and its derivatives."""
+    """Return the probability that a transmission arrives, and its derivatives with respect to the parameters."""
     spread = math.exp(values[1])
     deviation = (values[0] - row.log_m) / spread
     survives = math.exp(-values[2] - values[3] * row.others)
@@ -333,7 +340,7 @@ def _intervals(
 def _profile(
     rows: Sequence[_TransmissionCluster], values: Vector, least: float, free: Sequence[int], parameter: int
 ) -> tuple[float, float]:
-    """Return the values of a parameter at which its profile likelihood falls to `least`."""
+    """Return the values of a parameter at which its profile likelihood falls to the value `least`."""
     others = [each for each in free if each != parameter]
 
     def inside(value: float) -> bool:

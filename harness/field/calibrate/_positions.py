@@ -1,4 +1,4 @@
-"""Find the positions of the vehicles over time, from `tracks.jsonl` of a run, flight logs, or logged events.
+"""Find the positions of the vehicles over time in `tracks.jsonl` of a run, in flight logs, or in logged events.
 
 For each vehicle, the first of these sources counts. A flight log belongs to the agent with the vehicle's MAVLink system
 ID. Only records with GPS time are used, because the clocks of the autopilot and of the computer have no relation to
@@ -39,7 +39,7 @@ class Positions:
     problems: list[str] = field(default_factory=list)
 
     def at(self, vehicle: int, at_s: float) -> PositionFix | None:
-        """Return the position of a vehicle at a mission second, or None if it is unknown."""
+        """Return the position of a vehicle at a mission second. Return None if the position is unknown."""
         track = self.tracks.get(vehicle)
         if not track or not track[0].at_s - _MARGIN_S <= at_s <= track[-1].at_s + _MARGIN_S:
             return None
@@ -51,7 +51,7 @@ class Positions:
         return between(track[after - 1], track[after], at_s)
 
     def distance_m(self, one: int, other: int, at_s: float) -> float | None:
-        """Return the distance of two vehicles in three dimensions, or None if a position is unknown."""
+        """Return the distance of two vehicles in three dimensions. Return None if one of the positions is unknown."""
         first, second = self.at(one, at_s), self.at(other, at_s)
         if first is None or second is None:
             return None
@@ -59,7 +59,7 @@ class Positions:
 
 
 def find_positions(paths: Iterable[Path], flight: Flight, vehicles: Collection[int], epoch_us: int) -> Positions:
-    """Return the positions of `vehicles`. A vehicle without any known position has no path."""
+    """Return the positions of `vehicles` over time. A vehicle without any known position has no path."""
     positions = Positions({}, {})
     log_paths: list[Path] = []
     for path in _files(paths):

@@ -32,8 +32,8 @@ class SignalFit:
 
 
 def fit_signal(positions: Positions) -> SignalFit | None:
-    """Estimate the exponent from the signal strengths in all logs. Return None if the signal strengths do not determine
-    it.
+    """Estimate the path loss exponent from the signal strengths in all logs. Return None if they do not
+    determine it.
     """
     samples = [sample for number, log in enumerate(positions.logs) for sample in _samples(positions, number)]
     minutes = sorted({minute for _, _, minute in samples})

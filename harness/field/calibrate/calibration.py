@@ -1,4 +1,6 @@
-"""Calibrate the radio for a flight: fit a model, test it on the end of the flight, and write a scenario with it."""
+"""Calibrate the radio model of a flight: fit the model, test it on the end of the flight, and write a
+scenario with it.
+"""
 
 import math
 import re
@@ -34,8 +36,8 @@ _MAX_LOSS = 0.9999
 
 @dataclass(frozen=True)
 class ModelValidation:
-    """The test of a model: it is fitted to the beginning of the flight and predicts the end. A constant loss rate is
-    the alternative.
+    """The test of a model that was fitted to the beginning of the flight. The model predicts the end, and is compared
+    with a constant loss rate.
 
     A lower score is better. `bins` has, for each tenth of the predicted probability: number of messages, mean
     prediction and delivered share.
@@ -60,7 +62,7 @@ class ModelValidation:
 
 @dataclass(frozen=True)
 class DeliveryShare:
-    """The share of some messages that arrived, with a confidence interval as if they were independent."""
+    """The share of some messages that arrived. Its confidence interval assumes independent messages."""
 
     attempts: int
     delivered: int
@@ -74,7 +76,7 @@ class DeliveryShare:
 
 @dataclass(frozen=True)
 class LinkDelivery:
-    """The share of messages that arrived over one link, in total and in blocks of time."""
+    """The share of messages that arrived over one link: in total, and in each block of time."""
 
     one: int
     other: int
@@ -102,7 +104,7 @@ class CalibrationResult:
         return self.signal.exponent if self.signal else LogDistance.exponent
 
     def sentences(self) -> Iterator[str]:
-        """Yield sentences about the result of the calibration."""
+        """Yield sentences that describe the result of the calibration."""
         delivered = sum(attempt.delivered for attempt in self.attempts)
         yield (
             f"{delivered} of {len(self.attempts)} messages over {len(self.links)} links arrived, from {self.source} "
@@ -135,7 +137,7 @@ class CalibrationResult:
             yield self.validation.sentence
 
     def network(self, preset: str | None = None) -> dict[str, Any]:
-        """Return the section `network` of a scenario: a radio, or the shared channel of a preset.
+        """Return the section `network` of a scenario. It contains a radio, or the shared channel of a preset.
 
         A channel computes the losses by other messages itself, so its constant loss is only the floor.
         """
@@ -225,7 +227,7 @@ def _between(interval: ConfidenceInterval, form: str) -> str:
 
 
 def calibrate(paths: Sequence[Path]) -> CalibrationResult:
-    """Fit the radio model to the largest flight in these files.
+    """Fit the radio model to the largest flight in these files and directories.
 
     Raises FieldError if the files have no message whose receivers are known.
     """
@@ -269,8 +271,8 @@ def calibrate(paths: Sequence[Path]) -> CalibrationResult:
 
 
 def validate(attempts: Sequence[TransmissionAttempt]) -> ModelValidation | None:
-    """Fit the model to the beginning of the flight and predict the end. Return None if the beginning does not determine
-    the model.
+    """Fit the model to the beginning of the flight, and test how well it predicts the end. Return None if the beginning
+    does not determine the model.
     """
     first_s, last_s = min(each.at_s for each in attempts), max(each.at_s for each in attempts)
     until_s = first_s + TRAINING_SHARE * (last_s - first_s)
@@ -304,7 +306,9 @@ def _brier(predicted: Sequence[float], outcomes: Sequence[bool]) -> float:
 
 
 def _log_score(predicted: Sequence[float], outcomes: Sequence[bool]) -> float:
-    """Return the mean of -ln(predicted probability of each outcome). Probabilities are limited to 0.001 to 0.999."""
+    """Return the mean of -ln(predicted probability of the outcome) over all transmissions. Probabilities are limited to
+    0.001 to 0.999.
+    """
     bounded = [min(max(p, 0.001), 0.999) for p in predicted]
     return -sum(math.log(p if d else 1 - p) for p, d in zip(bounded, outcomes, strict=True)) / len(outcomes)
 

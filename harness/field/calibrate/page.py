@@ -1,5 +1,5 @@
-"""Write the page of a calibration: arrivals over distance, residuals, the test of the model, arrivals over time, and a
-map.
+"""Write the page of a calibration. It shows arrivals over distance, residuals, the test of the model, arrivals over
+time, and a map.
 """
 
 import math
@@ -94,8 +94,8 @@ def _delivery(calibration: CalibrationResult) -> Markup:
 
 
 def _residuals(calibration: CalibrationResult) -> Markup:
-    """Draw the share of messages that arrived minus the expected share. Without a model, a constant share is
-    expected.
+    """Draw the residuals: the share of messages that arrived minus the share that the model predicts. Without a model,
+    the predicted share is constant.
     """
     area = _areas(2)[1]
     across, up = _distance_axis(calibration, area), svg.linear_axis(-0.5, 0.5, area.up)

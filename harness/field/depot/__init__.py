@@ -1,3 +1,3 @@
-"""Prepare a mission and process its results: write the mission files of all vehicles, and merge their exports into one
-record.
+"""Write the mission files of all vehicles before a mission, and merge the chain exports of the vehicles into one record
+after it.
 """

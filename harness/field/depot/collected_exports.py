@@ -1,4 +1,4 @@
-"""Read the chain exports of a mission, even if they are damaged, and use every undamaged part.
+"""Read the chain exports of a mission. If an export is damaged, use all of its undamaged parts.
 
 A truncated export is read up to its end, and an edited or damaged one without its damaged parts. The hash of a block is
 computed from its content (eq. 3.1). If the file has another hash, the difference is reported. Vehicles that hold the
@@ -57,7 +57,7 @@ EXPORT_AGAIN = "export it again if you can"
 
 @dataclass(frozen=True)
 class ReadExport:
-    """An export whose hashes are correct, and its file.
+    """A chain export that was read, and its file. The hashes in `export` are correct.
 
     `problems` has a sentence for each error. `claims` maps the true hash of each wrong block to the hash in the file.
     """
@@ -74,7 +74,7 @@ class ReadExport:
 
 @dataclass
 class CollectedExports:
-    """The exports of one mission: the latest one of each agent, and earlier ones.
+    """The exports of one mission: the latest export of each agent, and the exports that the same agents made earlier.
 
     `left_out` has a sentence for each unused file, and `remarks` has further facts about the used ones.
     """
@@ -115,7 +115,8 @@ class CollectedExports:
 
     @property
     def claims(self) -> dict[str, str]:
-        """The correct hash of each block whose hash in its file is wrong, together with this wrong hash.
+        """The blocks that have a wrong hash in a file. The keys are the correct hashes, and the values are the wrong
+        ones.
 
         A block is not wrong if another export has it under its true hash, or if its agent completed it.
         """
@@ -128,7 +129,7 @@ class CollectedExports:
 
 @gc_paused()
 def collect_exports(paths: Iterable[Path], keys: "PublicKeys | None" = None) -> CollectedExports:
-    """Return the exports of the largest mission in these files and directories.
+    """Return the exports in these files and directories that belong to the mission with the most agents.
 
     `keys` are public keys that the user trusts. Without them, signatures are verified with the keys in the directories.
     Raises FieldError if a path does not exist, and ExportError if no export is usable.
@@ -189,7 +190,7 @@ def _is_flight_log(path: Path) -> bool:
 
 
 def _add_context(collected: CollectedExports, compared_files: Iterable[ComparedFile]) -> None:
-    """Add the roster, and the kind of events, that other files of the mission contain."""
+    """Add facts from the other files of the mission: the roster, and whether the events are telemetry."""
     for each in compared_files:
         if each.kind == "trace" and each.agent_id is not None and each.agent_id not in collected.latest:
             trace = read_trace(each.path, skim=True)
@@ -219,7 +220,9 @@ class NotAnExportError(ExportError):
 
 
 def _largest_mission(read_exports: Iterable[ReadExport]) -> str:
-    """Return the inception block of the mission with the most agents, or with the most blocks in a tie."""
+    """Return the hash of the inception block of the mission with the most agents. If several have equally many, return
+    the one with the most blocks.
+    """
     agents: dict[str, set[int]] = {}
     blocks: Counter[str] = Counter()
     for each in read_exports:
@@ -245,8 +248,8 @@ def _other_missions(read_exports: Iterable[ReadExport], mission: str) -> Iterato
 
 
 def _by_agent(read_exports: Iterable[ReadExport], left_out: list[str]) -> CollectedExports:
-    """Group the exports by agent. The latest export has the current state, but earlier ones may contain further
-    blocks.
+    """Group the exports by agent. The latest export of an agent has its current state. Earlier exports may contain
+    blocks that the latest one lacks.
     """
     collected = CollectedExports({}, [], left_out, [])
     for each in read_exports:
@@ -289,7 +292,7 @@ class _PartialExport(Export):
 
 
 class _ExportReader:
-    """A reader of exports that stores equal blocks once."""
+    """A reader of chain exports that stores each block once, even if several exports contain it."""
 
     def __init__(self) -> None:
         self._hashes: dict[tuple[int, int, str], str] = {}
@@ -382,7 +385,7 @@ def _edited(path: Path, which: str, claimed: str) -> str:
 
 
 def _content(path: Path, named_by_user: bool) -> bytes:
-    """Return the content of a file that the user named, or that looks like an export."""
+    """Return the content of a file if the user named the file, or if it looks like an export."""
     try:
         with BoundedFile(path, MAX_EXPORT_BYTES) as file:
             if not named_by_user and path.suffix != ".json" and _FORMAT not in file.peek(BEGINNING_BYTES):
@@ -396,7 +399,7 @@ def _content(path: Path, named_by_user: bool) -> bytes:
 
 
 def _recover(path: Path, data: bytes, problems: list[str]) -> Export:
-    """Return the undamaged parts of an export, and add a sentence about each error to `problems`."""
+    """Return the undamaged parts of an export. For each error, a sentence is added to `problems`."""
     if _FORMAT not in data:
         raise NotAnExportError(f"{path}: not a chain export")
     text = data.decode("utf-8", errors="replace")
@@ -440,7 +443,7 @@ _FLAT_OBJECT = re.compile(r"\{[^{}]*\}")
 
 
 def _parse_prefix(text: str) -> Any:
-    """Return the complete parts of a truncated JSON value, or None if there are none."""
+    """Return the complete parts of a truncated JSON value. Return None if no part is complete."""
     closing: list[str] = []
     complete_end, after = 0, ""
     for token in _TOKEN.finditer(text):
@@ -459,7 +462,7 @@ def _parse_prefix(text: str) -> Any:
 
 
 def _intact_blocks(text: str) -> Iterator[Any]:
-    """Yield each block in a text whose hash is correct, regardless of the surrounding text."""
+    """Yield each block in a text whose hash is correct. The text around a block may have any content."""
     for candidate in _FLAT_OBJECT.finditer(text):
         try:
             block = ExportedBlock.model_validate_json(candidate[0])
@@ -474,5 +477,5 @@ def _place(text: str, position: int) -> str:
 
 
 def all_blocks(read_exports: Iterable[ReadExport]) -> dict[str, ExportedBlock]:
-    """Return every block in any export, by hash."""
+    """Return every block of all exports, by block hash."""
     return {block.block_hash: block for each in read_exports for block in each.export.blocks()}

@@ -1,4 +1,5 @@
-"""Merge the exports of a mission into one ordered record, with each block once, its holders, and the missing blocks.
+"""Merge the exports of a mission into one ordered record. It lists each block once with its holders, and the missing
+blocks.
 
 Blocks are in the order of `harness.field.depot.record_lines`. The current block of an agent at its export comes after
 them, unless a completed block begins with the same events. In that case both are the same block at different times.
@@ -70,12 +71,12 @@ class MergedRecord:
 
     @property
     def missing(self) -> list[MissingItem]:
-        """The vehicles from which no export was collected."""
+        """The vehicles from which no chain export was collected."""
         return [lost for lost in self.lost if lost.block is None]
 
     @property
     def unfinished(self) -> list[RecordedBlock]:
-        """The blocks that agents had not completed when they exported their chains."""
+        """The blocks that their agents had not completed when they exported their chains."""
         return [block for block in self.blocks if block.line.block_hash is None]
 
 
@@ -163,12 +164,12 @@ def _header(
 
 
 def _without_surrogates(text: str) -> str:
-    """Return the text with question marks in place of bytes of a file name that are not valid text."""
+    """Return the text of a file name. Bytes that are not valid text are replaced by question marks."""
     return text.encode(errors="replace").decode()
 
 
 def _event_data(block: ExportedBlock, event_data: EventData) -> tuple[bytes, bool]:
-    """Return the event data of a block, and true if they are still encrypted."""
+    """Return the event data of a block, and whether the data are still encrypted."""
     try:
         return event_data.of_block(block), False
     except SealedError:
@@ -176,8 +177,8 @@ def _event_data(block: ExportedBlock, event_data: EventData) -> tuple[bytes, boo
 
 
 def events_in(event_data: bytes) -> list[tuple[int, int, int, int]]:
-    """Return the readable events at the beginning of the data: timestamp, event ID, and the start and end of each
-    event's data.
+    """Return the events at the beginning of the data, up to the first unreadable one: timestamp, event ID, and the
+    start and end of the event's own data.
     """
     events, offset = [], 0
     last_header = len(event_data) - EVENT_HEADER_BYTES
@@ -196,7 +197,9 @@ def _unreadable(event_data: bytes, events: Sequence[tuple[int, int, int, int]]) 
 
 
 def _names(collected: CollectedExports) -> dict[str, str]:
-    """Return the names of the blocks by hash. A modified block has no number."""
+    """Return the names of the blocks by hash. A block that was modified in a file has the name of the original block,
+    followed by "(edited)".
+    """
     claims = collected.claims
     exports: dict[int, Export] = {}
     for agent_id, export in collected.exports.items():
@@ -245,7 +248,9 @@ def _holdings(collected: CollectedExports) -> dict[str, list[Holding]]:
 
 
 def _add_unfinished(recorded_blocks: list[RecordedBlock], collected: CollectedExports) -> None:
-    """Add each unfinished block to a block that begins with the same events, or as a separate block."""
+    """Add the unfinished block of each export. If a recorded block begins with the same events, the unfinished block
+    becomes a part of that block.
+    """
     building = [
         (base64.b64decode(export.current_block.event_data), export)
         for export in (read_export.export for read_export in collected.read_exports)
@@ -280,7 +285,7 @@ def _add_unfinished(recorded_blocks: list[RecordedBlock], collected: CollectedEx
 
 
 def _forks(chains: Mapping[int, Sequence[str]], names: Mapping[str, str]) -> list[Fork]:
-    """Return the places at which chains diverge. The lowest is first."""
+    """Return the places at which chains diverge. The place nearest to the inception block is first."""
     forks = []
     to_split = [(0, sorted(chains))]
     while to_split:

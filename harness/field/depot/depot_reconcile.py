@@ -36,7 +36,7 @@ LIMIT_S = 1e7
 
 @dataclass(frozen=True)
 class ReconciledExports:
-    """The exports after the reconcile, by agent, and the line for the merged record."""
+    """The exports of all agents after the reconcile, and the line about the reconcile for the merged record."""
 
     exports: dict[int, Export]
     line: ReconcileResult
@@ -71,7 +71,7 @@ def reconcile(record: MergedRecord, report_progress: Callable[[str], None] = lam
 
 
 async def _play(swarm: RestoredSwarm, agents_with_deque: Iterable[int]) -> int:
-    """Simulate the final reconcile. Return the number of rounds, in each of which every agent reconciles once."""
+    """Simulate the final reconcile. Return the number of its rounds. In each round, every agent reconciles once."""
     first, *_ = timeline_of(swarm.scenario)
     await swarm.begin(first)
     await swarm.until_idle(LIMIT_S)
@@ -112,7 +112,7 @@ def _scenario(record: MergedRecord) -> Scenario:
 
 
 def _signatures(collected: CollectedExports) -> dict[bytes, bytes]:
-    """Return the signatures in the exports, by block hash, without their verification."""
+    """Return the signatures in the exports, by block hash. They are not verified."""
     return {
         bytes.fromhex(block.block_hash): base64.b64decode(block.signature)
         for read_export in collected.read_exports
@@ -122,7 +122,7 @@ def _signatures(collected: CollectedExports) -> dict[bytes, bytes]:
 
 
 def _stored(collected: CollectedExports) -> dict[int, StoredState]:
-    """Return the initial state of each agent. Every block occurs once, and modified blocks are left out."""
+    """Return the initial state of each agent, from its export. Repeated blocks and modified blocks are left out."""
     claims, shared_blocks = collected.claims, dict[str, Block]()
     stored = {}
     held_anywhere = {block.block_hash for export in collected.exports.values() for block in export.blocks()}

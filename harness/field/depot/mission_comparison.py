@@ -65,7 +65,9 @@ class ComparedFile:
 
 @dataclass(frozen=True)
 class MissionDifference:
-    """A difference between files. `file` is None if a file is missing, and `key` is None if the whole file is wrong."""
+    """A difference between files. `file` is None if a file is missing. `key` is None if the file as a whole
+    is wrong.
+    """
 
     file: Path | None
     key: str | None
@@ -89,7 +91,7 @@ class MissionComparison:
         return "differ" if self.differences else "same"
 
     def in_words(self) -> str:
-        """Return a sentence with the values that all files share."""
+        """Return a sentence with the values that are equal in all files."""
         kinds = Counter(file.kind for file in self.files)
         counted = ", ".join(f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in kinds.items())
         known = {name: shared.shown for file in self.files for name, shared in file.shared.items()}
@@ -119,7 +121,7 @@ class MissionComparison:
 
 
 def compare(paths: Iterable[Path]) -> MissionComparison:
-    """Compare these files, and the files in these directories.
+    """Compare the files in `paths`. A directory in `paths` stands for the files in it.
 
     Raises RunDirectoryError if a path does not exist, or a directory has no files to compare.
     """
@@ -153,7 +155,9 @@ def differences(files: Sequence[ComparedFile]) -> list[MissionDifference]:
 
 
 def read(path: Path) -> ComparedFile:
-    """Read a file. Raises UnreadableFileError with the reason but without the name of the file."""
+    """Read a file of a vehicle or of the mission. Raises UnreadableFileError with the reason, which does not contain
+    the name of the file.
+    """
     document = _beginning(path)
     schema = document.get("schema")
     try:
@@ -176,7 +180,9 @@ def read(path: Path) -> ComparedFile:
 
 
 def _beginning(path: Path) -> dict[str, Any]:
-    """Return the JSON object in the first line of the file, or the one that the whole file consists of."""
+    """Return the JSON object in the first line of the file. If the first line is not an object, return the object that
+    the whole file contains.
+    """
     try:
         with open_trace(path) as file:
             first = file.readline(MAX_LINE_BYTES)
@@ -280,7 +286,9 @@ def _shown(value: Any) -> str:
 
 
 def _deviating_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
-    """Yield the values that differ from those in the manifest, or from those in most files."""
+    """Yield a difference for each value that differs from the value in the manifest. Without a manifest, compare with
+    the most frequent value.
+    """
     names = dict.fromkeys(name for file in files for name in file.shared)
     for name in names:
         files_with_value = [file for file in files if name in file.shared]
@@ -307,14 +315,14 @@ def _deviating_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifferen
 
 
 def _has_settings_to_compare(file: ComparedFile, others: Sequence[ComparedFile]) -> bool:
-    """Return true if single settings can be compared, so that the difference of their hashes needs no separate
-    sentence.
+    """Return true if single settings can be compared. Their differences then replace a sentence about the hash of the
+    settings.
     """
     return file.mission is not None and any(other.mission is not None for other in others)
 
 
 def _duplicate_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
-    """Yield the values that several mission files share although they must be unique for each vehicle."""
+    """Yield a difference for each value that must be unique for each vehicle but occurs in several mission files."""
     for key in ("agent_id", "network.address", "seed"):
         first: dict[Hashable, ComparedFile] = {}
         for file in files:
@@ -332,7 +340,9 @@ def _duplicate_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifferen
 
 
 def _roster_differences(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
-    """Yield the agents on the roster without a mission file, and the files of agents that are not on the roster."""
+    """Yield a difference for each agent on the roster without a mission file, and for each file of an agent that is not
+    on the roster.
+    """
     rosters = [file for file in files if ROSTER in file.shared and file.kind in ("manifest", "mission file")]
     if not rosters:
         return
@@ -363,7 +373,7 @@ def _roster_differences(files: Sequence[ComparedFile]) -> Iterator[MissionDiffer
 
 
 def _files(paths: Iterable[Path]) -> list[tuple[Path, bool]]:
-    """Return the files, each once, and for each true if the user named the file itself."""
+    """Return each file once, as (file, true if the user named the file and not its directory)."""
     files: dict[Path, tuple[Path, bool]] = {}
     for path in paths:
         if path.is_dir():
@@ -380,7 +390,9 @@ def _files(paths: Iterable[Path]) -> list[tuple[Path, bool]]:
 
 
 def _in_directory(directory: Path) -> list[Path]:
-    """Return the JSON files in a directory. If there are none, return those in its subdirectories, one per vehicle."""
+    """Return the JSON files in a directory. If there are none, return the JSON files in its subdirectories, one of
+    which belongs to each vehicle.
+    """
     agents_folder = agents_directory(directory)
     for pattern in ("*.json*", "*/*.json*"):
         files = [path for path in agents_folder.glob(pattern) if path.is_file() and path.name.endswith(_READ)]

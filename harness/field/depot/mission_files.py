@@ -81,7 +81,7 @@ SUFFIX = ".mission.json"
 
 
 class MissionFileError(HarnessError):
-    """An error: no agent would accept the requested mission."""
+    """An error: agents would not accept the requested mission."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,9 @@ def write(plan: MissionPlan, directory: Path, *, overwrite: bool = False) -> lis
 
 
 def manifest(name: str, missions: Mapping[str, Mission]) -> Manifest:
-    """Return the manifest of these mission files, which are given by file name. There must be at least one."""
+    """Return the manifest of at least one mission file. `missions` maps the name of each mission file to its
+    content.
+    """
     first = next(iter(missions.values()))
     return Manifest(
         name=name,

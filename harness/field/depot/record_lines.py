@@ -39,7 +39,9 @@ class RecordLine(BaseModel):
 
 
 class ExportUsed(RecordLine):
-    """An export and the numbers of blocks in it. Of several exports of one agent, `latest` marks the current one."""
+    """An export that was used, with the numbers of blocks in it. `latest` is true for the most recent export of an
+    agent.
+    """
 
     agent_id: AgentId
     file: str
@@ -78,7 +80,9 @@ class Header(RecordLine):
 
 
 class ForkBranch(RecordLine):
-    """Agents whose chains continue with the same block, `next`. It is null if their chains end."""
+    """The agents whose chains continue with the same block `next` after a fork. `next` is null if their chains end at
+    the fork.
+    """
 
     agents: list[AgentId]
     next: str | None
@@ -86,8 +90,9 @@ class ForkBranch(RecordLine):
 
 
 class Fork(RecordLine):
-    """A fork: chains differ after `height` common blocks. `after` is the last common block, null for the inception
-    block."""
+    """A fork: chains differ after `height` common blocks. `after` is the last common block, or null for the inception
+    block.
+    """
 
     line: Literal["fork"] = "fork"
     height: Count
@@ -97,7 +102,7 @@ class Fork(RecordLine):
 
 
 class Holding(RecordLine):
-    """A place of a block, and the agents that hold it there. `position` counts from 1: in a chain from the inception
+    """A place at which agents hold a block, and these agents. `position` counts from 1: in a chain from the inception
     block, in a deque from the front, in a stack from the bottom.
 
     Blocks with the same `chain_hash` have the same predecessors. `current block` means that the agent had the first
@@ -133,12 +138,12 @@ class Block(RecordLine):
 
     @property
     def holders(self) -> list[int]:
-        """The IDs of the agents that hold it in chain, deque or stack, ascending."""
+        """The IDs of the agents that hold the block in their chain, deque or stack, in ascending order."""
         return sorted({agent for held in self.held if held.place in HELD_NOW for agent in held.agents})
 
 
 class Event(RecordLine):
-    """One event: number `index`, from 0, in the block with the number `block`."""
+    """One event. `block` is the number of its block, and `index` is its position in the block, from 0."""
 
     line: Literal["event"] = "event"
     block: Number
@@ -150,8 +155,9 @@ class Event(RecordLine):
 
 
 class MissingItem(RecordLine):
-    """A missing block of `agent_id`, or the missing vehicle itself if `block` is null. `agents` are the missing
-    vehicles that may have the block, or `agent_id` alone."""
+    """A missing block of the agent `agent_id`. If `block` is null, the vehicle itself is missing. `agents` are the
+    missing vehicles that may have the block, or only `agent_id`.
+    """
 
     line: Literal["lost"] = "lost"
     agent_id: AgentId
@@ -162,7 +168,7 @@ class MissingItem(RecordLine):
 
 
 class Vehicle(RecordLine):
-    """A vehicle after the reconcile. `gained` has the names of the blocks that it did not have before."""
+    """A vehicle after the reconcile. `gained` contains the names of the blocks that the vehicle did not have before."""
 
     agent_id: AgentId
     chain: Count
@@ -171,8 +177,8 @@ class Vehicle(RecordLine):
 
 
 class ReconcileResult(RecordLine):
-    """The last line: the result of a final reconcile of the exports. `chain` has the hashes of the uniform chain,
-    oldest first. It is empty if the chains are not uniform.
+    """The last line of the record: the result of a final reconcile of the exports. `chain` contains the hashes of the
+    uniform chain, oldest first. It is empty if the chains are not uniform.
 
     `left_out` has the blocks in no chain, each with the reason.
     """
@@ -248,7 +254,7 @@ def ordered(blocks: Mapping[str, ExportedBlock], chains: Sequence[Sequence[str]]
 
 
 def _components(after: Mapping[str, set[str]]) -> dict[str, int]:
-    """Return the number of each block's strongly connected component (Tarjan, 1972).
+    """Return, for each block, the number of its strongly connected component (Tarjan, 1972).
 
     Long chains would exceed the recursion limit, so the function is iterative.
     """

@@ -26,7 +26,7 @@ COLUMNS = (
 
 
 def lines(record: MergedRecord, reconciled: ReconcileResult | None = None) -> Iterator[str]:
-    """Yield the lines of the merged record, including line ends."""
+    """Yield the lines of the merged record, each with its line end."""
     yield _line(record.header)
     yield from map(_line, record.forks)
     for block in record.blocks:
@@ -83,7 +83,7 @@ def table(record: MergedRecord) -> str:
 
 
 def flight_logs(record: MergedRecord) -> list[MatchedLog]:
-    """Return the flight logs of vehicles, with the agents that flew on them."""
+    """Return the flight logs, each with the agent that flew on its vehicle."""
     if not record.collected.flight_logs:
         return []  # the events of all blocks need not be decoded
     logged = {track.agent_id: track.fixes for track in tracks(record)}
@@ -91,7 +91,9 @@ def flight_logs(record: MergedRecord) -> list[MatchedLog]:
 
 
 def flown_tracks(matches: Iterable[MatchedLog]) -> list[EventTrack]:
-    """Return the path in each flight log that belongs to an agent, by the clock of the log."""
+    """Return the path in each flight log that belongs to an agent. Times are UTC if the log has GPS time, otherwise
+    times on the log's clock.
+    """
     return [
         EventTrack(match.agent_id, [], [_fix(position) for position in match.vehicle.positions])
         for match in matches
@@ -106,7 +108,7 @@ def _fix(position: Position) -> tuple[int, RoundedPosition]:
 
 
 def tracks(record: MergedRecord) -> list[EventTrack]:
-    """Return the path of each agent that logged positions, by agent ID. There is none if the events are not
+    """Return the path of each agent that logged positions, by agent ID. The result is empty if the events are not
     telemetry.
     """
     logged: dict[int, list[tuple[LoggableEvent, str]]] = {}
@@ -206,7 +208,7 @@ def agents(ids: Sequence[int]) -> str:
 
 
 def _single_copies(record: MergedRecord) -> Iterator[str]:
-    """Yield a sentence for each vehicle whose loss would have lost blocks."""
+    """Yield a sentence for each vehicle that is the only holder of some blocks. Its loss would have destroyed them."""
     if len(record.collected.latest) < 2:
         return
     single_copies: dict[int, list[str]] = {}

@@ -1,5 +1,5 @@
-"""Flight logs of ArduPilot: DataFlash (`.bin`), which the autopilot writes, and telemetry (`.tlog`), which a ground
-station or the harness writes.
+"""Read flight logs of ArduPilot: DataFlash logs (`.bin`), which the autopilot writes, and telemetry logs (`.tlog`),
+which a ground station or the harness writes.
 
 `read_flight_log` reads either format into a `FlightLog`, with the records of each vehicle in the order of the file:
 

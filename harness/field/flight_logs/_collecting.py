@@ -26,8 +26,8 @@ Kind = TypeVar("Kind", bound=FlightRecord)
 
 
 class LogClock:
-    """The clock of a flight log. A single record with a wrong time is dropped, but several consistent new times are a
-    jump.
+    """The clock of a flight log. It drops a single record with a wrong time. Several new times that agree with each
+    other count as a jump of the clock.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class LogClock:
         return self._last_us is not None
 
     def accepts(self, at_us: int) -> bool:
-        """Return true if a record with this time may be used. After a jump, `jumps` has increased."""
+        """Return true if a record with this time may be used. If the clock has jumped, the jump is added to `jumps`."""
         if not 0 <= at_us <= MAX_TIME_US:
             self.dropped += 1
             return False
@@ -82,7 +82,9 @@ class RecordCollector:
         self._last_state: dict[type[Any], Hashable] = {}
 
     def add(self, record: FlightRecord) -> bool:
-        """Store a record, whose time is converted later. Return False if the limit is reached."""
+        """Store a record. Its time is converted to UTC at the end of the segment. Return false if the limit of records
+        is reached.
+        """
         kept = self._budget.take()
         if kept:
             self._records.setdefault(type(record), []).append(record)
@@ -96,11 +98,15 @@ class RecordCollector:
         return True
 
     def use_gps_time(self, time: GpsTime) -> None:
-        """Use a GPS time to convert the times of this collector's records, without storing it as a record."""
+        """Use a GPS time to convert the times of this collector's records to UTC. The GPS time itself is not stored as
+        a record.
+        """
         self._times.setdefault(time.at_us // _BIN_US, []).append((time.at_us, time.utc_us))
 
     def add_sample(self, record: FlightRecord, source: Hashable, state: Hashable = None) -> None:
-        """Store a record if the previous record from the same source is a second old or has a different state."""
+        """Store a record if the previous record from the same source is at least a second older or has a different
+        state.
+        """
         if self._is_due((type(record), source), record.at_us, state):
             self.add(record)
 
@@ -118,7 +124,7 @@ class RecordCollector:
         return True
 
     def end_segment(self) -> None:
-        """Convert the times of all records since the last call to UTC."""
+        """Convert the times of all records to UTC that were stored since the previous call."""
         to_utc = (
             _PiecewiseLinearClock(
                 [
@@ -144,8 +150,8 @@ class RecordCollector:
 
 
 class _PiecewiseLinearClock:
-    """Straight lines through points (time on the log's clock, UTC). The lines continue before the first and after the
-    last point.
+    """A conversion to UTC by straight lines through points (time on the log's clock, UTC). The first and the last line
+    continue beyond their points.
     """
 
     def __init__(self, points: list[tuple[int, int]]) -> None:

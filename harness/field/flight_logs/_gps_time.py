@@ -12,7 +12,7 @@ _OLDEST_S, _NEWEST_S = 1_136_073_600, 4_102_444_800
 
 
 def from_week(at_us: int, week: int, week_ms: int) -> GpsTime | None:
-    """Return the record for a GPS week and the milliseconds in it, or None if the time is impossible."""
+    """Return the GPS time for a GPS week and the milliseconds in this week. Return None if the time is impossible."""
     gps_ms = week * _WEEK_MS + week_ms
     unix_s = _EPOCH_S + gps_ms / 1000
     if not (_OLDEST_S <= unix_s <= _NEWEST_S and 0 <= week_ms < _WEEK_MS):
@@ -22,7 +22,7 @@ def from_week(at_us: int, week: int, week_ms: int) -> GpsTime | None:
 
 
 def from_utc(at_us: int, utc_us: int) -> GpsTime | None:
-    """Return the record for a time in UTC, or None if the time is impossible."""
+    """Return the GPS time for a time in UTC. Return None if the time is impossible."""
     if not _OLDEST_S <= utc_us / 1e6 <= _NEWEST_S:
         return None
     leap_s = _leap_seconds(utc_us / 1e6)

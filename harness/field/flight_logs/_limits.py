@@ -28,7 +28,7 @@ class DamagedBytes:
             self.first_at = at
 
     def ends_reading(self, at: int) -> bool:
-        """Return true if the file has too much damage to be read from byte `at` on."""
+        """Return true if the file has too much damage before the byte `at` to continue reading."""
         if self.searches <= MAX_SEARCHES:
             return False
         self.ends_at = at

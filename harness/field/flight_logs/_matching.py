@@ -44,7 +44,7 @@ _METRES_PER_DEGREE = 111_195.0
 
 
 class LoggedPosition(Protocol):
-    """A position in units of 1e-7 degrees that an agent logged."""
+    """A position in units of 1e-7 degrees that an agent logged at some time."""
 
     @property
     def lat_e7(self) -> int: ...
@@ -58,7 +58,7 @@ Fixes = Sequence[tuple[int, LoggedPosition]]
 
 @dataclass(frozen=True)
 class MatchedLog:
-    """A vehicle in a flight log, and its agent. `agent_id` is None if the vehicle carried none of the known agents.
+    """A vehicle in a flight log, and its agent. `agent_id` is None if none of the known agents flew on the vehicle.
 
     `evidence` completes "is of agent 10 by ...", or "matches no agent: ...". `clock_ahead_s` is the time on the agent's
     clock minus GPS time, None if unknown.
@@ -72,8 +72,7 @@ class MatchedLog:
 
 
 def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[MatchedLog]:
-    """Return the matching agent for each vehicle in the flight logs. `agents` contains the logged positions of each
-    agent.
+    """Find the agent of each vehicle in the flight logs. `agents` contains the logged positions of each agent.
 
     Of several flights along the same path, an agent keeps the one whose time is nearest to its own clock.
     """
@@ -86,7 +85,7 @@ def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[M
 
 
 def _other_flight(match: MatchedLog, nearest: Mapping[int, float]) -> MatchedLog:
-    """Return the match without its agent if another log fits the clock of this agent better."""
+    """Return the match without its agent if a different log fits the clock of this agent better."""
     if match.agent_id is None or match.clock_ahead_s is None:
         return match
     later_s = nearest[match.agent_id] - match.clock_ahead_s
@@ -117,8 +116,8 @@ def _match(log: FlightLog, vehicle: VehicleLog, agents: Mapping[int, Fixes]) -> 
 
 @dataclass(frozen=True)
 class _ClockDifference:
-    """A difference between two clocks, with the number of positions that support it. `of_utc` is true if the log has
-    UTC by GPS.
+    """A difference between two clocks, and the number of positions that support it. `of_utc` is true if the log has UTC
+    from GPS.
     """
 
     ahead_us: float
@@ -170,7 +169,9 @@ def _vote(positions: Sequence[Position], fixes: Fixes) -> _ClockDifference | Non
 
 
 def _visits(near: list[tuple[int, Position]], fix: LoggedPosition) -> Iterator[int]:
-    """Yield the time of each short visit at a place, if the vehicle came within MAX_ASIDE_M of it."""
+    """Yield the time of each short visit of the vehicle at a place. On a visit, the vehicle comes within MAX_ASIDE_M of
+    the place.
+    """
     near.sort(key=lambda timed: timed[0])
     visit: list[tuple[int, Position]] = []
     for index, timed in enumerate(near):
@@ -184,7 +185,9 @@ def _visits(near: list[tuple[int, Position]], fix: LoggedPosition) -> Iterator[i
 
 
 def _passage(before: tuple[int, Position], after: tuple[int, Position], fix: LoggedPosition) -> tuple[float, float]:
-    """Return the smallest distance in metres between a place and the line between two positions, and its time."""
+    """Return the smallest distance in metres between a place and the line between two positions, and the time of this
+    smallest distance.
+    """
     begin, end = _metres(before[1], fix), _metres(after[1], fix)
     along = (end[0] - begin[0], end[1] - begin[1])
     length = along[0] ** 2 + along[1] ** 2
@@ -194,7 +197,7 @@ def _passage(before: tuple[int, Position], after: tuple[int, Position], fix: Log
 
 
 def _metres(position: Position, fix: LoggedPosition) -> tuple[float, float]:
-    """Return the distances of a place in metres north and east."""
+    """Return the distance from a logged position to a position of the vehicle, in metres north and in metres east."""
     east_deg = (position.lon_deg - fix.lon_e7 / 1e7) * math.cos(math.radians(position.lat_deg))
     return (position.lat_deg - fix.lat_e7 / 1e7) * _METRES_PER_DEGREE, east_deg * _METRES_PER_DEGREE
 
@@ -204,7 +207,9 @@ def _cell(lat_deg: float, lon_deg: float) -> tuple[int, int]:
 
 
 def _contradiction(vehicle: VehicleLog, fixes: Fixes) -> str | None:
-    """Return the reason why a flight log cannot belong to the agent with these positions, or None if it can."""
+    """Return the reason why a flight log cannot belong to the agent with these positions. Return None if the log may
+    belong to it.
+    """
     if not vehicle.positions or not fixes:
         return None
     lat_deg = median(position.lat_deg for position in vehicle.positions)

@@ -33,7 +33,8 @@ _SUFFIXES: dict[str, LogKind] = {".bin": "DataFlash", ".tlog": "telemetry"}
 
 
 def flight_log_kind(path: Path, beginning: bytes) -> LogKind | None:
-    """Return the format of the flight log that begins with these bytes, or None if it is not a flight log.
+    """Return the format of the flight log that begins with these bytes. Return None if the bytes do not begin a flight
+    log.
 
     A damaged beginning is recognised by the suffix of the file, together with a mark of the format.
     """

@@ -8,7 +8,7 @@ LogKind = Literal["DataFlash", "telemetry"]
 
 
 class Position(NamedTuple):
-    """The estimated position of the vehicle."""
+    """The position of the vehicle, as the autopilot estimated it."""
 
     at_us: int
     utc_us: int | None
@@ -52,7 +52,7 @@ class Battery(NamedTuple):
 
 
 class GpsStatus(NamedTuple):
-    """The state of a GPS receiver. There is at most one record per second for each receiver and fix type."""
+    """The state of a GPS receiver. There is at most one record per second while receiver and fix type stay the same."""
 
     at_us: int
     utc_us: int | None
@@ -64,7 +64,8 @@ class GpsStatus(NamedTuple):
 
 
 class EkfStatus(NamedTuple):
-    """The state of the active position filter (EKF). There is at most one record per second for the same flags.
+    """The state of the active position filter (EKF). There is at most one record per second while the flags stay the
+    same.
 
     A variance is the square root of the normalised innovation test ratio. Above 1 the EKF rejects the measurement.
     """
@@ -80,7 +81,7 @@ class EkfStatus(NamedTuple):
 
 
 class GpsTime(NamedTuple):
-    """The GPS time at a time on the log's clock. There is at most one record per second."""
+    """The GPS time that belongs to a time on the log's clock. There is at most one record per second."""
 
     at_us: int
     utc_us: int
@@ -117,7 +118,8 @@ class Parameter(NamedTuple):
 
 
 class ClockJump(NamedTuple):
-    """A jump of the log's clock. Two records with consistent new times follow a record with the old time.
+    """A jump of the log's clock. A jump is recorded when two records have new times that agree with each other and not
+    with the old time.
 
     A restart of the autopilot, a corrected clock of the computer, and a pause of the log look the same. Only a clock
     that goes back is certainly wrong.
@@ -152,7 +154,7 @@ class VehicleLog:
 
     @property
     def type_name(self) -> str:
-        """Return "plane", "copter" or "rover", or "vehicle" for another or unknown type."""
+        """Return "plane", "copter" or "rover". Return "vehicle" for any other type and for an unknown type."""
         return _TYPE_NAMES.get(self.mav_type or 0, "vehicle")
 
     def latest_parameters(self) -> dict[str, float]:

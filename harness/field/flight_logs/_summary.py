@@ -16,7 +16,7 @@ MAX_NAMED_MODES = 8
 
 @dataclass(frozen=True)
 class LoggedChange:
-    """A change of a vehicle. `at_us` is UTC by GPS, or the time on the log's own clock without GPS time."""
+    """A change of a vehicle. `at_us` is UTC if the log has GPS time, otherwise the time on the log's own clock."""
 
     at_us: int
     agent_id: int | None
@@ -60,8 +60,8 @@ def _contents(match: MatchedLog) -> Iterator[str]:
 
 
 def changes(match: MatchedLog) -> list[LoggedChange]:
-    """Return the changes in order of time: flight modes, arming, and the beginnings and ends of GPS and filter
-    problems.
+    """Return the changes in order of time: new flight modes, arming, and the beginnings and ends of GPS problems and
+    filter problems.
     """
     vehicle, agent_id = match.vehicle, match.agent_id
     found = [
@@ -96,5 +96,5 @@ def _time(record: FlightRecord) -> int:
 
 
 def change_in_words(change: LoggedChange) -> tuple[str, str, str]:
-    """Return the time, the agent and the change as texts."""
+    """Return the time, the agent and the kind of the change, each as text."""
     return text.moment(change.at_us), "" if change.agent_id is None else str(change.agent_id), change.words

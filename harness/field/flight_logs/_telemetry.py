@@ -1,4 +1,4 @@
-"""Read telemetry logs: MAVLink frames of version 1 or 2, each after the time of its arrival.
+"""Read telemetry logs. They contain MAVLink frames of version 1 or 2, each preceded by the time of its arrival.
 
 The time is a big-endian u64 in microseconds since the Unix epoch. A frame of a known message counts only with the right
 checksum. A frame of another message counts if a frame or the end of the file follows it.
@@ -203,7 +203,7 @@ _HANDLERS: dict[int, Callable[[TelemetryReader, SystemLog, int, Values], None]] 
 
 
 def begins_with_frame(beginning: bytes) -> bool:
-    """Return true if the bytes begin with a time and a known frame with the right checksum."""
+    """Return true if the bytes begin with a time and a frame of a known type with the right checksum."""
     return (frame := _frame_at(beginning, _STAMP_BYTES)) is not None and frame[3] in mavlink.mavlink_map
 
 
@@ -217,8 +217,8 @@ def _values(message: int, payload: bytes) -> Values:
 
 
 def _frame_at(buffer: bytes, at: int) -> tuple[int, int, int, int, bytes] | None:
-    """Return the end, system ID, component ID, message ID and payload of the frame at a position, or None if there is
-    none.
+    """Return the end, system ID, component ID, message ID and payload of the frame at a position. Return None if there
+    is no frame.
     """
     if len(buffer) < at + _STAMP_BYTES:
         return None

@@ -1,4 +1,4 @@
-"""Read all files of a flight, and find out the agent, the flight and the usable part of each file.
+"""Read all files of a flight. Find out, for each file, its agent, its flight and the part that can be used.
 
 Field data is often broken. Lines are truncated, two flights are in one file, a file exists twice, and unrelated files
 lie in the same directory. Ingesting uses everything usable, and reports everything that it leaves out.

@@ -1,4 +1,4 @@
-"""Combine several copies of the same trace, because one copy may contain the lines that another copy has lost."""
+"""Combine several copies of the same trace. One copy may contain lines that are lost in the others."""
 
 from collections.abc import Iterator
 
@@ -11,7 +11,7 @@ from ucp.trace import HandlerRun
 def split_into_flights(
     incarnations: list[TraceIncarnation], left_out: list[UnusedPart]
 ) -> Iterator[list[TraceIncarnation]]:
-    """Yield groups of traces of one agent with the same header. Each group belongs to one flight.
+    """Yield groups of traces of one agent with the same header. The traces of each group belong to one flight.
 
     Successive incarnations belong to the same flight, overlapping ones to different flights. Copies are combined into
     one.
@@ -77,7 +77,7 @@ def _is_copy(incarnation: TraceIncarnation, other: TraceIncarnation) -> bool:
 
 
 def _overlap(incarnation: TraceIncarnation, other: TraceIncarnation, *, anywhere: bool = False) -> bool:
-    """Return true if the times of two traces overlap, so that they cannot belong to the same flight.
+    """Return true if the times of two traces overlap. One agent cannot have such traces in the same flight.
 
     Incarnations in the same file follow each other, whatever their times are. With `anywhere` this does not count.
     """
@@ -87,7 +87,9 @@ def _overlap(incarnation: TraceIncarnation, other: TraceIncarnation, *, anywhere
 
 
 def _fill_gaps(incarnation: TraceIncarnation, copy: TraceIncarnation) -> int:
-    """Insert the handler runs that one trace lacks and its copy contains. Return their number."""
+    """Insert handler runs that are missing in the trace `incarnation` and present in its copy. Return the number of
+    inserted handler runs.
+    """
     where = {_key(run): position for position, run in enumerate(copy.runs)}
     broken = {gap.position for gap in copy.gaps}
     added_runs = 0

@@ -1,5 +1,5 @@
-"""Find the mission of a packet capture, and the flight of a file with public keys. These files do not name their
-mission or flight.
+"""Find the mission of a packet capture, and the flight of a file with public keys. Neither file names its mission or
+flight.
 """
 
 import base64
@@ -22,7 +22,7 @@ MAX_FRAMES_READ = 5000
 
 @dataclass(frozen=True)
 class CaptureSummary:
-    """The facts about a packet capture that identify its flight.
+    """The facts about a packet capture by which its flight can be found.
 
     `hashes` are the block and chain hashes in its datagrams, in hex.
     """
@@ -59,8 +59,8 @@ PUBLIC_SCHEMA = '"ucp-keys/1"'
 
 
 def read_public_keys(path: Path, left_out: list[UnusedPart]) -> "PublicKeys | None":
-    """Return the public keys in a file. If they cannot be used, return None and add the reason to `left_out`. Raises
-    OSError.
+    """Return the public keys in a file. If the keys cannot be used, return None and add the reason to `left_out`.
+    Raises OSError.
     """
     try:
         from ucp.secure.bundle import load_public
@@ -78,7 +78,7 @@ def read_public_keys(path: Path, left_out: list[UnusedPart]) -> "PublicKeys | No
 def assign_keys(
     flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys"]], left_out: list[UnusedPart]
 ) -> None:
-    """Assign to each flight the public keys with which a signature in its exports is valid.
+    """Assign public keys to each flight. A flight gets the keys with which a signature in its exports is valid.
 
     If any block is signed, unused keys belong to another mission and are left out.
     """
@@ -100,7 +100,7 @@ def _signed(flight: Flight) -> Iterator[ExportedBlock]:
 
 
 def _has_signed(keys: "PublicKeys", block: ExportedBlock) -> bool:
-    """Return true if the signature of a block is valid with these keys."""
+    """Return true if the signature of a block is valid with these public keys."""
     from ucp.secure.block_signature import block_claim
     from ucp.secure.crypto_suite import verify
 

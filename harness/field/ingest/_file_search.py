@@ -1,4 +1,4 @@
-"""Find the files to read: the given files, and the files in the given directories, each once.
+"""Find the files to read: the files that the user gave, and the files in the given directories, each once.
 
 FIFOs, devices and loops of links are left out.
 """
@@ -63,7 +63,8 @@ def files_of(paths: Iterable[Path], left_out: list[UnusedPart]) -> list[Path]:
 
 
 def is_incarnation_copy(path: Path) -> bool:
-    """Return true if a run wrote this file for one start of an agent, in addition to the whole file.
+    """Return true if the file is a copy that a run wrote for one start of an agent, in addition to the file of all
+    starts.
 
     The files of the agent usually contain the same records.
     """
@@ -100,5 +101,5 @@ def _walk(
 
 
 def _files_first(path: Path) -> tuple[bool, int, str]:
-    """Return a sort key that puts files before directories, and 9 before 10."""
+    """Return a sort key that puts files before directories, and short names before long ones, so that 9 precedes 10."""
     return path.is_dir(), len(path.name), path.name

@@ -14,7 +14,9 @@ from ucp.telemetry import Position, position_of
 def assign_flight_logs(
     flights: Sequence[Flight], logs: Iterable[FlightLog], left_out: list[UnusedPart], remarks: list[FileRemark]
 ) -> None:
-    """Assign each log to the first flight with an agent of its vehicle. Logs of other vehicles are left out."""
+    """Assign each flight log to the first flight in which an agent flew on its vehicle. Logs of unknown vehicles are
+    left out.
+    """
     fixes = [_logged_positions(flight) for flight in flights] if logs else []
     for log in logs:
         remarks += [FileRemark(log.path, problem) for problem in log.problems]
@@ -36,7 +38,7 @@ def assign_flight_logs(
 
 
 def _logged_positions(flight: Flight) -> dict[int, list[tuple[int, Position]]]:
-    """Return the positions that each agent logged, in order of time, from all known blocks."""
+    """Return the positions that each agent logged, in order of time, from all blocks that any record contains."""
     found: dict[int, dict[int, Position]] = {agent_id: {} for agent_id in {*flight.agents, *flight.roster}}
     data = {(block.agent_id, block.event_bytes) for export in flight.exports.values() for block in export.blocks()}
     data |= {(agent_id, b64decode(export.current_block.event_data)) for agent_id, export in flight.exports.items()}

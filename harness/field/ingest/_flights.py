@@ -1,4 +1,4 @@
-"""Group records by flight. The agents of one flight have the same mission and time, and each occurs once.
+"""Group records by flight. All agents of a flight have the same mission and time, and each agent occurs once.
 
 A mission is identified by its roster and its inception data (BD_0). One mission may have several flights, each with its
 own mission second 0. Exports and captures do not contain the flight. They are assigned to the flight that shares the
@@ -27,7 +27,7 @@ from ucp.trigger import TimerTrigger
 
 
 class _MissionInHeader(NamedTuple):
-    """The mission in a trace header: the inception data in base64 if present, the roster, and the start time."""
+    """The mission in a trace header: the inception data in base64 (None if absent), the roster, and the start time."""
 
     initial_data: str | None
     roster: tuple[int, ...]
@@ -36,7 +36,7 @@ class _MissionInHeader(NamedTuple):
 
 @dataclass
 class _FlightRecords:
-    """The records of one flight that were read until now. `hashes` contains the hexadecimal hashes of the blocks and
+    """The records of one flight that were read so far. `hashes` contains the hexadecimal hashes of the blocks and
     chains in them.
     """
 
@@ -83,7 +83,7 @@ def group_by_flight(
     left_out: list[UnusedPart],
     remarks: list[FileRemark],
 ) -> list[Flight]:
-    """Return the flights, with the flight that has the most records first."""
+    """Return the flights. The flight with the most records is first."""
     groups, without_header = _by_mission(incarnations, left_out)
     for path, export in exports:
         _add_export(groups, path, export, left_out)
@@ -103,7 +103,7 @@ def group_by_flight(
 def _by_mission(
     incarnations: Iterable[TraceIncarnation], left_out: list[UnusedPart]
 ) -> tuple[list[_FlightRecords], list[TraceIncarnation]]:
-    """Return the records of each mission with the same start time, and the traces without a header."""
+    """Return the records of each mission, separated by start time, and the traces without a header."""
     by_header: dict[tuple[_MissionInHeader, int], list[TraceIncarnation]] = defaultdict(list)
     without_header: list[TraceIncarnation] = []
     last: TraceIncarnation | None = None
@@ -140,7 +140,8 @@ def _mission_of(header: TraceHeader) -> _MissionInHeader:
 def _assign_to_flights(
     groups: list[_FlightRecords], mission: _MissionInHeader, agent_id: int, flights: list[list[TraceIncarnation]]
 ) -> None:
-    """Assign the flights of one agent to the flights of the others, by the number of shared directories.
+    """Assign the records of one agent's flights to the flights of the other agents, by the number of directories in
+    common.
 
     This is only a guess, for flights that nothing else distinguishes.
     """
@@ -216,8 +217,8 @@ def _hashes_of(incarnation: TraceIncarnation) -> set[str]:
 def _add_without_header(
     groups: list[_FlightRecords], incarnation: TraceIncarnation, left_out: list[UnusedPart], remarks: list[FileRemark]
 ) -> None:
-    """Add a trace without a header to the flight with which it shares the most hashes, and give it that flight's
-    header.
+    """Add a trace without a header to the flight with which it shares the most hashes. The trace gets the header of
+    this flight.
     """
     agent_id, hashes = incarnation.agent_id, _hashes_of(incarnation)
     if agent_id is None or not incarnation.runs:
@@ -260,8 +261,8 @@ MAX_DRIFT = 0.05
 
 
 def _drift(incarnation: TraceIncarnation) -> float:
-    """Return the drift of an agent's clock, computed from the timer that expired earliest relative to its duration.
-    Without timers, the drift is 0.
+    """Return the drift of an agent's clock. It is computed from the timer that expired earliest in proportion to its
+    duration, and is 0 without timers.
     """
     started: dict[str, tuple[float, float]] = {}
     drifts = []
@@ -326,7 +327,9 @@ def _inception(records: _FlightRecords) -> str:
 
 
 def _inception_chain_hash(records: _FlightRecords) -> str | None:
-    """Return the chain hash CH_0 (eq. 3.4) of the mission, which is the same for all its flights, or None."""
+    """Return the chain hash CH_0 (eq. 3.4) of the mission, which is the same for all its flights. Return None if it is
+    unknown.
+    """
     data = _decoded(records.mission.initial_data)
     return None if data is None else InceptionBlock(data).chain_hash.hex()
 
@@ -368,7 +371,9 @@ def _add_capture(groups: list[_FlightRecords], capture: CaptureSummary) -> None:
 
 
 def _add_logged(groups: list[_FlightRecords], path: Path, agent_id: int, event: LoggableEvent) -> None:
-    """Assign an event to the flight in progress at its time, or else to the flight with files in the same directory."""
+    """Add an event to the flight that was in progress at the time of the event. Without such a flight, add it to the
+    flight with files in the same directory.
+    """
 
     def under_way(records: _FlightRecords) -> bool:
         start_s, end_s = records.time_span

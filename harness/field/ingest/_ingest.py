@@ -1,4 +1,4 @@
-"""Represent the result of reading many files: flights, and remarks on files."""
+"""Define the result of reading many files: the flights in them, and remarks on the files."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field

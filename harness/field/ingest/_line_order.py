@@ -16,7 +16,9 @@ MAX_REPEATED = 10_000
 
 @dataclass(frozen=True, slots=True)
 class ReorderedPart:
-    """A part of a trace that was repaired: its first and last position before the repair, and the reason."""
+    """A part of a trace that was repaired. `first` and `last` are its positions before the repair, and `why` is the
+    reason for it.
+    """
 
     first: int
     last: int
@@ -24,7 +26,9 @@ class ReorderedPart:
 
 
 def in_order(runs: Sequence[HandlerRun]) -> tuple[list[int], list[ReorderedPart]]:
-    """Return the positions of the handler runs to keep, in the right order, and the parts that were repaired."""
+    """Return the positions of the handler runs to keep in the right order, and the parts of the trace that must be
+    repaired.
+    """
     places = [*_repeated(runs)]
     repeated = {position for place in places for position in range(place.first, place.last + 1)}
     order = [position for position in range(len(runs)) if position not in repeated]
@@ -64,7 +68,7 @@ def _repeated(runs: Sequence[HandlerRun]) -> Iterator[ReorderedPart]:
 
 
 def _happens_once(part: Sequence[HandlerRun]) -> bool:
-    """Return true if these handler runs have an effect that no agent can have twice at the same time."""
+    """Return true if these handler runs had an effect that an agent cannot have twice at the same time."""
     return any(
         run.changes or run.sent or run.tally or run.started or not isinstance(run.trigger, MessageTrigger)
         for run in part
@@ -72,7 +76,7 @@ def _happens_once(part: Sequence[HandlerRun]) -> bool:
 
 
 def _triggers_next(runs: Sequence[HandlerRun], position: int) -> bool:
-    """Return true if the run at this position was triggered by the run before it."""
+    """Return true if the handler run before this position triggered the handler run at this position."""
     if position >= len(runs):
         return False
     trigger = runs[position].trigger
@@ -80,7 +84,7 @@ def _triggers_next(runs: Sequence[HandlerRun], position: int) -> bool:
 
 
 def _are_swapped(runs: Sequence[HandlerRun], order: Sequence[int], number: int) -> bool:
-    """Return true if the handler run at `number` belongs after the next handler run."""
+    """Return true if the handler run at position `number` belongs after the handler run that follows it."""
     first, second = runs[order[number]], runs[order[number + 1]]
     before_s = runs[order[number - 1]].t if number else 0.0
     if second.t < first.t:
@@ -94,7 +98,7 @@ def _are_swapped(runs: Sequence[HandlerRun], order: Sequence[int], number: int) 
 
 
 def _is_triggered_later(runs: Sequence[HandlerRun], order: Sequence[int], number: int) -> bool:
-    """Return true if the handler that triggered this run appears after it, and not before it."""
+    """Return true if the handler that triggered this run appears only after it in the trace."""
     trigger = runs[order[number]].trigger
     assert isinstance(trigger, LocalTrigger)
     for position in reversed(order[:number]):

@@ -46,7 +46,9 @@ class EventLine(BaseModel):
 
 
 def read_logged(path: Path, left_out: list[UnusedPart]) -> list[tuple[int, LoggableEvent]]:
-    """Return the events in a file, each with its agent. The list is empty for another format. Raises OSError."""
+    """Return the events in a file, each with the ID of its agent. The list is empty if the file has another format.
+    Raises OSError.
+    """
     events: list[tuple[int, LoggableEvent]] = []
     damaged: list[int] = []
     with BoundedFile(path) as file:

@@ -42,7 +42,8 @@ _BLANK = " \t\r\n\0\ufeff"
 
 @gc_paused()
 def ingest_files(paths: Iterable[Path], opener: "DatagramOpener | None" = None) -> IngestResult:
-    """Return the records in files and directories, grouped by flight. File names and damage do not matter.
+    """Return the records in files and directories, grouped by flight. Neither the names of files nor damage in them
+    matter.
 
     `opener` decrypts captures of a secured mission. Raises FieldError if a path does not exist. Every other problem is
     reported in `left_out` of the result.
@@ -55,7 +56,7 @@ def ingest_files(paths: Iterable[Path], opener: "DatagramOpener | None" = None) 
 
 
 class RecordSorter:
-    """Collects records from files, and sorts them by flight.
+    """A collector that reads records from files and sorts them by flight.
 
     It reads files of the harness, and accepts the records that adapters read from other files.
     """
@@ -121,7 +122,7 @@ class RecordSorter:
         self.add_exports(path, text)
 
     def add_exports(self, path: Path, text: str, line: int | None = None, counts: str = "line") -> None:
-        """Add the exports in a text. If the text is only a part of its file, `line` is its position there."""
+        """Add the chain exports in a text. If the text is only a part of a file, `line` is its position in the file."""
         try:
             for document in _documents(text.strip(_BLANK)):
                 self.exports.append((path, parse_export(path, document)))
@@ -136,7 +137,7 @@ class RecordSorter:
 
 
 def _documents(text: str) -> Iterator[Any]:
-    """Yield JSON documents that follow each other in a text. Raises ValueError."""
+    """Yield the JSON documents that follow one another in a text. Raises ValueError."""
     position = 0
     for _ in range(MAX_DOCUMENTS):
         if position == len(text):
@@ -160,7 +161,7 @@ def _describe_content(data: bytes) -> str:
 
 
 def _summarise(left_out: list[UnusedPart]) -> Iterator[UnusedPart]:
-    """Yield the omitted files. Many files of one directory with the same reason are combined."""
+    """Yield the omitted files. Many files of one directory that have the same reason become one entry."""
     alike: dict[tuple[Path, str], list[UnusedPart]] = {}
     for each in left_out:
         alike.setdefault((each.path.parent, each.why) if each.line is None else (each.path, str(each.line)), []).append(

@@ -1,4 +1,4 @@
-"""Read damaged traces from the field, divided at restarts of the agent. Undamaged lines between damaged ones are used.
+"""Read damaged traces from the field. Divide them at restarts of the agent, and use every undamaged line.
 
 A header line begins an incarnation. A file may contain incarnations of several agents and missions, and may begin
 within one.
@@ -65,7 +65,9 @@ class TraceIncarnation:
 
     @property
     def agent_id(self) -> int | None:
-        """The agent ID from the header, the sent datagrams or the file name, in this order. None if unknown."""
+        """The ID of the agent, from the header, the source of the lines, the sent datagrams or the file name. The first
+        of these that has an ID decides. None if the ID is unknown.
+        """
         if self.header is not None:
             return self.header.agent_id
         if self.agent is not None:
@@ -91,7 +93,7 @@ class TraceIncarnation:
         return zip(self.asides, self.aside_lines, strict=True)
 
     def add_gap(self, lines: int, lost_bytes: int) -> None:
-        """Record lost or damaged lines. Consecutive ones form one gap."""
+        """Record lost or damaged lines. If they follow other lost lines directly, both form one gap."""
         position = len(self.runs)
         if self.gaps and self.gaps[-1].position == position:
             last = self.gaps.pop()
@@ -99,7 +101,7 @@ class TraceIncarnation:
         self.gaps.append(TraceGap(position, lines, lost_bytes))
 
     def put_in_order(self) -> Iterator[UnusedPart]:
-        """Repair the order of lines, and drop repeated ones. Yield a sentence for each repaired place."""
+        """Repair the order of lines, and remove repeated lines. Yield an entry for each repaired place."""
         order, places = in_order(self.runs)
         if not places:
             return
@@ -119,7 +121,7 @@ def _jumps(before: HandlerRun, after: HandlerRun) -> bool:
 
 
 def jumps_in(runs: list[HandlerRun]) -> list[int]:
-    """Return the positions of runs before which the agent's clock was probably changed."""
+    """Return the positions of handler runs before which the agent's clock was probably changed."""
     return [position for position, pair in enumerate(pairwise(runs), 1) if _jumps(*pair)]
 
 
@@ -150,8 +152,8 @@ class _DamagedLines:
 
 
 class TraceReader:
-    """Reads the lines of a trace in any condition. `incarnations` contains the parts of the trace between restarts, as
-    far as it was read.
+    """A reader for the lines of a trace in any condition. `incarnations` contains the parts of the trace between
+    restarts that were read so far.
 
     `gave_up` is true if further lines are not needed, because a limit is exceeded.
     """
@@ -240,14 +242,14 @@ class TraceReader:
             self.incarnations[-1].add_gap(0, 0)
 
     def _add_earlier_gap(self, number: int, lines: int, lost_bytes: int) -> None:
-        """Record lines that an earlier import reported as lost."""
+        """Record that an earlier import of this trace had lost lines at this place."""
         if self.incarnations:
             self.incarnations[-1].add_gap(lines, lost_bytes)
         what = "the part before this" if not lines else "1 line" if lines == 1 else f"{lines} lines"
         self._report(number, f"{what} {'were' if lines > 1 else 'was'} lost before this file was written")
 
     def finish(self, left_out: list[UnusedPart]) -> list[TraceIncarnation]:
-        """Return the parts of the trace. If there are any, descriptions of damage are added to `left_out`."""
+        """Return the parts of the trace. If there are any, add descriptions of the damage to `left_out`."""
         incarnations = [life for life in self.incarnations if life.runs or life.asides or life.header]
         left_out += self._left_out() if incarnations else ()
         places = [place for incarnation in incarnations for place in incarnation.put_in_order()]
@@ -274,7 +276,9 @@ class TraceReader:
 
 
 def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield (number, line, true if it has a line end). Of a line that is too long, only the last part is returned."""
+    """Yield (number, line, true if the line has a line end). Only the last part of a line that is too long is
+    returned.
+    """
     number, kept = 1, b""
     while text := file.readline(MAX_LINE_BYTES):
         if not text.endswith(b"\n") and len(text) == MAX_LINE_BYTES:
@@ -287,13 +291,13 @@ def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
 
 
 def _entry(line: bytes) -> TraceHeader | Entry | None:
-    """Return the entry in a line, or None if it is incomplete or has an impossible time."""
+    """Return the entry in a line. Return None if the entry is incomplete or has an impossible time."""
     entry = _parse(line)
     return entry if entry is None or isinstance(entry, TraceHeader) or 0 <= entry.t <= LATEST_S else None
 
 
 def _parse(line: bytes) -> TraceHeader | Entry | None:
-    """Return the entry in a line without a check of its time, or None if the entry is incomplete."""
+    """Return the entry in a line without a check of its time. Return None if the entry is incomplete."""
     if not any(word in line for word in _MARKERS):
         return None
     try:
@@ -314,7 +318,9 @@ def _texts_in_base64(entry: TraceHeader | Entry) -> Iterator[str]:
 
 
 def _recover_tail(text: bytes) -> tuple[int, TraceHeader | Entry] | None:
-    """Return the position and content of a complete entry at the end of a damaged line, or None."""
+    """Return the position and content of a complete entry at the end of a damaged line. Return None if there is no such
+    entry.
+    """
     start = max(text.rfind(beginning) for beginning in _BEGINNINGS)
     entry = _entry(text[start:]) if start > 0 else None
     return None if entry is None else (start, entry)

@@ -1,4 +1,4 @@
-"""Reconstruct a flight: write a scenario that reproduces it in virtual time.
+"""Reconstruct a flight: write a scenario that reproduces the flight in virtual time.
 
 The mission, settings and clock offsets come from the records (`_known_mission`, `_clock_offsets`). The inputs of an
 agent come from its trace (`_agent_inputs`), from other agents' records (`_other_records`), or are inferred from its

@@ -1,4 +1,4 @@
-"""Divide a trace into the inputs of the agent, each with the handler runs that it caused."""
+"""Divide a trace into the inputs of the agent, each with the handler runs that the input caused."""
 
 import base64
 import math
@@ -17,7 +17,7 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 
 
 class UnusableInputError(Exception):
-    """An error: an input is not recorded, or is impossible. The message is a sentence."""
+    """An error: an input is not recorded or is impossible. The message is a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,8 @@ Cause = EventLogged | DatagramReceived | TimerExpired | ReconcileRequested | Boo
 
 @dataclass(slots=True)
 class RecordedInput:
-    """One input of an agent. `at_s` is the time on the agent's clock, and `line` the line of its trace (from 1).
+    """One input of an agent. `at_s` is a time on the agent's clock, and `line` is the line number in the agent's trace
+    (from 1).
 
     `runs` are the handler runs that it caused, including those of local events. If the record `is_partial`, some of
     them may be lost.
@@ -70,7 +71,7 @@ class RecordedInput:
 
 
 class MissingInputs(Protocol):
-    """The other records that may contain inputs which a trace of version 1 lacks."""
+    """Records other than the trace of the agent. They may contain inputs that a trace of version 1 lacks."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]: ...
 
@@ -80,7 +81,8 @@ class MissingInputs(Protocol):
 def inputs_by_incarnation(
     trace: Trace, header: CheckedHeader, missing: MissingInputs
 ) -> tuple[list[list[RecordedInput]], str | None]:
-    """Return the inputs between restarts, and the reason why later inputs are unusable, or None.
+    """Return the inputs of each incarnation, and the reason why the inputs after them are unusable. The reason is None
+    if all inputs are usable.
 
     The reason names the line.
     """

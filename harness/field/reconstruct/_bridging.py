@@ -1,4 +1,5 @@
-"""Continue an agent after lost trace lines: guess inputs that lead to the next recorded state.
+"""Find the state of an agent after lost trace lines. For this, guess inputs that lead the agent to the next recorded
+state.
 
 The lost inputs are unknown, but their result is not: a chain, and the events in the current block. The inference plays
 the other agents of a swarm that already holds this chain. They answer each question of the agent, approve its blocks in
@@ -42,7 +43,7 @@ STEPS_PER_BLOCK = 200
 
 @dataclass(frozen=True)
 class KnownState:
-    """The state of an idle agent after lost lines. `why` is the reason why earlier lines are missing.
+    """The known state of an idle agent after lost trace lines. `why` is the reason why the lines are missing.
 
     `current_block` is None if it is empty, or its content has no later effect.
     """
@@ -53,7 +54,9 @@ class KnownState:
 
 
 class InferredInputPath:
-    """The guessed inputs that lead an agent to a known state, one after another. `reached` is true after success."""
+    """The guessed inputs that lead an agent to a known state. They are computed one at a time. `reached` is true when
+    the agent is in this state.
+    """
 
     def __init__(self, agent: Agent, known: KnownState) -> None:
         self.reached = False
@@ -71,7 +74,9 @@ class InferredInputPath:
             self._chain_hashes.append(top)
 
     def next(self, sent: Iterable[Message]) -> Cause | None:
-        """Return the next input, after the agent has sent these messages. Return None at the end."""
+        """Return the next input, given the messages that the agent has just sent. Return None if there is no further
+        input.
+        """
         self._left -= 1
         if self._left < 0 or not self._peers:
             return None
@@ -106,8 +111,8 @@ class InferredInputPath:
         return self._datagram(owner, CommitBlock(block, self._chain_hashes[held + 1]))
 
     def _log(self, event_data: bytes) -> Cause | None:
-        """Return the next event that is missing in the block under construction. Return None if none is missing, or if
-        the block has other events.
+        """Return the next event that is missing in the block under construction. Return None if no event is missing or
+        if the events in the block are different.
         """
         logged = bytes(self._agent.state.current_block)
         if not event_data.startswith(logged):
@@ -123,7 +128,7 @@ class InferredInputPath:
         return DatagramReceived(encode(sender, self._sequence, message))
 
     def _answer(self, message: Message) -> None:
-        """Answer a query in the way of agents that hold the known chain."""
+        """Answer a query as agents do that hold the known chain."""
         answer: Message
         known = {chain_hash: height for height, chain_hash in enumerate(self._chain_hashes)}
         chain = self._known.chain

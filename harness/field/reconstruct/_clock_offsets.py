@@ -1,4 +1,5 @@
-"""Estimate the offsets and drifts of the agents' clocks from the times of messages alone.
+"""Estimate the offsets and drifts of the agents' clocks. The only data are the times at which messages were sent and
+received.
 
 Each message was received after it was sent. Let t be the time on the clock of agent A, and u that on the clock of B.
 Then the messages from A to B are points (t sent, u received) above the line that converts t to u. The messages from B
@@ -35,11 +36,11 @@ class ClockLine:
         return self.offset_s + self.rate * t
 
     def at(self, shown: float) -> float:
-        """Return the time on the reference clock at which this clock shows `shown`."""
+        """Return the time on the reference clock at the moment when this clock shows `shown`."""
         return (shown - self.offset_s) / self.rate
 
     def after(self, first: "ClockLine") -> "ClockLine":
-        """Combine two relations of clocks. The result relates this clock to the reference clock of `first`."""
+        """Combine two clock relations. The result relates this clock to the reference clock of `first`."""
         return ClockLine(self.shows(first.offset_s), self.rate * first.rate)
 
     def inverse(self) -> "ClockLine":
@@ -103,7 +104,7 @@ def _height(hull: list[Point], rate: float, of: Callable[[Iterator[float]], floa
 
 
 def _hull(points: list[Point], side: int) -> list[Point]:
-    """Return the convex hull of the points on their lower (side 1) or upper (side -1) side."""
+    """Return the lower (`side` 1) or upper (`side` -1) part of the convex hull of the points."""
     hull: list[Point] = []
     for t, u in sorted(points, key=lambda point: (point[0], side * point[1])):
         if hull and hull[-1][0] == t:
@@ -119,7 +120,7 @@ def _turn(a: Point, b: Point, c: Point) -> float:
 
 
 def fit_line(above: list[Point], below: list[Point]) -> ClockLine:
-    """Return the line between two sets of points that has the greatest distance to both."""
+    """Return the line between two sets of points that is as far as possible from both sets."""
     lower, upper = _hull(above, 1), _hull(below, -1)
 
     def room(rate: float) -> float:

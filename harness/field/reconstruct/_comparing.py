@@ -1,4 +1,4 @@
-"""Compare simulated agents with the records: first each agent alone, and then the whole flight."""
+"""Compare simulated agents with the records. First simulate each agent alone, and then the whole flight."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +31,8 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True)
 class FirstDifference:
-    """The first step at which the simulation differs from a record. `at_s` is the mission second in the reconstruction.
+    """The first step at which the simulation differs from a record. `at_s` is a mission second of the reconstructed
+    scenario.
 
     `line` is the line of the trace, None if the record has no further steps. `recorded` and `played` describe both
     steps.
@@ -60,7 +61,7 @@ PlayedStep = tuple[float, int | None, HandlerRun]
 def first_difference(
     table: InputTimetable, rehearsals: Mapping[int, SoloSimulation], simulated: Simulated
 ) -> FirstDifference | None:
-    """Return the earliest difference in mission time, or None if all steps with an effect are equal."""
+    """Return the difference with the earliest mission time. Return None if all steps that have an effect are equal."""
     differences = []
     for agent_id in rehearsals:
         recorded = [*_effective(_recorded(table, agent_id))]
@@ -82,7 +83,7 @@ def _played(trace: Trace | None) -> Iterator[PlayedStep]:
 
 
 def _effective(steps: Iterable[PlayedStep]) -> Iterator[PlayedStep]:
-    """Yield the steps, except messages that only changed a vote count."""
+    """Yield the steps that have an effect. Messages that only changed a vote count are left out."""
     return (
         step for step in steps if step[2].changes or step[2].sent or not isinstance(step[2].trigger, MessageTrigger)
     )
@@ -120,7 +121,7 @@ RecordedInputs = Sequence[Sequence[RecordedInput]]
 
 
 class SoloSimulations:
-    """Simulates each agent alone with its recorded inputs.
+    """The simulations of single agents. Each agent is simulated alone with its recorded inputs.
 
     `rehearsals` has each agent that can be played, and `why` the reasons for incomplete ones.
     """
@@ -135,7 +136,7 @@ class SoloSimulations:
 
     @property
     def remarks(self) -> list[str]:
-        """Sentences about assumptions and findings of the reconstruction."""
+        """Sentences about the assumptions and findings of the reconstruction."""
         if not self._by_captures:
             return self._remarks
         which = agents(self._by_captures)
@@ -183,8 +184,8 @@ class SoloSimulations:
     def _explain_deviations(
         self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: SoloSimulation
     ) -> SoloSimulation:
-        """Explain the deviations of an agent by a known error, if possible. Otherwise simulate the agent up to the
-        first deviation.
+        """Explain the deviations of an agent by a known programming error, if possible. Otherwise simulate the agent up
+        to the first deviation.
         """
         agent_id, finding = header.agent_id, judged.first_finding
         parts: Incarnations = judged.with_known_states(incarnations) if judged.lost else incarnations
@@ -209,7 +210,9 @@ class SoloSimulations:
     def _play_around_lost_lines(
         self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: SoloSimulation
     ) -> SoloSimulation:
-        """Simulate an agent without deviations. Inputs on lost lines are replaced by guessed inputs if possible."""
+        """Simulate an agent whose recorded steps follow the protocol. Inputs on lost lines are replaced by guessed
+        inputs if possible.
+        """
         agent_id = header.agent_id
         early = (
             rehearse(header, incarnations, tolerance=ToleratedDeviations(early_timers=True))
@@ -235,7 +238,7 @@ class SoloSimulations:
     def _name_alternative(
         self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, at: ProtocolDeviation
     ) -> None:
-        """Add a remark if a single damaged line and a known error explain the trace equally well."""
+        """Add a remark if damage to a single line explains the trace as well as a known programming error does."""
         doubt = next((sentence for sentence in judged.lost if f" {PERHAPS} " in sentence), None)
         if doubt is None:
             return
@@ -261,8 +264,8 @@ class SoloSimulations:
             )
 
     def _by_capture(self, header: CheckedHeader, by_trace: SoloSimulation | None) -> SoloSimulation | None:
-        """Return the simulation that explains more inputs: the one by the trace, or one by the packet capture if
-        needed.
+        """Return the simulation that explains more inputs: the given one from the trace, or one from the packet
+        capture.
         """
         agent_id = header.agent_id
         export, capture = self._flight.exports.get(agent_id), self._other_records.captures.get(agent_id)
@@ -282,7 +285,8 @@ class SoloSimulations:
     def _explain_by_quirk(
         self, header: CheckedHeader, incarnations: Incarnations, at: ProtocolDeviation
     ) -> SoloSimulation | None:
-        """Return a simulation with a known error that explains the whole record, or None.
+        """Return a simulation in which a known programming error explains the whole record. Return None if there is no
+        such error.
 
         Quirks of the handlers that ran at the deviation are tried first.
         """
@@ -310,8 +314,8 @@ class SoloSimulations:
         return explaining[names[0]]
 
     def _explain_by_tolerance(self, header: CheckedHeader, incarnations: Incarnations) -> SoloSimulation | None:
-        """Return a simulation that allows ignored messages or early timers, if it gives the recorded chain. Otherwise
-        None.
+        """Return a simulation in which the agent may ignore messages or let timers expire early, if the record has no
+        deviation then. Return None otherwise.
         """
         agent = f"agent {header.agent_id}"
         ignoring = rehearse(header, incarnations, tolerance=ToleratedDeviations(ignoring=True))

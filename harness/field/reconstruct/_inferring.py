@@ -1,4 +1,5 @@
-"""Guess the inputs of an agent without a complete trace, from its packet capture and the events in its blocks.
+"""Guess the inputs of an agent that has no complete trace. The sources are its packet capture and the events in its
+blocks.
 
 The capture contains the received and sent datagrams with their times. The blocks contain the logged events. The expiry
 of timers is not recorded. Usually a timer expires on time, but a process is sometimes late, and another input may then
@@ -61,8 +62,8 @@ SENT_ON_TIMER_EXPIRY = (BlockAddRequest, CommitBlock, ChainContainQuery, ChainHa
 
 @dataclass
 class InferredInputs:
-    """The guessed inputs that explain the sent datagrams, by restart. `problem` names the first unexplained
-    datagram.
+    """The guessed inputs of each incarnation, which explain the sent datagrams. `problem` names the first datagram that
+    they do not explain.
     """
 
     incarnations: list[list[RecordedInput]] = field(default_factory=list)
@@ -84,7 +85,7 @@ class _IncarnationRecord:
     is_last: bool
 
     def since(self, at_s: float) -> "_IncarnationRecord":
-        """Return the records of the agent after its restart at `at_s`."""
+        """Return the records of the agent from its restart at `at_s` on."""
         received = [sighting for sighting in self.received if sighting.at_s >= at_s]
         logged_events = [timed for timed in self.logged_events if timed[0] >= at_s]
         return _IncarnationRecord(received, self.sent, logged_events, self.is_last)
@@ -111,7 +112,9 @@ def infer(
 
 
 def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent]) -> Iterator[_IncarnationRecord]:
-    """Yield the records between restarts. After a restart, an agent numbers its datagrams from 0 again."""
+    """Yield the records of each incarnation. A restart is found because the agent numbers its datagrams from
+    0 again.
+    """
     received = [sighting for sighting in capture.sightings if not sighting.outbound and sighting.at_s >= 0]
     sent = [sighting for sighting in capture.sightings if sighting.outbound]
     logged_events = [(seconds_of(event, capture), event) for event in events]
@@ -128,7 +131,7 @@ def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent])
 
 
 def _last_seen(received: Sequence[CapturedDatagram], last_s: float, restart_s: float) -> float:
-    """Return a time until which the agent certainly ran. A running agent would have answered the next query."""
+    """Return a time until which the agent certainly ran. It ran until the first query that it did not answer."""
     later = (sighting for sighting in received if last_s < sighting.at_s)
     questions = (sighting.at_s for sighting in later if isinstance(decode(sighting.datagram).message, ANSWERED_QUERIES))
     return min(next(questions, restart_s), restart_s)
@@ -137,8 +140,8 @@ def _last_seen(received: Sequence[CapturedDatagram], last_s: float, restart_s: f
 def _infer_restarted(
     header: CheckedHeader, record: _IncarnationRecord, late_s: float, stored: StoredState, tries: int
 ) -> "_InputSequence":
-    """Guess the inputs after a restart that happened some time before the first datagram, with or without data on the
-    disk.
+    """Guess the inputs after a restart with or without data on the disk. The restart happened some time before the
+    first sent datagram.
     """
     first_s = record.sent[0].at_s if record.sent else NEVER
     times = sorted(
@@ -167,7 +170,9 @@ def _infer_incarnation(
     tries: int,
     start_s: float = 0.0,
 ) -> "_InputSequence":
-    """Return the order of inputs that explains the most datagrams."""
+    """Try different orders of the inputs. Return the order that explains all sent datagrams, or the one that explains
+    the longest sequence of inputs.
+    """
     deferred: dict[int, int] = {}
     pauses: list[Pause] = []
     best: _InputSequence | None = None
@@ -188,7 +193,9 @@ def _infer_incarnation(
 
 
 def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
-    """Choose the next order to try, by changing the last timer that allows it. Return False if there is none."""
+    """Choose the next order of inputs to try, by changing the last timer that allows a change. Return false if no timer
+    does.
+    """
     for place in range(len(choices) - 1, -1, -1):
         if deferred.get(place, 0) < choices[place]:
             deferred[place] = deferred.get(place, 0) + 1
@@ -199,7 +206,7 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 
 
 class _InputSequence:
-    """One possible order of an agent's inputs between two restarts.
+    """One possible order of the inputs of an agent in one incarnation.
 
     `deferred` maps timers, by number, to their deviation from the likely order.
     """
@@ -242,7 +249,7 @@ class _InputSequence:
         self._now = start_s
 
     def stored_at_end(self) -> StoredState:
-        """Return the data on the agent's disk at the end."""
+        """Return the data on the agent's disk after all these inputs."""
         agent = _agent(self._header)
         for played in self.inputs:
             _feed(agent, played.at_s, played.cause, self._stored)
@@ -270,7 +277,8 @@ class _InputSequence:
             self._fail(self._sent[self._explained])
 
     def _end_of_pause(self, at_s: float, after_s: float = 0.0) -> float:
-        """Return the time at which an input is handled, if the agent was paused when the input arrived.
+        """Return the time at which an input is handled that arrives at `at_s`. If the agent was paused then, this is
+        the end of the pause.
 
         After a pause, the process first reads its socket, then it handles timers, then events.
         """
@@ -281,8 +289,8 @@ class _InputSequence:
         return None if deadline is None else self._end_of_pause(deadline, JUST_AFTER_S)
 
     def _begin_requested_reconcile(self, next_s: float) -> bool:
-        """Return true if a reconcile begins before the next input. Such a reconcile must have been requested by the
-        operator.
+        """Begin a reconcile if the capture shows that one began before the next input. The operator must have requested
+        it. Return true in this case.
         """
         if self._explained == len(self._sent) or self._agent.state.reconcile_in_progress:
             return False
@@ -293,7 +301,7 @@ class _InputSequence:
         return True
 
     def _expire_timer(self, deadline: float, position: int) -> int:
-        """Let the timer expire after the inputs that precede it. Return the position of the next input."""
+        """Let the timer expire after the inputs that precede its expiry. Return the position of the next input."""
         count, fewest, most = self._inputs_before_timer(deadline, position)
         place = len(self.choices)
         self.choices.append(most - fewest)
@@ -357,7 +365,7 @@ class _InputSequence:
             self.inputs.append(RecordedInput(now, 0, cause, runs))
 
     def _detect_pause(self, since_s: float) -> None:
-        """Record a pause if the agent sent nothing for a long time although it should have."""
+        """Record a pause if the agent sent nothing for a long time although it should have sent a message."""
         until_s = self._sent[self._explained].at_s if self._explained < len(self._sent) else NEVER
         if since_s + self._late_s < until_s < NEVER:
             self.pause = since_s, until_s

@@ -1,4 +1,4 @@
-"""Compare a trace with the reference implementation, and find the parts whose inputs can be simulated."""
+"""Compare a trace with the reference implementation. Find the parts of the trace whose inputs can be simulated."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,7 +22,9 @@ class JudgedTrace:
     """
 
     def __init__(self, flight: Flight, agent_id: int) -> None:
-        """Compare the trace. Raises FieldError if the trace does not contain inputs."""
+        """Compare the trace with the reference implementation. Raises FieldError if the trace does not
+        contain inputs.
+        """
         trace = flight.traces[agent_id]
         record = RecordedTrace(Path(f"agent {agent_id}"), "", trace, IngestedRecords(flight), [])
         player = RecordPlayer(record)
@@ -49,13 +51,15 @@ class JudgedTrace:
 
     @property
     def first_finding(self) -> str | None:
-        """The first deviation from the reference implementation as a sentence, or None."""
+        """A sentence about the first deviation from the reference implementation. None if there is no deviation."""
         return self.deviations[0].sentence(self._names.of) if self.deviations else None
 
     def with_known_states(
         self, incarnations: Sequence[Sequence[RecordedInput]]
     ) -> list[list[RecordedInput | KnownState]]:
-        """Return the inputs that can be simulated, with a known state in place of lost inputs."""
+        """Return the inputs that can be simulated. Lost inputs are replaced by the known state of the agent
+        after them.
+        """
         parts = [[*self._parts(inputs)] for inputs in incarnations]
         for before, after in zip(parts, incarnations[1:], strict=False):
             if after and isinstance(after[0].cause, BootedFromDisk) and (disk := _disk(after[0])) is not None:
@@ -74,7 +78,9 @@ class JudgedTrace:
             yield from (self._known[id(run)] for run in recorded.runs if id(run) in self._known)
 
     def _state_at_export(self) -> KnownState | None:
-        """Return the state in the export, if the agent was idle then and its last trace lines are lost."""
+        """Return the state in the export as the known state at the end. Return None if the agent was not idle when it
+        exported its chain.
+        """
         export = self._export
         if export is None or not export.idle or export.blocks_to_be_committed or export.reconcile_stack:
             return None
@@ -84,7 +90,9 @@ class JudgedTrace:
 
 
 def _disk(boot: RecordedInput) -> KnownState | None:
-    """Return the recorded content of the disk at a restart, or None if some of its blocks were not committed yet."""
+    """Return the recorded content of the disk at a restart. Return None if some of its blocks were not yet
+    committed.
+    """
     run = boot.runs[0]
     try:
         blocks = [*stored_blocks(run.input)]

@@ -1,4 +1,4 @@
-"""Find the mission and the settings of a flight, which are recorded or guessed from the sent messages.
+"""Find the mission and the settings of a flight. They are recorded, or must be guessed from the sent messages.
 
 Some settings are visible in messages and blocks: whether votes name a chain, and the size of a full block. For the
 others, each value is tried alone, and the one that explains the most messages is assumed.
@@ -30,11 +30,15 @@ TRIES = 10
 def likely_settings(
     other_records: OtherRecords, captures: dict[int, AgentCapture], header_of: Callable[[int, Settings], CheckedHeader]
 ) -> Settings:
-    """Return the settings that explain the most datagrams of the agents with packet captures."""
+    """Return the settings with which the inputs of the most agents can be guessed completely from their packet
+    captures.
+    """
     events = {agent_id: other_records.events(agent_id) for agent_id in captures}
 
     def explained(settings: Settings) -> tuple[int, int]:
-        """Return the number of completely explained agents, and the number of explained inputs."""
+        """Return the number of agents whose inputs are completely explained, and the number of explained inputs of all
+        agents.
+        """
         inferred = [
             infer(header_of(agent_id, settings), capture, events[agent_id], tries=TRIES)
             for agent_id, capture in captures.items()
@@ -64,7 +68,7 @@ def _alternatives(visible: Settings) -> Iterator[Settings]:
 
 
 def _visible_settings(other_records: OtherRecords) -> Settings:
-    """Return the settings that can be seen in messages and blocks."""
+    """Return the settings that messages and blocks reveal."""
     votes = (decode(datagram).message for datagram in other_records.all_datagrams())
     names_chain = any(isinstance(vote, BlockAddResponse) and vote.chain_hash is not None for vote in votes)
     default = Settings()
@@ -76,7 +80,9 @@ def _visible_settings(other_records: OtherRecords) -> Settings:
 
 
 def _max_block_bytes(blocks: Iterable[bytes], largest: int) -> int:
-    """Return the setting max_block_bytes. A block is full when another event of the largest size might not fit."""
+    """Return the setting max_block_bytes, as the blocks reveal it. A block is full when an event of the largest size
+    might not fit into it.
+    """
     least, most = largest, MAX_EVENT_DATA_BYTES
     for event_data in blocks:
         last = _last_event_bytes(event_data)
@@ -111,7 +117,7 @@ class MissionConfiguration:
 def known_mission(
     flight: Flight, other_records: OtherRecords, name: str, remarks: list[str]
 ) -> tuple[MissionConfiguration, dict[int, CheckedHeader]]:
-    """Return the mission, and the trace header of each agent with enough records.
+    """Return the mission, and the trace header of each agent that has enough records to be simulated.
 
     Raises FieldError if no agent has enough.
     """
@@ -151,7 +157,7 @@ def _in_words(settings: Settings) -> str:
 
 
 def _initial_data(flight: Flight) -> str | None:
-    """Return the data of the inception block in base64, or None if they are unknown."""
+    """Return the data of the inception block in base64. Return None if the data are unknown."""
     if flight.initial_data is not None:
         return base64.b64encode(flight.initial_data).decode("ascii")
     return next((export.inception.block_data for export in flight.exports.values()), None)

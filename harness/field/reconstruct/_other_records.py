@@ -62,7 +62,7 @@ class OtherRecords:
         self._event_data = {block_hash: self._open(block) for block_hash, block in self._blocks.items()}
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
-        """Return the datagrams of a sender with this sequence number.
+        """Return the datagrams with this sender and this sequence number.
 
         Several if it restarted, or if an attacker imitated it.
         """
@@ -73,7 +73,7 @@ class OtherRecords:
         return {sender for sender, _ in self._datagrams}
 
     def all_datagrams(self) -> Iterator[bytes]:
-        """Yield each different datagram of the flight once."""
+        """Yield each datagram of the flight. Equal datagrams are yielded once."""
         for datagrams in self._datagrams.values():
             yield from datagrams
 
@@ -82,7 +82,9 @@ class OtherRecords:
         return [*self._event_data.values()]
 
     def with_seal(self, header: CheckedHeader) -> CheckedHeader:
-        """Return the header with the encrypted event data of the agent, if its mission encrypts them."""
+        """Return the header of a trace. If the mission encrypts event data, add the recorded encrypted data of the
+        agent.
+        """
         if sealed_to(header.initial_data) is None:
             return header
         max_block_bytes = min(header.settings.max_block_bytes, MAX_EVENT_DATA_BYTES - SEAL_BYTES)
@@ -94,7 +96,7 @@ class OtherRecords:
         return replace(header, settings=settings, seal=RecordedSeals(self.sealed[header.agent_id]))
 
     def events(self, agent_id: int) -> list[LoggableEvent]:
-        """Return the known events of an agent in order, including those of its block under construction."""
+        """Return the known events of an agent in order, including the events in its block under construction."""
         export = self._exports.get(agent_id)
         own = [block for block in self._blocks.values() if block.agent_id == agent_id]
         data = [self._event_data[block.block_hash.hex()] for block in sorted(own, key=lambda block: block.timestamp_us)]
@@ -112,7 +114,9 @@ class OtherRecords:
         return events
 
     def _open(self, block: Block) -> bytes:
-        """Return the event data of a block, decrypted if possible."""
+        """Return the event data of a block in decrypted form, if the key of the depot decrypts them. Otherwise return
+        them unchanged.
+        """
         if self._depot is None:
             return block.event_data
         from ucp.secure.sealing import NotOpenedError
@@ -126,7 +130,9 @@ class OtherRecords:
 
     @property
     def _reason_unreadable(self) -> str:
-        """The reason why encrypted event data cannot be divided into events, or "" if they are not encrypted."""
+        """The reason why event data cannot be divided into events, as the end of a sentence. It is "" if they are not
+        encrypted.
+        """
         exports = self._exports.values()
         if not any(sealed_to(base64.b64decode(export.inception.block_data)) for export in exports):
             return ""
@@ -145,7 +151,7 @@ class OtherRecords:
 
 
 def _seals(trace: Trace) -> Iterator[tuple[bytes, bytes]]:
-    """Yield each event that completed a block, with the encrypted data of the block."""
+    """Yield each event that completed a block, together with the encrypted data of this block."""
     for run in trace.runs:
         if (sealed := sealed_of(run.sealed)) is not None and run.input is not None:
             with suppress(ValueError, MalformedEventsError):

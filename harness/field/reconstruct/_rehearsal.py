@@ -1,4 +1,4 @@
-"""Simulate one agent alone with its recorded inputs, to find how far its record follows the protocol.
+"""Simulate one agent alone with its recorded inputs, to find out how far its record follows the protocol.
 
 The agent core, or a core with a known quirk, plays each recorded input at its recorded time. The resulting handler
 runs must equal the recorded ones. The reference cannot play: the scenario needs agents, and known quirks exist only
@@ -40,8 +40,8 @@ MAX_NAME = 40
 
 @dataclass(frozen=True, slots=True)
 class TimerStart:
-    """A timer that the agent started. `number` counts its timers, and `place` is the position of the input that started
-    it.
+    """A timer that the agent started. `number` counts the timers of the agent, and `place` is the position of the input
+    that started this timer.
 
     `duration_s` is measured on the agent's own clock.
     """
@@ -65,7 +65,7 @@ class ProtocolDeviation:
 
 @dataclass(slots=True)
 class PlayedInput:
-    """An input that can be simulated again. `sent` contains the datagrams that it caused.
+    """An input that was simulated and can be simulated again. `sent` contains the datagrams that the input caused.
 
     `matters` is false for a message that no handler uses. `expired` is the timer that expired, if the input is that.
     `stopped` are timers that were stopped before their expiry.
@@ -81,8 +81,8 @@ class PlayedInput:
 
 @dataclass
 class SoloSimulation:
-    """The simulation of one agent with its recorded inputs. `played` contains the inputs up to `deviation`, if there is
-    one.
+    """The simulation of one agent with its recorded inputs. If the record deviates from the protocol, `played` contains
+    only the inputs before `deviation`.
 
     `chain` has the block hashes of the agent's chain at that point. `running_at_end` has the timers that ran at the end
     of each incarnation.
@@ -108,7 +108,7 @@ class SoloSimulation:
 
 @dataclass(frozen=True, slots=True)
 class ToleratedDeviations:
-    """The kinds of deviations to ignore: timers that expire early, and ignored messages."""
+    """The kinds of deviations to ignore. Timers may expire early, and the agent may ignore messages."""
 
     early_timers: bool = False
     ignoring: bool = False
@@ -183,7 +183,9 @@ class _IncarnationSimulation:
         return [*self._running_timers.values()]
 
     def bridge(self, known: KnownState) -> bool:
-        """Guess and simulate inputs that lead the agent to this state. Return true on success."""
+        """Guess inputs that lead the agent to the state `known`, and simulate them. Return true if the agent reaches
+        the state.
+        """
         bridge = InferredInputPath(self.agent, known)
         sent: list[Message] = []
         while (cause := bridge.next(sent)) is not None:
@@ -207,7 +209,7 @@ class _IncarnationSimulation:
     def play(
         self, index: int, recorded_input: RecordedInput, stored: StoredState | None, *, is_last: bool
     ) -> ProtocolDeviation | None:
-        """Simulate an input. Return the deviation if the result differs from the record, otherwise None."""
+        """Simulate an input. Return the deviation if the result differs from the record. Return None otherwise."""
         expired = (
             self._timers.running.get(recorded_input.cause.name)
             if isinstance(recorded_input.cause, TimerExpired)
@@ -243,14 +245,16 @@ class _IncarnationSimulation:
         return None
 
     def _sent(self, recorded_input: RecordedInput) -> list[bytes]:
-        """Return the sent datagrams as recorded. If the record lacks them, return those of the simulated agent."""
+        """Return the datagrams that the record contains as sent. If the record lacks them, return those of the
+        simulated agent.
+        """
         encoded = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
         recorded = [sent.datagram for run in recorded_input.runs for sent in run.sent]
         both = zip(encoded, recorded, strict=False)
         return [our if their is None else base64.b64decode(their.text) for our, their in both]
 
     def _follow_timers(self, played: PlayedInput, ended: RunningTimer | None) -> None:
-        """Record the timers that the input started, and those that no longer run."""
+        """Record the timers that the input started, and the timers that it stopped."""
         place, before = len(self._rehearsal.played), self._running_timers
         self._timers.update(self.agent.state)
         self._running_timers = {}
@@ -262,7 +266,7 @@ class _IncarnationSimulation:
         played.stopped = [started for number, started in before.items() if number not in self._running_timers]
 
     def _feed(self, recorded_input: RecordedInput, stored: StoredState | None) -> str | None:
-        """Give an input to the simulated agent. Return the reason if the input is impossible, otherwise None."""
+        """Give an input to the simulated agent. Return the reason if the input is impossible. Return None otherwise."""
         agent, now = self.agent, recorded_input.at_s
         match recorded_input.cause:
             case EventLogged(event):
@@ -288,7 +292,7 @@ class _IncarnationSimulation:
         return None
 
     def _matters(self, datagram: bytes) -> bool:
-        """Return true if a correct agent uses the datagram."""
+        """Return true if an agent that follows the protocol uses the datagram."""
         try:
             sender, _, message = decode(datagram)
         except MalformedDatagramError:
@@ -299,7 +303,7 @@ class _IncarnationSimulation:
         return MATTERS[type(message)](agent.state, sender, message)
 
     def _ignores(self, recorded_input: RecordedInput) -> bool:
-        """Return true if the agent ignored a message that should have had an effect."""
+        """Return true if the recorded agent ignored a message that should have had an effect."""
         if not isinstance(recorded_input.cause, DatagramReceived) or any(
             run.changes or run.sent for run in recorded_input.runs
         ):
@@ -321,7 +325,7 @@ def _matches_exactly(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -
 
 
 def _difference(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | None:
-    """Return a description of the first difference that has an effect, or None."""
+    """Return a description of the first difference that has an effect. Return None if there is no such difference."""
     runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
     for ours, theirs in zip_longest(runs, recorded):
         if ours is None:

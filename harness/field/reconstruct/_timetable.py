@@ -32,8 +32,8 @@ MAX_CLOCK_ERROR_S = 1.0
 
 @dataclass(slots=True)
 class TimedInput:
-    """An input of an agent at mission second `at_s`. `number` counts the sender's datagrams, or is None for another
-    input.
+    """An input of an agent at mission second `at_s`. If the input is a datagram of a simulated agent, `sender` and
+    `number` identify the datagram.
 
     `late_s` is the delay of an expired timer.
     """
@@ -47,8 +47,8 @@ class TimedInput:
 
 @dataclass
 class IncarnationTimes:
-    """The mission seconds of the first and last input between two restarts. `boots` is true if the agent began with
-    data on its disk.
+    """The mission seconds of the first and the last input of an incarnation. `boots` is true if the incarnation began
+    with data on the disk.
 
     The incarnation existed at `present_s`: the first message that it received was sent then, or another input came.
     """
@@ -62,7 +62,7 @@ class IncarnationTimes:
 
 @dataclass
 class InputTimetable:
-    """The inputs of all agents in mission time. `clocks` relates each agent's clock to mission time.
+    """The inputs of all agents in mission time. Each element of `clocks` relates an agent's clock to mission time.
 
     `contradictions` has a sentence for each record that no order of inputs explains.
     """
@@ -95,7 +95,7 @@ class InputTimetable:
 
 
 def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, float] = {}) -> InputTimetable:
-    """Return the inputs on one time axis. `ahead_s` relates the clocks of agents to GPS time."""
+    """Return the inputs of all agents on one time axis. `ahead_s` relates the clocks of the agents to GPS time."""
     senders = _DatagramsBySender(rehearsals)
     clocks = estimate(rehearsals, senders.deliveries(), ahead_s)
     clocks = _from_zero(clocks, rehearsals)
@@ -103,7 +103,7 @@ def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, fl
 
 
 def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSimulation]) -> dict[int, ClockLine]:
-    """Return the clocks of all agents relative to mission time.
+    """Return the clocks of all agents relative to mission time, which has a new second 0.
 
     Mission second 0 is the time at which the first clock shows 0. If the first input is earlier, or much later, mission
     second 0 is directly before it.
@@ -121,7 +121,7 @@ def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSim
 
 
 class _DatagramsBySender:
-    """The datagrams that each simulated agent sent, and their receivers among the simulated agents."""
+    """The datagrams that each simulated agent sent. The simulated agents that received them can be found."""
 
     def __init__(self, rehearsals: Mapping[int, SoloSimulation]) -> None:
         self._rehearsals = rehearsals
@@ -137,7 +137,7 @@ class _DatagramsBySender:
                     self._sent_by[agent].append(place)
 
     def of(self, datagram: bytes, receiver: int) -> list[tuple[int, int]]:
-        """Return (agent, number) for each time that an agent other than the receiver sent the datagram."""
+        """Return (agent, number) for each time that the datagram was sent by an agent that is not the receiver."""
         return [sent for sent in self._numbers.get(datagram, ()) if sent[0] != receiver]
 
     def sent_s(self, agent: int, number: int) -> float:
@@ -145,7 +145,7 @@ class _DatagramsBySender:
         return self._rehearsals[agent].played[self._sent_by[agent][number]].input.at_s
 
     def deliveries(self) -> list[DeliveredMessage]:
-        """Return the datagrams that were sent exactly once, with each of their receptions."""
+        """Return one delivery for each reception of a datagram that was sent exactly once."""
         found = []
         for receiver, rehearsal in self._rehearsals.items():
             for played in rehearsal.played:
@@ -191,7 +191,9 @@ class _TimetablePlanner:
         return self._table
 
     def _queue(self, agent: int) -> None:
-        """Mark the next relevant input of the agent as ready, or as waiting until a message is sent."""
+        """Find the next relevant input of the agent. It is ready, or it waits until another agent has sent
+        the message.
+        """
         played = self._played[agent]
         place = self._next[agent]
         while place < len(played) and not played[place].matters:
@@ -209,8 +211,8 @@ class _TimetablePlanner:
         return self._table.clocks[agent].at(self._played[agent][place].input.at_s)
 
     def _sent(self, agent: int, place: int) -> tuple[int, int] | None:
-        """Return (sender, number) of the arriving datagram, or None for other inputs and for datagrams of unknown
-        origin.
+        """Return (sender, number) of the datagram that arrives with this input. Return None for other inputs, and for a
+        datagram of unknown origin.
         """
         cause = self._played[agent][place].input.cause
         if not isinstance(cause, DatagramReceived) or (agent, place) in self._as_strays:
@@ -223,7 +225,7 @@ class _TimetablePlanner:
         return before[-1] if before else candidates[0]
 
     def _break_cycle(self) -> None:
-        """Resolve a deadlock in which each agent waits for a later message of another one.
+        """Resolve a deadlock in which each agent waits for a message that another agent has not yet sent.
 
         The earliest waiting input becomes a stray.
         """
@@ -281,7 +283,9 @@ class _TimetablePlanner:
         self._queue(agent)
 
     def _expiry(self, agent: int, timer: TimerStart) -> tuple[float, float]:
-        """Return the time at which a timer expires without delay, on the agent's clock and in mission seconds."""
+        """Return the time at which a timer would expire without delay, once on the agent's clock and once in mission
+        seconds.
+        """
         expiry_local = self._at[agent][timer.place] + timer.duration_s
         return expiry_local, self._table.clocks[agent].at(expiry_local)
 

@@ -1,4 +1,6 @@
-"""Write the inputs of all agents as a scenario with exact events, datagrams, timer delays and faults."""
+"""Write the inputs of all agents as a scenario. The scenario contains exact events, datagrams, timer delays
+and faults.
+"""
 
 import base64
 import dataclasses
@@ -64,7 +66,7 @@ def scenario_document(
 
 
 def _all_incarnations(known: Sequence[IncarnationTimes], count: int) -> list[IncarnationTimes]:
-    """Return the times between all restarts of an agent, including those without inputs."""
+    """Return the times of all incarnations of an agent, including the incarnations without inputs."""
     incarnations: list[IncarnationTimes] = []
     by_number = {incarnation.number: incarnation for incarnation in known}
     for number in range(count):
@@ -74,8 +76,8 @@ def _all_incarnations(known: Sequence[IncarnationTimes], count: int) -> list[Inc
 
 
 def _start_times(incarnations: Sequence[IncarnationTimes]) -> list[float]:
-    """Return the start times of an agent: 0 at first, then each restart, or just before the first reception after
-    it.
+    """Return the start times of an agent's incarnations. The first one starts at 0. The others start at the recorded
+    restart, or just before their first reception.
     """
     start_times = [0.0]
     for before, incarnation in pairwise(incarnations):
@@ -125,7 +127,7 @@ def _events(table: InputTimetable, sealed: Sealed) -> list[Document]:
 
 
 class _StrayDatagrams:
-    """The datagrams that the scenario must deliver itself, because no agent in it sends them."""
+    """The datagrams that no agent in the scenario sends. The scenario must deliver them itself."""
 
     def __init__(self) -> None:
         self._reached: dict[bytes, list[dict[int, float]]] = defaultdict(list)
@@ -165,7 +167,7 @@ def _fates(
     incarnations: Mapping[int, Sequence[IncarnationTimes]],
     strays: _StrayDatagrams,
 ) -> Iterator[Document]:
-    """Yield the scripted deliveries of all datagrams that arrive.
+    """Yield the scripted delivery of each datagram that arrives.
 
     All others are lost. Datagrams that no agent can send to the receiver become strays.
     """
@@ -188,7 +190,7 @@ def _fates(
 
 
 def _can_be_sent(timed_input: TimedInput, table: InputTimetable, start_times: Sequence[float]) -> bool:
-    """Return true if the receiver was already running when the datagram was sent."""
+    """Return true if a simulated agent sent the datagram while the receiver was already running."""
     if timed_input.sender is None or timed_input.number is None:
         return False
     return table.sent_at_s[timed_input.sender][timed_input.number] >= start_times[timed_input.played.incarnation]
@@ -223,7 +225,7 @@ def _entries(
 
 
 def _pauses(table: InputTimetable) -> Iterator[tuple[float, Document]]:
-    """Yield a pause for each agent that did nothing while a timer was long overdue."""
+    """Yield a pause for each time that an agent did nothing although a timer was long overdue."""
     for agent, inputs in table.inputs.items():
         pause_starts: set[float] = set()
         for index, timed_input in enumerate(inputs):

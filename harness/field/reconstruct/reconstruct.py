@@ -1,4 +1,4 @@
-"""Reconstruct a flight as a scenario, write the scenario, and verify that it reproduces the flight."""
+"""Reconstruct a flight as a scenario, write the scenario to a file, and verify that it reproduces the flight."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,8 +34,8 @@ SEED = 1
 
 @dataclass(frozen=True)
 class AgentOutcome:
-    """The result for one agent: the number of blocks in its simulated chain, and the reason `why` it differs from the
-    recorded chain, or None.
+    """The result for one agent: the number of blocks in its simulated chain, and the reason `why` this chain differs
+    from the recorded one. `why` is None if they are equal.
     """
 
     agent_id: int
@@ -62,8 +62,8 @@ class Reconstruction:
 
     @property
     def problems(self) -> list[str]:
-        """Sentences about the parts that are not reproduced. The first difference is first, and there is none if all is
-        reproduced.
+        """Sentences about the parts of the flight that are not reproduced. The sentence about the first difference is
+        first.
         """
         first = [self.difference.sentence] if self.difference else []
         return first + [f"agent {agent.agent_id} {agent.why}" for agent in self.agents if agent.why]
@@ -127,8 +127,8 @@ def reconstruct(
     depot: "Depot | None" = None,
     keys: "PublicKeys | None" = None,
 ) -> Reconstruction:
-    """Reconstruct a flight. `report_progress` is called with a text at each step. Raises FieldError without usable
-    records.
+    """Reconstruct a flight. `report_progress` is called with a text at each step. Raises FieldError if no record is
+    usable.
 
     In a secured mission, `opener` decrypts captures, `depot` decrypts blocks, and `keys` are public keys that the user
     trusts.
@@ -187,7 +187,7 @@ def reconstruct(
 
 
 def _check_signatures(flight: Flight, keys: "PublicKeys | None", remarks: list[str]) -> list[str]:
-    """Return a sentence about each wrong signature. Add a remark if no signature confirms the exports."""
+    """Return a sentence about each wrong signature. Add a remark if the exports are not confirmed by signatures."""
     trusted = TrustedKeys(keys, "--keys") if keys is not None else None
     if trusted is None and flight.public_keys is not None:
         trusted = TrustedKeys(flight.public_keys, None)
@@ -236,7 +236,7 @@ def _blocks(simulated: Simulated, agent_id: int) -> int:
 
 
 def _expected(simulated: Simulated, reproduced: set[int]) -> Document:
-    """Return the expected results of the scenario: the reproduced chains, and the bad verdicts of the flight."""
+    """Return the expectations of the scenario: the reproduced chains, and the bad verdicts on the recorded flight."""
     exports = simulated.evidence.exports
     chains = {str(agent): exports[agent].top_chain_hash for agent in sorted(reproduced) if agent in exports}
     bad = {key: simulated.result.judgements[key].verdict for key in simulated.result.bad}

@@ -1,4 +1,4 @@
-"""Replay the record of one agent step by step, forward and back, and compare it with the agent core.
+"""Replay the record of one agent step by step, forward or back, and compare each step with the reference core.
 
 `_record_search` finds the record in a directory, `_agent_record` holds its lines, and `_player` plays them. The player
 saves its state at intervals, so it can go back exactly. `breakpoints` stop it at a line, a handler, a block or a

@@ -30,7 +30,7 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class RecordEntry:
-    """A line of the record. Line numbers and restarts count from 1.
+    """An entry of the record: one line of the trace. Line numbers and incarnations count from 1.
 
     `gap` describes missing lines directly before it, such as "2 lines are damaged", else None.
     """
@@ -42,7 +42,7 @@ class RecordEntry:
 
 
 class FlightRecords(Protocol):
-    """The records of a flight. Each is read when it is first used."""
+    """The records of a flight. Each record is read when it is first used."""
 
     @property
     def exports(self) -> Mapping[int, Export]: ...
@@ -52,10 +52,10 @@ class FlightRecords(Protocol):
 
     @property
     def record(self) -> JudgedRecord | None:
-        """Return run.json of the run, or None for a real flight."""
+        """Return the content of run.json. Return None for a real flight."""
 
     def capture(self, agent_id: int) -> AgentCapture | None:
-        """Return the capture of the agent's vehicle. None without one, or if it is not needed."""
+        """Return the capture of the agent's vehicle. Return None if there is no capture or if it is not needed."""
 
 
 class RecordedTrace:
@@ -96,8 +96,8 @@ class RecordedTrace:
 
     @cached_property
     def unrecorded(self) -> dict[int, str]:
-        """The positions of entries whose errors lost lines may explain, with reasons such as "lines are missing
-        ...".
+        """The positions of entries whose deviations lost lines may explain. The values are reasons, such as "lines are
+        missing ...".
         """
         lost = {} if self.is_counted else lost_lines(self.trace)
         of_runs = [position for position, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
@@ -105,14 +105,18 @@ class RecordedTrace:
 
     @property
     def doubtful_runs(self) -> dict[int, str]:
-        """Positions in the trace of handler runs that damage to a single line may explain, with the reason."""
+        """The positions in the trace of handler runs whose deviations may come from damage to a single line, with the
+        reason.
+        """
         of_entries = [number for number, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
         doubts = self.doubts or {}
         return {number: doubts[entry] for number, entry in enumerate(of_entries) if entry in doubts}
 
     @property
     def is_counted(self) -> bool:
-        """True if run.json proves that no line is missing, because the agent counted its handler runs."""
+        """True if run.json proves that no line of the trace is missing. The proof is the agent's own count of its
+        handler runs.
+        """
         run = self.flight.record
         recorded = run.agents.get(str(self.agent_id)) if run is not None else None
         counts = recorded.handler_runs if recorded is not None else []
@@ -120,7 +124,7 @@ class RecordedTrace:
         return bool(counted) and len(counted) == self.incarnations and sum(counted) <= len(self.trace.runs)
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
-        """Return the datagrams of a sender with this number, from the traces of other agents."""
+        """Return the datagrams with this sender and sequence number, from the traces of other agents."""
         return self._datagrams.get((sender, sequence), [])
 
     @cached_property
@@ -138,7 +142,7 @@ class RecordedTrace:
         return found
 
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
-        """Return false if the records prove that no such message reached the agent until this time.
+        """Return false if the records prove that this message did not reach the agent before `at_s`.
 
         A capture of the vehicle proves it, and so does a trace of the sender that lacks no line.
         """
@@ -151,7 +155,9 @@ class RecordedTrace:
 
     @cached_property
     def _sent_by_complete_traces(self) -> dict[int, list[Message]]:
-        """Agent -> the messages that it sent, for other agents whose traces lack no line."""
+        """The messages that each other agent sent, by agent ID. Agents with missing lines in their traces are
+        left out.
+        """
         sent = {}
         lacking = {agent_id for agent_id, _ in lacking_traces(self.flight.traces)}
         for agent_id, trace in self.flight.traces.items():
@@ -164,7 +170,7 @@ class RecordedTrace:
 
     @cached_property
     def arrivals(self) -> list[CapturedDatagram] | None:
-        """The datagrams that reached the vehicle of the agent, in order. None without a capture of the vehicle."""
+        """The datagrams that reached the vehicle of the agent, in order. None if there is no capture of the vehicle."""
         capture = self.flight.capture(self.agent_id)
         return None if capture is None else [seen for seen in capture.sightings if not seen.outbound]
 
@@ -175,7 +181,7 @@ class RecordedTrace:
 
     @cached_property
     def present_until_s(self) -> float | None:
-        """A mission second after the last line at which the agent certainly still ran, or None if it is unknown.
+        """A mission second after the last line until which the agent certainly ran. None if no such time is known.
 
         Steps that were due before this time, but have no line, are missing.
         """
@@ -196,8 +202,8 @@ class RecordedTrace:
         return exported_s if exported_s >= self.end_s else None
 
     def ends_open(self, follower: StepComparer) -> str | None:
-        """Return a sentence about the end of the record, if the agent left no export and other agents continued after
-        it.
+        """Return a sentence about an early end of the record. The record ends early if the agent left no export and
+        other agents continued after it.
 
         Without any export, the mission may have ended at different times, and only a due timer proves an early end.
         `follower` is in the state after the last line.
@@ -212,7 +218,9 @@ class RecordedTrace:
         return unfinished(follower, trace, others_until_s, self._coming() if flight.exports else None)
 
     def _coming(self) -> Iterator[MessageArrival]:
-        """Yield the messages that reached the vehicle of the agent, or were sent to it if it has no capture."""
+        """Yield the messages that reached the vehicle of the agent. Without a capture, yield the messages that were
+        sent to the agent.
+        """
         if self.arrivals is None:
             yield from sent_to(self.agent_id, self.flight.traces)
         for seen in self.arrivals or ():
@@ -238,7 +246,9 @@ class RecordedTrace:
 
 
 def _are_alike(ours: Message, other: Message) -> bool:
-    """Return whether two messages have the same content. The judge does not know all timestamps of candidates."""
+    """Return true if two messages have the same content. Timestamps in NextInSequenceResponse messages may differ,
+    because the judge does not know all of them.
+    """
     if isinstance(ours, NextInSequenceResponse) and isinstance(other, NextInSequenceResponse):
         return (ours.chain_hash, ours.block_hash) == (other.chain_hash, other.block_hash)
     return ours == other

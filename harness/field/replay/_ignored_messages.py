@@ -1,4 +1,4 @@
-"""Find messages that reached the vehicle of an agent, and that its trace does not have.
+"""Find messages that reached the vehicle of an agent but are missing in its trace.
 
 An agent writes a line for each message that it handles or drops. A capture of its vehicle shows the messages that
 arrived. A few messages without a line prove nothing, because lines may be lost, or the socket of the agent may discard
@@ -26,7 +26,7 @@ MAX_TRIED = 200
 
 
 class PlayedAgent(Protocol):
-    """A player of an agent's record at some position in this record."""
+    """A player of an agent's record that is at some position in the record."""
 
     @property
     def lost(self) -> str | None: ...
@@ -37,7 +37,8 @@ class PlayedAgent(Protocol):
 
 
 def ignored_messages(record: RecordedTrace, play_to: Callable[[int], PlayedAgent]) -> tuple[int, StepDeviation] | None:
-    """Return the first message that the agent ignored, with its position. None if it ignored at most a few.
+    """Return the first message that the agent ignored, with its position. Return None if the agent ignored no or only a
+    few messages.
 
     `play_to` plays the entries up to a position.
     """
@@ -65,7 +66,9 @@ def ignored_messages(record: RecordedTrace, play_to: Callable[[int], PlayedAgent
 
 
 def _without_line(record: RecordedTrace) -> Iterator[tuple[int, CapturedDatagram]]:
-    """Yield the messages that arrived between two lines of an incarnation and have no line, with the next position."""
+    """Yield the messages that arrived between two lines of an incarnation and have no line themselves. Each has the
+    position of the next entry.
+    """
     known = {(run.sender, run.sequence) for entry in record.entries if (run := _received(entry)) is not None}
     times = [entry.content.t for entry in record.entries]
     tried = 0

@@ -1,4 +1,4 @@
-"""Show the steps of the other agents at the current moment of a replay, if their records exist."""
+"""Show the steps of the other agents at the current moment of a replay, as far as these agents left records."""
 
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ STEPS_SHOWN = 2
 
 
 class OtherAgents:
-    """The records of the other agents, each of which is read when it is first used.
+    """The records of the agents that are not replayed. Each record is read when it is first used.
 
     The agents of a run share one clock. Agents in the field have separate clocks, whose offsets follow from the
     messages between two agents.
@@ -40,7 +40,9 @@ class OtherAgents:
         return {agent_id: _OtherAgent(record, trace) for agent_id, trace in others.items()}
 
     def at(self, player: RecordPlayer) -> Iterator[Text]:
-        """Yield the steps of each agent at this moment, its state, and its relation to the current step."""
+        """Yield text about each other agent: its steps at this moment, its state, and its relation to the
+        current step.
+        """
         entry = player.entry
         now = entry.content.t if entry else 0.0
         top = player.state.chain.top_chain_hash.hex()
@@ -64,7 +66,7 @@ class OtherAgents:
 
 
 class _OtherAgent:
-    """Another agent. `clock` relates its clock to that of the replayed agent."""
+    """An agent that is not replayed. `clock` relates its clock to that of the replayed agent."""
 
     def __init__(self, record: RecordedTrace, trace: Trace) -> None:
         self._messages = PeerMessages(record, trace)
@@ -81,13 +83,13 @@ class _OtherAgent:
         return clocks[other].after(clocks[own].inverse())
 
     def runs_near(self, now: float) -> range:
-        """Return the positions of its last runs before this moment, and of the next ones."""
+        """Return the positions of the agent's last handler runs before this moment, and of its first ones after it."""
         first, until = (bisect_right(self._times, now + seconds) for seconds in (-NEAR_S, NEAR_S))
         middle = bisect_right(self._times, now)
         return range(max(first, middle - STEPS_SHOWN), min(until, middle + STEPS_SHOWN))
 
     def state_text(self, now: float, top: str) -> str:
-        """Return a text about the state of another agent at this moment."""
+        """Return a text about the state of the agent at this moment."""
         number = bisect_right(self._times, now) - 1
         if number < 0:
             return "nothing yet"
@@ -100,7 +102,9 @@ class _OtherAgent:
         )
 
     def related_lines(self, their_run: int, run: HandlerRun) -> Iterator[Text]:
-        """Yield the step that sent the message which triggered our run, and the steps that received our messages."""
+        """Yield the lines of the agent that are related to the current step: the step that sent the message which
+        triggered it, and the steps that received its messages.
+        """
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger) and trigger.sender == their_run:
             numbers = self._messages.runs_that_sent(trigger.message, trigger.sequence)
@@ -117,7 +121,9 @@ class _OtherAgent:
                 yield shown(f"    has no line for {message.message[:60]} {message.seq}", style="yellow")
 
     def _nearest(self, numbers: list[int], at_s: float) -> list[tuple[int, HandlerRun]]:
-        """Return the run that is nearest in time. Sequence numbers repeat after restarts, so several runs may match."""
+        """Return the handler run that is nearest in time to the current step. Several may match, because sequence
+        numbers repeat after restarts.
+        """
         runs = (self.runs[number] for number in numbers)
         return sorted(runs, key=lambda numbered: abs(self.clock.at(numbered[1].t) - at_s))[:1]
 

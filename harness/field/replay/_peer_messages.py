@@ -1,4 +1,4 @@
-"""Find the messages between the agent of a record and one other agent in both of their records."""
+"""Find the messages between the replayed agent and one other agent that occur in the records of both agents."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +12,9 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class DeliveredMessage:
-    """A message with the times at which it was sent and received, each on the clock of the agent there."""
+    """A message with the time at which it was sent, on the sender's clock, and the time at which it was received, on
+    the receiver's clock.
+    """
 
     sender: int
     receiver: int
@@ -28,7 +30,7 @@ class PeerMessage(NamedTuple):
 
 
 class PeerMessages:
-    """The messages between two agents. `runs` contains the handler runs of the other agent with line numbers."""
+    """The messages between two agents. `runs` contains the handler runs of the second agent with their line numbers."""
 
     def __init__(self, record: RecordedTrace, other_trace: Trace) -> None:
         self.runs = [numbered for numbered_runs in other_trace.incarnations() for numbered in numbered_runs]
@@ -44,17 +46,19 @@ class PeerMessages:
                 self._received.setdefault((trigger.message, trigger.sequence), []).append(number)
 
     def runs_that_sent(self, message: object, sequence: object) -> list[int]:
-        """Return the positions of handler runs that sent a message of this type and number. Between two restarts there
-        is at most one.
+        """Return the positions of the handler runs that sent a message of this type with this sequence number. There is
+        at most one in each incarnation.
         """
         return self._sent.get((message, sequence), [])
 
     def runs_that_received(self, message: object, sequence: object) -> list[int]:
-        """Return the positions of runs that such a message of our agent triggered."""
+        """Return the positions of the second agent's handler runs that were triggered by a message of this type with
+        this sequence number.
+        """
         return self._received.get((message, sequence), [])
 
     def __iter__(self) -> Iterator[PeerMessage]:
-        """Yield the messages that both records certainly contain, in the order of our record."""
+        """Yield the messages that both records certainly contain, in the order of the replayed agent's record."""
         own, other = self._agents
         for position, entry in enumerate(self._record.entries):
             run = entry.content

@@ -1,4 +1,5 @@
-"""Play a record: the agent core gets the recorded inputs, forward or back, with the same result each time.
+"""Play a record: give the recorded inputs to the reference core or to the agent core, forward or back. The result is
+the same each time.
 
 To go back, the player restores a checkpoint and plays forward from there. Reversing single steps instead would need an
 inverse of each handler.
@@ -62,7 +63,7 @@ class ReplayResult:
             self.positions.append(position)
 
     def insert(self, position: int, deviation: StepDeviation) -> None:
-        """Add a deviation that was found after later ones."""
+        """Add a deviation that was found after deviations at later positions."""
         number = bisect_left(self.positions, position)
         self.deviations.insert(number, deviation)
         self.positions.insert(number, position)
@@ -80,7 +81,8 @@ class _PlayerCheckpoint:
 
 
 class RecordPlayer:
-    """A player of a record. `position` is the number of played entries, and `result` their result.
+    """A player of a record. `position` is the number of entries that were played, and `result` is the result of these
+    entries.
 
     `until_s` is the last mission second to play. `implementation` plays the record: the reference, which judges agents,
     or the core in use (`harness.checker.steps.core_in_use`).
@@ -112,12 +114,12 @@ class RecordPlayer:
 
     @property
     def lost(self) -> str | None:
-        """The reason why the state of the agent is unknown at this position, or None."""
+        """The reason why the state of the agent is unknown at this position. None if the state is known."""
         return self._follower.lost
 
     @property
     def entry(self) -> RecordEntry | None:
-        """The trace entry that was played last, or None."""
+        """The trace entry that was played last. None if no entry was played."""
         return self.entries[self.position - 1] if self.position else None
 
     @property
@@ -125,7 +127,7 @@ class RecordPlayer:
         return self.position == len(self.entries)
 
     def deviations_here(self) -> list[StepDeviation]:
-        """Return the deviations of the last entry, including those that only the next entry shows."""
+        """Return the deviations at the last played entry, including those that only the following entry reveals."""
         result = self.result
         here = result.deviations[bisect_left(result.positions, self.position) :]
         upcoming = None if self.at_end else self.entries[self.position]
@@ -141,7 +143,7 @@ class RecordPlayer:
         return here + self._follower.foresee(upcoming.line, upcoming.content)
 
     def forward(self, *, into_debugger: bool = False) -> RecordEntry:
-        """Play the next entry. With `into_debugger`, call `breakpoint()` directly before its handler runs."""
+        """Play the next entry. If `into_debugger` is true, call `breakpoint()` directly before its handler runs."""
         entry = self.entries[self.position]
         if isinstance(entry.content, HandlerRun):
             if entry.incarnation != self._incarnation:
@@ -161,7 +163,9 @@ class RecordPlayer:
         return entry
 
     def to(self, position: int, *, replay: bool = False) -> None:
-        """Go to a position, forward or back. With `replay`, play the entry there again."""
+        """Go forward or back to a position. If `replay` is true, play the entry at this position again even if the
+        player is already there.
+        """
         position = max(0, min(position, len(self.entries)))
         if position < self.position or replay:
             nearest = max(known for known in self._checkpoints if known <= position)
@@ -172,7 +176,9 @@ class RecordPlayer:
             self.forward()
 
     def to_end(self) -> ReplayResult:
-        """Play the rest. The result includes steps that are missing after the last line, and ignored messages."""
+        """Play all remaining entries. The result includes steps that are missing after the last line, and messages that
+        the agent ignored.
+        """
         self.to(len(self.entries))
         result = self.result.copy()
         whole = len(self.entries) == len(self.record.entries) and self._incarnation == self.record.incarnations
@@ -187,7 +193,7 @@ class RecordPlayer:
         return result
 
     def _judge_end(self, result: ReplayResult) -> None:
-        """Add the reason why the record ends, if the agent did not end it itself."""
+        """Add the reason why the record ends if the agent did not end regularly."""
         record = self.record
         if record.flight.record is not None:
             recorded = record.flight.record.agents.get(str(record.agent_id))
@@ -206,13 +212,13 @@ class RecordPlayer:
         return self
 
     def _earlier(self) -> "RecordPlayer":
-        """Return a copy of this player at the beginning."""
+        """Return a copy of this player, moved to the beginning of the record."""
         earlier = copy(self)
         earlier.to(0, replay=True)
         return earlier
 
     def has_effect(self, sender: int, message: Message, at_s: float) -> bool:
-        """Return whether the agent would do anything with a message that arrives here."""
+        """Return true if the agent would react to a message that arrives at the current position."""
         return self._follower.copy().has_effect(sender, message, at_s)
 
     def handler_of(self, message: Message) -> str:
@@ -271,9 +277,11 @@ class RecordPlayer:
         return shift or self._doubt(deviations)
 
     def _doubt(self, deviations: list[StepDeviation]) -> str | None:
-        """Return damage to a single line of the trace that would also explain the deviations, or None.
+        """Return a description of damage to a single line that would also explain the deviations. Return None if there
+        is no such damage.
 
-        It is a coincidence at most a few times in a record. If it explains more places, the deviations count.
+        Such damage is a coincidence, and occurs at most a few times in a record. If it explains more places, the
+        deviations count.
         """
         if self.record.is_counted:
             return None
@@ -310,7 +318,7 @@ class _DoubtingPlayer(RecordPlayer):
         return self.found[self.position]
 
     def _following(self) -> Iterator[tuple[int, HandlerRun]]:
-        """Yield the handler runs after this entry, up to the next place at which lines are missing."""
+        """Yield the handler runs after the current entry, up to the next place at which lines are missing."""
         for position, entry in enumerate(self.entries[self.position + 1 :], self.position + 1):
             if entry.gap is not None or entry.incarnation != self._incarnation or position in self.record.unrecorded:
                 return

@@ -47,11 +47,13 @@ class _RunRecords:
         return self._archive.judged_record
 
     def capture(self, agent_id: int) -> None:
-        """Return None: the counters of the run show messages that an agent ignored."""
+        """Return None. A capture is not needed, because counters in the record of the run show whether an agent ignored
+        messages.
+        """
 
 
 class _DirectoryRecords:
-    """The records of the same mission in the directory of a trace."""
+    """The records in the directory of a trace that belong to the same mission as the trace."""
 
     record = None
 
@@ -85,7 +87,7 @@ class _DirectoryRecords:
 
 
 class IngestedRecords:
-    """The records of a flight that was already read."""
+    """The records of a flight that `ingest_files` has already read."""
 
     record = None
 
@@ -107,7 +109,9 @@ def _capture(flight: Flight, agent_id: int) -> AgentCapture | None:
 
 
 def open_record(path: Path, agent_id: int | None = None) -> RecordedTrace:
-    """Return the record in a trace, or of an agent in a directory. Raises FieldError if none can be played."""
+    """Return the record in a trace file, or the record of one agent in a directory. Raises FieldError if no record can
+    be played.
+    """
     records = open_records(path, agent_id)
     if len(records) > 1:
         names = ", ".join(str(record.agent_id) for record in records)
@@ -116,7 +120,9 @@ def open_record(path: Path, agent_id: int | None = None) -> RecordedTrace:
 
 
 def open_records(path: Path, agent_id: int | None = None) -> list[RecordedTrace]:
-    """Return all records in a trace or a directory, or those of one agent. Raises FieldError if none can be played."""
+    """Return all records in a trace file or a directory, or only those of one agent. Raises FieldError if no record can
+    be played.
+    """
     files = _files_in(path, agent_id) if path.is_dir() else [path]
     directory = path if path.is_dir() else _directory_of(path)
     traces = [trace for file in files if (trace := _read(file)) and not trace.problem and not trace.cut_off]
@@ -139,7 +145,7 @@ def open_records(path: Path, agent_id: int | None = None) -> list[RecordedTrace]
 def _playable(records: Iterable[Callable[[], RecordedTrace]]) -> list[RecordedTrace]:
     """Return the records that can be played.
 
-    The problems of the others are added to the first. Raises FieldError if none can.
+    The problems of the other records are added to the first record. Raises FieldError if no record can be played.
     """
     playable, problems = [], []
     for open_record_of in records:
@@ -163,13 +169,15 @@ def _read(file: Path) -> Trace | None:
 
 
 def _directory_of(file: Path) -> Path:
-    """Return the directory of the run that wrote the file, or else the directory of the file."""
+    """Return the directory of the run that wrote the file. If no run wrote it, return the directory that contains the
+    file.
+    """
     run_records = file.parent.parent
     return run_records if file.parent.name == AGENTS and (run_records / RUN_FILE).is_file() else file.parent
 
 
 def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
-    """Return the traces of all agents, or of one, if their file names identify them without doubt.
+    """Return the traces of all agents or of one agent, if the file names identify them without doubt.
 
     Otherwise return nothing. Then all files must be ingested, which takes longer.
     """
@@ -184,7 +192,7 @@ def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
 
 
 def _belongs_to_another(path: Path, agent_id: int) -> bool:
-    """Return true if a file certainly has no record of the agent, judged by its name or its first line."""
+    """Return true if a file certainly contains no record of the agent, judged by the file's name or first line."""
     if path.name.endswith((".chain.json", ".mission.json", ".log", ".store")):
         return True
     try:
@@ -196,7 +204,9 @@ def _belongs_to_another(path: Path, agent_id: int) -> bool:
 
 
 def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) -> list[RecordedTrace]:
-    """Return the records in files of any kind. If too few were found in the part that was read, return none."""
+    """Return the records in files of any kind. If only some of the files were read and they contain too few records,
+    return an empty list.
+    """
     ingested = ingest_files(sources)
     flights = [flight for flight in ingested.flights if flight.traces]
     if path not in sources and len({agent for flight in flights for agent in flight.traces}) < len(sources):
@@ -230,7 +240,7 @@ def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) ->
 
 
 def _remarks(ingested: IngestResult, agent_id: int) -> Iterator[str]:
-    """Yield the remarks on all files except those of other agents."""
+    """Yield the remarks on all files, except those that belong to other agents."""
     of_others = {
         file
         for flight in ingested.flights

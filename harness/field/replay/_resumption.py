@@ -1,4 +1,5 @@
-"""Find a place after a gap at which the state of an agent is known again, and detect changes of its clock.
+"""Find a place after a gap in a trace at which the state of the agent is known. Also detect changes of the agent's
+clock.
 
 The state of an idle agent consists of its chain and its current block. The top chain hash identifies the chain, if the
 records of the flight contain each step from the inception block to it. The current block follows from the block that
@@ -29,7 +30,7 @@ _ChainSteps = dict[bytes, tuple[bytes, str]]
 
 
 class ResumptionSearch:
-    """The chains in all records of the flight, and the agent states that follow from them."""
+    """A search for known agent states after missing lines. It uses the chains in all records of the flight."""
 
     def __init__(self, record: RecordedTrace, blocks: RecordedBlocks) -> None:
         self._record = record
@@ -37,7 +38,9 @@ class ResumptionSearch:
         self._inception = InceptionBlock(record.header.initial_data).chain_hash
 
     def resume(self, follower: StepComparer, position: int) -> bool:
-        """Set a new follower to the agent's state after the entry at `position`. Return true if that state is known."""
+        """Set a new follower to the agent's state after the entry at `position`. Return false if this state
+        is unknown.
+        """
         entry = self._record.entries[position]
         run = entry.content
         if not isinstance(run, HandlerRun):
@@ -75,7 +78,7 @@ class ResumptionSearch:
 
     @cached_property
     def _own_steps(self) -> _ChainSteps:
-        """Return the extensions of chains that the record itself and exports contain."""
+        """The steps by which chains grew, according to the exports and the trace of this record."""
         steps: _ChainSteps = {}
         for export in self._record.flight.exports.values():
             predecessors = self._inception
@@ -88,8 +91,8 @@ class ResumptionSearch:
 
     @cached_property
     def _all_steps(self) -> _ChainSteps:
-        """Return the blocks that agents added to their chains, from all records. This reads every trace, which takes
-        some time.
+        """The steps by which chains grew, according to all records. Computing them reads every trace, which takes some
+        time.
         """
         steps = self._own_steps.copy()
         for trace in self._record.flight.traces.values():
@@ -112,7 +115,9 @@ class ResumptionSearch:
                 top = bytes.fromhex(run.state.top) if _is_hex(run.state.top) else None
 
     def _block_in_progress(self, position: int) -> bytes | None:
-        """Return the block under construction after an entry, from the events that follow, or None if it is unknown."""
+        """Return the content of the block under construction after an entry, computed from the events that follow.
+        Return None if it is unknown.
+        """
         logged = bytearray()
         for _, run in self._following_runs(position):
             if run.handler != "build_data_block" or not isinstance(run.trigger, EventTrigger):
@@ -125,11 +130,13 @@ class ResumptionSearch:
         return b""  # The block is never completed, so its content has no effect.
 
     def _sequence(self, position: int) -> int:
-        """Return the sequence number of the next message after an entry, or 0 if there is none."""
+        """Return the sequence number of the first message that is sent after an entry. Return 0 if there is no such
+        message.
+        """
         return next((run.sent[0].seq for _, run in self._following_runs(position) if run.sent), 0)
 
     def _following_runs(self, position: int) -> Iterator[tuple[RecordEntry, HandlerRun]]:
-        """Yield the following entries up to a gap or a restart."""
+        """Yield the handler runs after an entry, up to a gap or a restart."""
         incarnation = self._record.entries[position].incarnation
         for entry in islice(self._record.entries, position + 1, None):
             if isinstance(entry.content, HandlerRun):
@@ -161,7 +168,9 @@ class ClockChangeDetector:
         self._record = record
 
     def shift_near(self, position: int) -> str | None:
-        """Return a text such as "its clock was set by +30.0 s" if the clock changed near this entry, otherwise None."""
+        """Return a text such as "its clock was set by +30.0 s" if the clock changed near this entry. Return None if it
+        did not.
+        """
         if self._record.flight.record is not None:
             return None  # The agents of a run share one clock.
         jumps = [_largest_jump(differences, position) for differences in self._differences]
@@ -175,8 +184,8 @@ class ClockChangeDetector:
 
     @cached_property
     def _differences(self) -> list[list[tuple[int, float]]]:
-        """Return, for each other agent, the positions of its messages, with the difference between both clocks at
-        each.
+        """Return, for each other agent, the positions of the messages with that agent, and the difference between both
+        clocks at each.
         """
         own = self._record.agent_id
         differences = []
@@ -192,7 +201,7 @@ class ClockChangeDetector:
 
 
 def _largest_jump(differences: list[tuple[int, float]], position: int) -> float | None:
-    """Return the largest change of the clock difference around an entry, or None if there are too few messages."""
+    """Return the largest change of the clock difference around an entry. Return None if there are too few messages."""
     shift_near = [offset_s for at, offset_s in differences if abs(at - position) <= WITHIN]
     jumps = (
         median(shift_near[number : number + MESSAGES]) - median(shift_near[number - MESSAGES : number])

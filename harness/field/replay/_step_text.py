@@ -1,4 +1,4 @@
-"""Print a step, a state or a difference, mostly in one line of at most 100 columns."""
+"""Describe a step, a state or a difference as text. Most descriptions are one line of at most 100 columns."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import zip_longest
@@ -24,7 +24,7 @@ BLOCKS_SHOWN = 8
 
 
 class StepText:
-    """The texts for the record of a player. `names` contains the names of its blocks."""
+    """Texts about the record of a player. `names` contains the names of the blocks in the record."""
 
     def __init__(self, player: RecordPlayer, names: ReplayNames) -> None:
         self._player = player
@@ -92,7 +92,7 @@ class StepText:
             yield _row("counted", ", ".join(self._counted(key, count) for key, count in run.tally.items()))
 
     def deviation(self, deviation: StepDeviation) -> Text:
-        """Return the line about a deviation. If the deviation is not in the last step, the line names its step."""
+        """Return the line about a deviation. If the deviation belongs to an earlier step, the line names that step."""
         entry = self._player.entry
         own = entry is not None and entry.line == deviation.line and isinstance(entry.content, HandlerRun)
         whose = "" if own else f"of line {deviation.line}, {deviation.handler}: "
@@ -161,7 +161,7 @@ class StepText:
         return ", ".join(text)
 
     def chain(self, chain_hash: bytes) -> str:
-        """Return a text about a chain hash, which states whether it belongs to the agent's own chain."""
+        """Return a text about a chain hash. The text states whether the chain hash belongs to the agent's own chain."""
         chain = self._player.state.chain
         if chain_hash == chain.top_chain_hash:
             own = "our top"

@@ -46,8 +46,8 @@ def parse_breakpoint(text: str, names: ReplayNames) -> Breakpoint:
 
 
 def next_stop(player: RecordPlayer, stops_at: Breakpoint, backward: bool = False) -> int | None:
-    """Return the position after the next entry that matches, or after the previous one with `backward`. None if none
-    matches.
+    """Return the position after the next entry that matches the breakpoint. If `backward` is true, search for the
+    previous one. Return None if no entry matches.
     """
     numbers = range(player.position - 2, -1, -1) if backward else range(player.position, len(player.entries))
     return next((number + 1 for number in numbers if stops_at(player.entries[number])), None)
@@ -81,7 +81,8 @@ def blocks_of(entry: RecordEntry) -> set[str]:
 
 @cache
 def source_of(handler: str) -> str:
-    """Return the place of a handler's first statement, such as "ucp/reconcile.py:187". A breakpoint there always stops.
+    """Return the place of a handler's first statement, such as "ucp/reconcile.py:187". A debugger always stops at a
+    breakpoint there.
 
     The path is relative to the working directory, if the code is in it.
     """
@@ -93,6 +94,6 @@ def source_of(handler: str) -> str:
 
 
 def _decorators(handler: str) -> Iterator[str]:
-    """Yield the lines before `def`, which run only when the module is imported."""
+    """Yield the lines of the handler's source before `def`. They run only when the module is imported."""
     lines, _ = inspect.getsourcelines(HANDLERS[handler].run)
     return takewhile(lambda line: not line.startswith("def "), lines)

@@ -1,4 +1,4 @@
-"""Prepare the records of a real flight for the checker. Without run.json, trace lines may be missing.
+"""Prepare the records of a real flight for the checker. There is no run.json, and trace lines may be missing.
 
 Each trace is judged as `replay` judges it. The other checks read a trace only up to the first place at which lines are
 missing.
@@ -22,7 +22,7 @@ from harness.field.replay._record_search import IngestedRecords
 
 
 def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
-    """Return the evidence with the traces of a flight in place of its own traces."""
+    """Return the evidence with its traces replaced by the traces of a flight, and with the judgement on their steps."""
     results: dict[int, ReplayResult | str] = {}
     traces: dict[int, Trace] = {}
     for agent_id, recorded in flight.traces.items():
@@ -64,7 +64,9 @@ def _up_to_loss(trace: Trace, doubtful: Mapping[int, str]) -> Trace:
 
 
 def _judge_steps(evidence: Evidence, results: Mapping[int, ReplayResult | str]) -> Judgement:
-    """Judge the results of the replays. A result in words is the reason why a trace cannot be judged."""
+    """Judge the results of all replays. If the result of an agent is a text, it is the reason why the agent's trace
+    cannot be judged.
+    """
     deviations: list[StepDeviation] = []
     judged, unjudged, lost = 0, 0, list[str]()
     for agent_id, result in results.items():

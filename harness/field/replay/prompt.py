@@ -1,4 +1,4 @@
-"""Provide the command line of a replay: go forward and back by step, handler, block, line and second."""
+"""Provide the command line of a replay. Its commands go forward and back by step, handler, block, line and second."""
 
 import cmd
 import sys
@@ -250,7 +250,7 @@ class ReplayPrompt(cmd.Cmd):
         self._show()
 
     def _stops_at(self, entry: RecordEntry) -> bool:
-        """Return true if `continue` must stop at the last entry."""
+        """Return true if the command `continue` must stop at the last played entry."""
         positions = self._player.result.positions
         return positions[-1:] == [self._player.position] or self._breaks_at(entry)
 

@@ -1,4 +1,4 @@
-"""Represent the result of a replay: the JSON document `ucp-replay/1`, and a summary for users."""
+"""Define the result of a replay as the JSON document `ucp-replay/1`, and summarise it for users."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -25,8 +25,9 @@ Verdict = Literal["as specified", "deviates", "not judged"]
 
 
 class DifferenceRecord(BaseModel):
-    """A step that differs from the reference core. `algorithm`, `handler` and `source` are null if it is none of the 20
-    handlers."""
+    """A step that differs from the reference core. `algorithm`, `handler` and `source` are null if the step ran none of
+    the 20 handlers.
+    """
 
     line: int
     t: Annotated[float, Field(description="Mission seconds, by the agent's record.")]
@@ -37,8 +38,8 @@ class DifferenceRecord(BaseModel):
 
 
 class ReplayedRecord(BaseModel):
-    """The replay of one record. `steps` counts the compared handler runs, and `unjudged` the others. `unjudged_because`
-    has the reasons.
+    """The replay of one record. `steps` counts the handler runs that were compared. `unjudged` counts all other handler
+    runs, and `unjudged_because` contains the reasons.
     """
 
     record: Annotated[str, Field(description="The file, or the first of the files.")]
@@ -116,8 +117,8 @@ def header_text(record: RecordedTrace) -> Text:
 
 
 def summary(record: RecordedTrace, result: ReplayResult, names: ReplayNames) -> Iterator[Text]:
-    """Yield text about the first difference in detail, the others by handler, and the reasons why steps were not
-    compared.
+    """Yield text about the first difference in detail, a list of the other differences by handler, and the reasons why
+    steps were not compared.
     """
     steps = f"{result.steps:,} handler run{'s' if result.steps != 1 else ''}"
     match verdict(result):

@@ -18,7 +18,7 @@ _NAME = re.compile(r"\d+\.\d+")
 
 
 def is_block(text: str) -> bool:
-    """Return true if a text may be the name of a block, or the beginning of its hash."""
+    """Return true if a text may be the name of a block or the beginning of a block hash."""
     return bool(_NAME.fullmatch(text) or (_HASH.fullmatch(text) and not text.isdigit()))
 
 
@@ -56,7 +56,9 @@ class ReplayNames:
 
 
 class RecordedBlocks(BlockIndex):
-    """All blocks in the records of the flight, including those that the replay has not reached yet."""
+    """All blocks in the records of the flight. They include blocks that occur only after the current position of the
+    replay.
+    """
 
     def __init__(self, record: RecordedTrace) -> None:
         super().__init__(())

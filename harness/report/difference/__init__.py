@@ -1,4 +1,4 @@
-"""Find the first difference between two runs: the first handler run of an agent that only one of them contains.
+"""Compare two runs. Find the first handler run of an agent that occurs in only one of them.
 
 Runs are compared agent by agent and handler run by handler run. The comparison covers incarnation, handler, branch,
 trigger with the message number, sent messages, and changes of chain, deque and stack. Blocks are compared by name, such

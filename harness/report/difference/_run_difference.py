@@ -17,7 +17,8 @@ from ucp.trigger import Trigger
 
 @dataclass(frozen=True)
 class ComparedStep:
-    """A handler run in a form that can be compared. `t` (mission seconds) and `line` are not compared.
+    """A handler run in a form in which it can be compared. The mission second `t` and the line number `line` are not
+    compared.
 
     `changes` holds (operation, block) and `sent` holds (message, block). A block is given by its name, None for no
     block.
@@ -56,7 +57,7 @@ def name(block_hash: str, names: Mapping[str, str]) -> str:
 
 
 def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str, str]:
-    """Return a name such as 3.2 for each block that the agent completed, by block hash."""
+    """Return the names, such as 3.2, of the blocks that the agent completed, by block hash."""
     names: dict[str, str] = {}
     for line in lines:
         if b'"complete"' in line.text:
@@ -68,7 +69,7 @@ def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str
 
 @dataclass(frozen=True)
 class KeyDifference:
-    """A scenario key such as `network.loss` or `timeline.0.at_s`, with its value in each run.
+    """A scenario key with different values in the two runs, such as `network.loss` or `timeline.0.at_s`.
 
     A missing key has the value None.
     """
@@ -79,8 +80,8 @@ class KeyDifference:
 
 
 def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
-    """Yield the innermost keys whose values differ, in the order of `a`. Lists of different length count as one
-    difference.
+    """Yield a difference for each innermost key whose values differ, in the order of `a`. Two lists of different length
+    give one difference.
     """
     if isinstance(a, dict) and isinstance(b, dict):
         pairs = [(name, a.get(name), b.get(name)) for name in {**a, **b}]
@@ -96,8 +97,8 @@ def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
 
 @dataclass(frozen=True)
 class FirstDifference:
-    """The first handler run in which the traces of an agent differ. A trace that ended before has None in place of a
-    handler run.
+    """The first position at which the two traces of an agent differ, with the handler run of each trace. A trace that
+    ended earlier has None.
     """
 
     number: int
@@ -112,7 +113,8 @@ class FirstDifference:
 
 @dataclass(frozen=True)
 class ChainDifference:
-    """The first position (from 1) at which the exported chains of an agent differ, with the names of both blocks.
+    """The first position (from 1) at which the exported chains of an agent differ, with the name of the block that each
+    chain has there.
 
     A chain that ended before has None. An agent without an export has an empty chain.
     """
@@ -147,8 +149,8 @@ class RunDifference:
 
     @property
     def first(self) -> int | None:
-        """The agent whose difference is the earliest in mission time, or None. Of several agents, the lowest ID is
-        chosen.
+        """The agent whose first difference is the earliest in mission time. If several are equal, it is the one with
+        the lowest ID. None without differences.
         """
         at_s = {
             agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None
@@ -242,7 +244,7 @@ def _check_comparable(a: _ComparedRun, b: _ComparedRun) -> None:
 
 
 def _compare_traces(a: _ComparedRun, b: _ComparedRun, agent_id: int) -> tuple[int, bool, FirstDifference | None]:
-    """Return the number of equal handler runs, true if the traces are equal to the last byte, and the first
+    """Return the number of equal handler runs, whether the traces are equal to the last byte, and the first
     difference.
     """
     equal, exact = 0, True

@@ -62,7 +62,7 @@ MAX_LINKED = 100
 
 
 class ExportedRun:
-    """A run to export. Positions come from logged events if no other file contains them. `depot` decrypts events.
+    """A run to export. If no file contains positions, they are taken from logged events. `depot` decrypts the events.
 
     Raises RunDirectoryError if the directory holds no run, and ExportError if it holds nothing to export.
     """
@@ -98,7 +98,7 @@ class ExportedRun:
         return name_blocks(self.archive.exports.by_agent)
 
     def block(self, block_hash: str) -> str:
-        """Return the name of a block, or the first 12 digits of its hash if no export contains it."""
+        """Return the name of a block. If no export contains the block, return the first 12 digits of its hash."""
         return self.block_names.get(block_hash, block_hash[:12])
 
     @cached_property
@@ -129,7 +129,9 @@ class ExportedRun:
 
     @property
     def problems(self) -> list[str]:
-        """A sentence for each damaged or missing file. The list is complete after all of `samples` were read."""
+        """A sentence for each damaged or missing file. The list is complete only after the last element of `samples`
+        was read.
+        """
         archive = self.archive
         sentences = [*archive.problems, *archive.gaps, *self.tracks.problems, *self.network.problems, *self._problems]
         return list(dict.fromkeys(map(archive.within, sentences)))
@@ -147,7 +149,7 @@ class ExportedRun:
         return list(log_files(self.directory))
 
     def samples(self) -> Iterator[Sample]:
-        """Yield all recorded values in order of time. Telemetry and logs are read during the loop."""
+        """Yield all recorded values in order of time. Telemetry and log files are read while the caller iterates."""
         streams: list[Iterable[Sample]] = [
             self.positions(),
             self._losses(),
@@ -184,7 +186,7 @@ class ExportedRun:
                 yield FieldPosition(self.time.at(fix.at_s), vehicle, metres, place)
 
     def _by_events(self) -> Iterator[FieldPosition]:
-        """Yield the positions in logged events. The first one becomes the centre of the field."""
+        """Yield the positions in logged events. The first position of all becomes the centre of the field."""
         if not self.archive.exports.by_agent:
             return
         untimed, field = 0, None
@@ -257,7 +259,7 @@ class ExportedRun:
             yield ReconcileSample(self.time.at(reconcile.end_s, reconcile.agent), reconcile)
 
     def _log_lines(self) -> Iterator[LogLine]:
-        """Yield the faults, the operator commands, and at the end of the run the verdicts."""
+        """Yield a log line for each fault, each operator command, and, at the end of the run, each verdict."""
         for state in self.archive.record.network[:1]:
             yield LogLine(self.time.at(0.0), "info", FAULTS, f"{state.what}: {state.detail}")
         for fault in self.faults:

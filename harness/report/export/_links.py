@@ -21,7 +21,7 @@ def vehicle_frame(vehicle: int) -> str:
 
 
 class LinkLine(NamedTuple):
-    """The link between two vehicles, with a loss rate below 1. `loss` is the larger loss rate of both directions."""
+    """The link between two vehicles. `loss` is the larger loss rate of the two directions, and is below 1."""
 
     low: Metres
     high: Metres
@@ -29,12 +29,14 @@ class LinkLine(NamedTuple):
 
     @property
     def colour(self) -> dict[str, float]:
-        """The colour of the link, from green (no loss) to faint red, as red, green, blue and opacity from 0 to 1."""
+        """The colour of the link as red, green, blue and opacity, each from 0 to 1. Green means no loss, and faint red
+        means a high loss rate.
+        """
         return {"r": self.loss, "g": 1.0 - self.loss, "b": 0.1, "a": 1.0 - 0.7 * self.loss}
 
 
 class CurrentLinks:
-    """The current positions of the vehicles, and the current loss rates of their links."""
+    """The present positions of the vehicles, and the present loss rates of the links between them."""
 
     def __init__(self) -> None:
         self.losses: dict[Link, float] = {}
@@ -43,7 +45,8 @@ class CurrentLinks:
         self._moved_ns = -1
 
     def move(self, position: FieldPosition) -> list[LinkLine] | None:
-        """Store a new position. If a picture of the previous positions is due, return its lines, otherwise None.
+        """Store a new position. If it is time for a new picture of the previous positions, return the lines of this
+        picture. Return None otherwise.
 
         All movements of one instant belong together, so the lines are complete when the first later movement arrives.
         """

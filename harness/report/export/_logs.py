@@ -26,7 +26,9 @@ _BAD = re.compile(r"\bwarn(ing)?\b", re.IGNORECASE)
 
 
 def log_files(directory: Path) -> Iterator[tuple[str, Path]]:
-    """Yield the name and path of each log file: those of the network, the rogue node, the agents and the vehicles."""
+    """Yield the name and path of each log file. The network, the rogue node, the agents and the vehicles write log
+    files.
+    """
     files = chain(directory.glob("*.log"), directory.glob("agents/**/*.log"), directory.glob("vehicles/*/output.log"))
     for path in sorted(islice(files, MAX_FILES)):
         yield str(path.relative_to(directory)).encode("utf-8", "replace").decode(), path
@@ -55,8 +57,8 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
 
 
 def _zone_s(ahead_s: float) -> float:
-    """Return the time zone of a log in seconds, from the difference between its first line and the start of the
-    mission.
+    """Return the time zone of a log in seconds, from the difference between the first line of the log and the start of
+    the mission.
 
     Return infinity if no zone matches, as in virtual time.
     """
@@ -65,8 +67,8 @@ def _zone_s(ahead_s: float) -> float:
 
 
 def _seconds(timed: re.Match[str]) -> float | None:
-    """Return the time in seconds since the Unix epoch as if its zone were UTC, or None if the text is not a valid
-    time.
+    """Return the time in seconds since the Unix epoch. The text is read as UTC, whatever its zone is. Return None if it
+    is not a valid time.
     """
     try:
         whole = datetime.fromisoformat(timed[1]).replace(tzinfo=UTC).timestamp()

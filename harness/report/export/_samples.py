@@ -34,7 +34,7 @@ class EarthPosition(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FieldPosition:
-    """The position of a vehicle at one time, relative to the centre of the field.
+    """The position of a vehicle at one time, in the coordinates of the field.
 
     `place` is None if the field's location is unknown.
     """
@@ -55,7 +55,9 @@ class LossSample:
 
 @dataclass(frozen=True, slots=True)
 class NetworkSample:
-    """A change of the network: the groups of connected vehicles (largest first), and the loss rates of their links."""
+    """A change of the network. It contains the groups of connected vehicles (the largest is first), and the loss rates
+    of the links.
+    """
 
     at_ns: int
     groups: Components
@@ -107,7 +109,7 @@ class ReconcileSample:
 
 @dataclass(frozen=True, slots=True)
 class ReplicationSample:
-    """The number of copies of the blocks, at the time of a change."""
+    """The numbers of copies of blocks from one change to the next."""
 
     at_ns: int
     replication: ReplicationFigures
@@ -124,7 +126,9 @@ class TelemetrySample:
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """A line of a log, a fault, a network change or a verdict. `source` is the name of its origin."""
+    """A line of a log, a fault, a network change or a verdict. `source` is the name of the file or part that it comes
+    from.
+    """
 
     at_ns: int
     level: Level
@@ -165,27 +169,32 @@ class MissionTime:
     by_agent: Mapping[int, int]
 
     def at(self, mission_s: float, agent: int | None = None) -> int:
-        """Return the time of a mission second, by the agent's clock if `agent` is given. It is never before 1970."""
+        """Return the time since the Unix epoch at a mission second. If `agent` is given, its clock is used. The time is
+        never before 1970.
+        """
         epoch_ns = self.epoch_ns if agent is None else self.by_agent.get(agent, self.epoch_ns)
         return max(0, epoch_ns + round(mission_s * _NS))
 
     def mission_s(self, at_ns: int) -> float:
-        """Return the mission second of a time."""
+        """Return the mission second at a time since the Unix epoch."""
         return (at_ns - self.epoch_ns) / _NS
 
     def of_wall(self, wall_s: float) -> int | None:
-        """Return the time of a wall clock value in Unix seconds, or None if it is far outside the mission."""
+        """Convert a time of the wall clock (Unix seconds) to a time on this clock, which runs faster by `speedup`.
+        Return None if it is far outside the mission.
+        """
         mission_s = (wall_s - self.epoch_ns / _NS) * self.speedup
         return self.at(mission_s) if abs(mission_s) <= LATEST_S else None
 
     def of_timestamp(self, timestamp_us: int) -> int | None:
-        """Return the time of a block's or event's timestamp, or None if it is far outside the mission."""
+        """Return the time of a timestamp in a block or an event. Return None if it is far outside the mission."""
         at_ns = timestamp_us * 1000
         return at_ns if abs(self.mission_s(at_ns)) <= LATEST_S else None
 
 
 def mission_time(headers: Mapping[int, TraceHeader], record: RunRecord, problems: list[str]) -> MissionTime:
-    """Return the clock of the mission from the headers of the traces, or otherwise from run.json.
+    """Return the clock of the mission. It comes from the headers of the traces, or from run.json if there are no
+    headers.
 
     Add a sentence for each invalid clock.
     """
@@ -214,7 +223,9 @@ def _speedup(headers: Mapping[int, TraceHeader], record: RunRecord) -> float:
 
 
 def _start_ns(record: RunRecord) -> int:
-    """Return the start time of the run, as an estimate of the start of the mission. It is 0 in virtual time."""
+    """Return the start time of the run in nanoseconds, as an estimate of the start of the mission. Return 0 in virtual
+    time.
+    """
     try:
         start = datetime.fromisoformat(record.started_at or "")
     except ValueError:

@@ -22,7 +22,7 @@ _TEXT = Color(r=1.0, g=1.0, b=1.0, a=1.0)
 
 
 def colours_of(vehicles: Iterable[int]) -> dict[int, Any]:
-    """Return for each vehicle the colour that it has in reports."""
+    """Return the colour of each vehicle. Reports use the same colours."""
     return {vehicle: _colour(ink.fill) for vehicle, ink in inks(vehicles).items()}
 
 
@@ -40,7 +40,7 @@ class FieldScene:
         self._drawn: set[int] = set()
 
     def move(self, position: FieldPosition) -> Iterator[Any]:
-        """Yield the updates of the view (SceneUpdate messages) that are due after a movement."""
+        """Yield the updates of the view (SceneUpdate messages) that a new position makes necessary."""
         if (lines := self.links.move(position)) is not None:
             yield _drawn_links(position.at_ns, lines)
         if position.vehicle not in self._drawn:

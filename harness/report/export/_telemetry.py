@@ -25,7 +25,7 @@ def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
 
 
 def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[str]) -> Iterator[TelemetrySample]:
-    """Yield the messages of a telemetry log. Then add sentences about damaged parts to `problems`."""
+    """Yield the messages of a telemetry log. At the end, add sentences about damage in the log to `problems`."""
     damaged = untimed = 0
     if not path.is_file():
         problems.append(f"{path}: cannot be read: it is not a file")

@@ -34,7 +34,7 @@ _LARGEST = 2**53
 
 
 def schema(**properties: Schema) -> Schema:
-    """Return the JSON schema of an object with these keys, all of which are optional."""
+    """Return the JSON schema of an object with these keys. All keys are optional."""
     return {"type": "object", "properties": {"mission_s": _NUMBER, **properties}}
 
 
@@ -72,7 +72,9 @@ SCHEMAS: dict[str, Schema] = {
 
 
 class TopicConverter:
-    """Converts recorded values to JSON objects. `schemas` contains the JSON schemas of all used topics by name."""
+    """A converter from recorded values to JSON objects. `schemas` contains the JSON schemas of these objects,
+    by name.
+    """
 
     def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
@@ -82,7 +84,7 @@ class TopicConverter:
         self.schemas["ucp.LinkLosses"] = schema(**links)
 
     def of(self, sample: Sample) -> Iterator[tuple[str, str, Object]]:
-        """Yield the topic, the schema name and the JSON object for each part of a recorded value."""
+        """Yield (topic, name of the schema, JSON object) for each part of a recorded value."""
         for topic, name, values in self._of(sample):
             known = {key: value for key, value in values.items() if _is_plottable(value)}
             yield topic, name, {"mission_s": round(self._recording.time.mission_s(sample.at_ns), 6), **known}
@@ -194,7 +196,7 @@ def _link(link: Link) -> str:
 
 
 def _whole(number: Any) -> int | None:
-    """Return the number if it is an integer that all tools can show, otherwise None."""
+    """Return the number if it is an integer that all tools can show. Return None otherwise."""
     return number if isinstance(number, int) and abs(number) <= _LARGEST else None
 
 
@@ -207,7 +209,7 @@ def _mavlink_schema(message: type[Any]) -> Schema:
 
 
 def _lengths(message: type[Any]) -> Iterable[int]:
-    """Return the number of elements of each field, which is 0 for a field that is not an array."""
+    """Return the number of elements of each field. The number is 0 for a field that is not an array."""
     in_order: Mapping[str, int] = dict(zip(message.ordered_fieldnames, message.array_lengths, strict=True))
     return [in_order[name] for name in message.fieldnames]
 

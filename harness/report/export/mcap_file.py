@@ -35,8 +35,8 @@ _SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO
 
 
 def write_mcap(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    """Write a new MCAP file, and return its number of messages. `progress` is called with the mission second from time
-    to time.
+    """Write a new MCAP file, and return the number of messages in it. `progress` is called from time to time with the
+    present mission second.
 
     Raises OSError.
     """
@@ -74,7 +74,7 @@ def _write(recording: ExportedRun, writer: "_McapWriter", progress: Callable[[fl
 
 
 class _McapWriter:
-    """An MCAP file that is being written. A channel is added with its first message."""
+    """A writer of an MCAP file. It adds each channel to the file together with the channel's first message."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._writer = Writer(file)
@@ -84,7 +84,7 @@ class _McapWriter:
         self.messages = 0
 
     def position(self, position: FieldPosition, colour: Any) -> None:
-        """Write a position, both for the map and for the 3D view."""
+        """Write a position as two messages: one for the map and one for the 3D view."""
         frame = vehicle_frame(position.vehicle)
         transform = FrameTransform(parent_frame_id=FIELD, child_frame_id=frame)
         transform.timestamp.FromNanoseconds(position.at_ns)

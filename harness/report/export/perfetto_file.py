@@ -51,8 +51,8 @@ Event = tuple[int, int, Any]
 
 
 def write_perfetto(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    """Write a new trace file, and return its number of events. `progress` is called with the mission second from time
-    to time.
+    """Write a new trace file, and return the number of events in it. `progress` is called from time to time with the
+    present mission second.
 
     Raises OSError.
     """
@@ -79,7 +79,7 @@ def _write(recording: ExportedRun, file: IO[bytes], progress: Callable[[float], 
 
 
 class _MessageArrows:
-    """The numbers of all arrows. Each pair of a message and a receiver has its own arrow."""
+    """The numbers of all arrows. Each message has one arrow for each of its receivers."""
 
     def __init__(self, messages: Iterable[BroadcastMessage]) -> None:
         numbers = count(1)
@@ -107,7 +107,9 @@ class _MessageArrows:
 
 
 class _PerfettoTrace:
-    """Converts recorded values to packets, and describes each track when it is first used."""
+    """A converter from recorded values to packets of the trace. It describes each track when the track is
+    first used.
+    """
 
     def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
@@ -125,7 +127,7 @@ class _PerfettoTrace:
             self._track(group, rank=rank)
 
     def clocks(self) -> Any:
-        """Return a packet that declares the times as wall time."""
+        """Return a packet that declares that all times are wall time."""
         packet = TracePacket(trusted_packet_sequence_id=_SEQUENCE)
         for clock in (BUILTIN_CLOCK_BOOTTIME, BUILTIN_CLOCK_REALTIME):
             packet.clock_snapshot.clocks.add(clock_id=clock, timestamp=self._recording.time.epoch_ns)
@@ -211,7 +213,7 @@ class _PerfettoTrace:
         return at_ns, 0, self._packet(at_ns, _agent(agent), track, TrackEvent.TYPE_SLICE_END)
 
     def _count(self, at_ns: int, group: str, name: str, value: float) -> Iterator[Event]:
-        """Yield a counter event if the value of the counter has changed since the last event."""
+        """Yield a counter event if the value of the counter differs from the value in the last event of the counter."""
         if self._counters.get((group, name)) != value and abs(value) <= _LARGEST:
             self._counters[group, name] = value
             packet = self._packet(at_ns, group, name, TrackEvent.TYPE_COUNTER)
@@ -227,7 +229,7 @@ class _PerfettoTrace:
         return packet
 
     def _track(self, group: str, name: str = "", *, rank: int = 0, counter: bool = False) -> int:
-        """Return the ID of a track in a group. Without a name, return the ID of the group itself."""
+        """Return the ID of a track in a group. If `name` is empty, return the ID of the group."""
         if (group, name) not in self._tracks:
             uuid = self._tracks[group, name] = next(self._uuids)
             packet = TracePacket(trusted_packet_sequence_id=_SEQUENCE)

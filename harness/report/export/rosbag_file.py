@@ -46,8 +46,8 @@ _NS = 1_000_000_000
 
 
 def write_rosbag(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    """Write a new ROS 2 bag, and return its number of messages. `progress` is called with the mission second from time
-    to time.
+    """Write a new ROS 2 bag, and return the number of messages in it. `progress` is called from time to time with the
+    present mission second.
 
     Raises OSError, and MachineError if the database cannot be written.
     """
@@ -134,7 +134,7 @@ class _RosMessages:
                 yield f"/vehicle_{vehicle}/mavlink", _bytes(bytes(message.get_msgbuf()))
 
     def _count(self, topic: str, kind: str, value: float) -> Iterator[tuple[str, Any]]:
-        """Yield the value if it has changed since the last call."""
+        """Yield a message with the value if the value differs from the last one on this topic."""
         if self._counts.get(topic) != value:
             self._counts[topic] = value
             yield topic, _message(f"std_msgs/msg/{kind}", data=value)
@@ -207,8 +207,8 @@ def _transform(position: FieldPosition) -> Any:
 
 
 def _markers(at_ns: int, lines: list[LinkLine]) -> Any:
-    """Return one marker with all lines. Without lines, the marker deletes the old lines, because RViz rejects an empty
-    list.
+    """Return one marker that contains all lines. Without lines, return a marker that deletes the previous lines,
+    because RViz rejects an empty list.
     """
     marker: Any = _STORE.types["visualization_msgs/msg/Marker"]
     origin = (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Serve a web page that shows a run while it is active, or replays it afterwards.
+"""Serve a web page that shows a run: live while the run is active, or as a film afterwards.
 
 `harness.report.live.feed` turns the files of a run (`network.jsonl`, `tracks.jsonl`, the agents' traces) into one
 stream of changes. During the run the feed follows the growing files. After the run it reads them to the end. The page

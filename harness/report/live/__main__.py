@@ -54,7 +54,7 @@ def _send_request(page: int, request: Any) -> None:
 
 
 async def _read_until_over(reader: asyncio.StreamReader, server: LivePageServer, log: ChangeLog) -> bool:
-    """Read messages until the run is over. Return False if the process of the run ended early."""
+    """Read messages from the process of the run until the run is over. Return false if that process ended early."""
     while line := await reader.readline():
         kind, *rest = json.loads(line)
         if kind == "over":

@@ -37,7 +37,7 @@ _NO_CHANGES = b'"changes":[],"sent":[]'
 
 
 class MessageReceipt(NamedTuple):
-    """The reception of message `seq` of `sender` by an agent."""
+    """The reception of the message with the sequence number `seq` of the agent `sender`."""
 
     t: float
     sender: int
@@ -45,7 +45,9 @@ class MessageReceipt(NamedTuple):
 
 
 class SentMessage(NamedTuple):
-    """The broadcast of message `seq` by an agent. `block` identifies the block that the message concerns, if any."""
+    """The broadcast of the message with the sequence number `seq`. `block` identifies the block that the message
+    concerns, if any.
+    """
 
     t: float
     seq: int
@@ -54,7 +56,9 @@ class SentMessage(NamedTuple):
 
 
 class AgentActions:
-    """The actions of one agent so far. Callers take the lists `changes`, `sent` and `receipts`, and empty them."""
+    """The actions of one agent that were read so far. Callers read the lists `changes`, `sent` and `receipts`, and
+    empty them.
+    """
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self.agent_id = agent_id
@@ -78,8 +82,8 @@ class AgentActions:
         self._incarnation = HistoryReader(agent_id)
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Read up to mission second `until_s`, but at most `at_most` lines. Return true if entries up to `until_s`
-        remain.
+        """Read the trace up to mission second `until_s`, but at most `at_most` lines. Return true if entries up to
+        `until_s` remain unread.
         """
         for _ in range(at_most):
             entry = self._ahead or self._next()
@@ -100,14 +104,14 @@ class AgentActions:
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the entry that was read in advance, or None."""
+        """The mission second of the entry that was read in advance. None if there is no such entry."""
         return None if self._ahead is None else self._ahead.t
 
     def close(self) -> None:
         self._trace.close()
 
     def _next(self) -> MessageReceipt | HandlerRun | DroppedDatagram | None:
-        """Return the next entry that has a valid time, or None."""
+        """Return the next entry that has a valid time. Return None if there is no further entry yet."""
         while self.problem is None:
             line = self._trace.next()
             if line is None:
@@ -133,7 +137,7 @@ class AgentActions:
         return bool(self._held.not_in_chain) and b'"idle":true' in line
 
     def _begin(self) -> None:
-        """Reset the recorded actions, because the agent was started again."""
+        """Reset the state that was computed from the trace, because the agent was restarted."""
         if self._has_started:
             self.changes.append(["z", self.at_s, self.agent_id])
         self._has_started, self._held, self._idle_too_early = True, HeldBlocks(), False
@@ -186,7 +190,7 @@ class AgentActions:
         self.changes.append(["s", t, self.agent_id, activity, detail])
 
     def _report_violations(self, run: HandlerRun) -> None:
-        """Report a violation of characteristic 2 or 3 when it first appears."""
+        """Report a violation of characteristic 2 or 3 when it is first found."""
         for operation, block in run.changes:
             if operation.endswith("+") and self._held.copies[block] > 1 and block not in self._duplicates:
                 self._duplicates.add(block)

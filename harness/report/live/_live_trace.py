@@ -18,7 +18,7 @@ _CHUNK_BYTES = 256 * 1024
 
 
 class GrowingFile:
-    """The complete lines of a growing file. The file may be created later.
+    """The complete lines of a file that still grows. The file may be created after this object.
 
     `trouble` is the reason why no more lines can be read, or None.
     """
@@ -31,7 +31,7 @@ class GrowingFile:
         self._partial_line = b""
 
     def next(self) -> bytes | None:
-        """Return the next line with its line end, or None if it is not complete yet."""
+        """Return the next line with its line end. Return None if the next line is not complete yet."""
         while not self._lines:
             if not self._read():
                 return None
@@ -67,7 +67,7 @@ class GrowingFile:
 
 
 class AgentTrace:
-    """The lines of one agent's trace, across its restarts."""
+    """The lines of one agent's trace, in all incarnations of the agent."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self._agents, self._agent_id = agents, agent_id
@@ -80,7 +80,7 @@ class AgentTrace:
         return self._file.trouble and f"{self._file.path.name} {self._file.trouble}"
 
     def next(self) -> bytes | None:
-        """Return the next line with its line end, or None if it is not complete yet."""
+        """Return the next line with its line end. Return None if the next line is not complete yet."""
         while True:
             line = self._file.next()
             if line is None:

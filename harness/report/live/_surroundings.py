@@ -30,7 +30,7 @@ TimedLine = TypeVar("TimedLine", _TimedNetworkLine, TrackLine)
 
 
 class _TimedFile(Generic[TimedLine]):
-    """A growing file whose entries have times.
+    """A growing file in which each entry has a time.
 
     `model` validates each line, and `play` processes it at its mission second.
     """
@@ -46,8 +46,8 @@ class _TimedFile(Generic[TimedLine]):
         self.problems: dict[str, None] = {}
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Read up to mission second `until_s`, but at most `at_most` lines. Return true if entries up to `until_s`
-        remain.
+        """Read the file up to mission second `until_s`, but at most `at_most` lines. Return true if entries up to
+        `until_s` remain unread.
         """
         name = self._file.path.name
         for _ in range(at_most):
@@ -77,7 +77,9 @@ class _TimedFile(Generic[TimedLine]):
 
 
 class NetworkAndVehicles:
-    """The network and the vehicles of a run so far. Callers take the list `changes` and empty it."""
+    """The network and the vehicles of a run, as far as their files were read. Callers read the list `changes` and empty
+    it.
+    """
 
     def __init__(self, directory: Path, vehicles: Collection[int]) -> None:
         self.changes: list[Change] = []
@@ -98,12 +100,12 @@ class NetworkAndVehicles:
 
     @property
     def at_s(self) -> float:
-        """The mission second of the last entry that was read from the file."""
+        """The mission second of the latest entry that was read from the files."""
         return max(self._conditions.at_s, self._tracks.at_s)
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the earliest entry that was read in advance, or None."""
+        """The mission second of the earliest entry that was read in advance. None if there is no such entry."""
         ahead = (self._conditions.ahead, self._tracks.ahead)
         return min((line.at_s for line in ahead if line is not None), default=None)
 
@@ -147,7 +149,7 @@ class NetworkAndVehicles:
 
 
 def _state_after(fault: type[Fault]) -> str:
-    """Return the state of an agent after a fault in one word, or "" if the fault does not change the state."""
+    """Return the state of an agent after a fault in one word. Return "" if the fault does not change the state."""
     states = {
         "gone": fault.removes_vehicle,
         "down": fault.ends_incarnation,

@@ -1,4 +1,4 @@
-"""Store all changes for the live page in a log. Any number of browsers can read it at their own speed.
+"""Store all changes for the live page in a log. Any number of browsers can read the log, each at its own speed.
 
 The log is an unnamed temporary file. Memory use is therefore bounded, and a slow reader does not delay the others.
 """
@@ -21,7 +21,7 @@ _encode = partial(json.dumps, separators=(",", ":"), check_circular=False)
 
 
 class ChangeLog:
-    """A log with one change per line. `size` is its size in bytes."""
+    """A log that has one change in each line. `size` is its size in bytes."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
@@ -42,7 +42,8 @@ class ChangeLog:
         self.size += len(lines)
 
     def read(self, start: int, *, may_skip: bool = False) -> tuple[int, str]:
-        """Return the next complete lines from position `start` on. The first value is the position after them.
+        """Return the complete lines that follow the position `start`, and the position after these lines. The position
+        is the first value.
 
         With `may_skip`, a reader that is far behind gets no messages and positions.
         """

@@ -57,7 +57,7 @@ MAX_KEPT = 100_000
 
 @dataclass
 class _Broadcast:
-    """A broadcast message. `message` is None while only its receivers have recorded it."""
+    """A broadcast message. `message` is None as long as only receivers, and not yet the sender, have recorded it."""
 
     mask: int
     polls: int
@@ -66,7 +66,7 @@ class _Broadcast:
     block: str | None = None
 
     def add_receiver(self, bit: int) -> bool:
-        """Add the receiver with this bit. Return true if it is new."""
+        """Add the receiver with this bit. Return true if the receiver was not yet known."""
         before = self.mask
         self.mask |= bit
         return self.mask != before
@@ -130,13 +130,15 @@ class ChangeFeed:
         ]
 
     def _is_flown(self) -> bool:
-        """Return true if the vehicles are real programs. Only these can have vehicle faults."""
+        """Return true if the vehicles are real programs. Only such vehicles can have vehicle faults."""
         record, scenario = self._record, self._record.scenario
         has_vehicles = scenario is not None and scenario.vehicles.kind != "none"
         return has_vehicles and record.backend is not None and not in_virtual_time(record.backend)
 
     def poll(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
-        """Return the new changes up to a mission second, and true if more changes up to that second remain."""
+        """Return the new changes up to a mission second, and whether more changes up to this mission second remain
+        unread.
+        """
         more = self._surroundings.read(until_s, LINES_AT_ONCE)
         for course in self._courses:
             more |= course.read(until_s, LINES_AT_ONCE)
@@ -154,13 +156,13 @@ class ChangeFeed:
         return [*changes, *self._notes()], more
 
     def final_changes(self) -> list[Change]:
-        """Return the remaining changes and the result of the run."""
+        """Return the changes that were not returned yet, and the result of the run."""
         changes = [*self._take_changes(), *self._messages(report_all=True)]
         return [*changes, *self._notes(), ["end", self._ending()]]
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the earliest entry that was read in advance, or None."""
+        """The mission second of the earliest entry that was read in advance. None if there is no such entry."""
         ahead = (self._surroundings.next_s, *(course.next_s for course in self._courses))
         return min((at_s for at_s in ahead if at_s is not None), default=None)
 
@@ -187,7 +189,9 @@ class ChangeFeed:
             changes.clear()
 
     def _messages(self, *, report_all: bool) -> Iterator[Change]:
-        """Yield the messages whose receivers have had time to record them. With `report_all`, yield all messages."""
+        """Yield the messages whose receivers had enough time to record them. If `report_all` is true, yield all
+        messages.
+        """
         happened: list[tuple[float, int, int, SentMessage | MessageReceipt]] = []
         for course in self._courses:
             happened += [(sent.t, 0, course.agent_id, sent) for sent in course.sent]

@@ -27,7 +27,9 @@ async def copy_finished_run(feed: ChangeFeed, log: ChangeLog) -> None:
 
 
 async def copy_live_run(feed: ChangeFeed, log: ChangeLog, ended: asyncio.Event) -> None:
-    """Write the changes of an active run until it has a result, or until `ended` is set because its process ended."""
+    """Write the changes of an active run to a log until the run has a result. Also stop when `ended` is set, because
+    the process of the run has ended.
+    """
     log.append([feed.run_change(live=True)])
     while True:
         over = feed.over or ended.is_set()

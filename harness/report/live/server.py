@@ -81,7 +81,7 @@ class LivePageServer:
 
     @contextlib.asynccontextmanager
     async def open(self, port: int) -> AsyncIterator[str]:
-        """Run the server inside the context, and yield the address of the page.
+        """Run the server as long as the context is open, and yield the address of the page.
 
         Port 0 means any free port. Raises MachineError if the port is not available.
         """
@@ -144,8 +144,8 @@ class LivePageServer:
         )
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
-        """Return the report of the run. The browser treats it as a page without rights, because its author is
-        unknown.
+        """Return the report of the run. Send it as a page without rights in the browser, because the author of the
+        report is unknown.
         """
         path = self._directory / "report.html"
         if not path.is_file():
@@ -177,12 +177,12 @@ class LivePageServer:
         return len(self._pages)
 
     def answer(self, page: int, answer: Change) -> None:
-        """Send an answer to one page, if that page is still open."""
+        """Send the answer to a request to the page that made the request, if this page is still open."""
         if page in self._pages:
             self._pages[page].answers.append(json.dumps(answer) + "\n")
 
     async def _send_changes(self, page: _OpenPage) -> None:
-        """Send answers and changes, no faster than the browser reads them."""
+        """Send answers and changes to a page, no faster than its browser reads them."""
         start, caught_up = 0, False
         while not page.socket.closed:
             if page.answers:
@@ -204,7 +204,9 @@ class LivePageServer:
 
 
 def _log() -> logging.Logger:
-    """Return a log of errors without those of malformed requests, which any program of this machine can send."""
+    """Return a log for errors of the server. It leaves out malformed requests, because any program of this machine can
+    send them.
+    """
     log = logging.getLogger(__name__)
     log.addFilter(_is_own_error)
     return log

@@ -32,8 +32,8 @@ _NO_REASON = "it does not say why"
 
 
 class LivePage:
-    """The process of the web server, and the requests that it forwards from browsers. `address` is the address of the
-    page.
+    """The process of the web server that serves the live page. It forwards requests from browsers. `address` is the
+    address of the page.
 
     The run never waits for the server. Threads write to the server and read from it.
     """
@@ -67,7 +67,7 @@ class LivePage:
         """After the run: a sentence about an early end of the server, or None."""
 
     def tee(self, progress: ProgressDisplay) -> ProgressDisplay:
-        """Return a progress display that forwards everything to `progress` and also updates the page."""
+        """Return a progress display that passes all progress on to `progress` and also updates the page."""
         return _ProgressTee(progress, self)
 
     def set_snapshot(self, snapshot: SwarmSnapshot) -> None:
@@ -206,7 +206,9 @@ def _required(stream: IO[str] | None) -> IO[str]:
 
 
 def _perform(interventions: Interventions, request: dict[str, Any]) -> Future[float]:
-    """Execute the request of a page. Raises ValueError, TypeError, KeyError or AttributeError if it is invalid."""
+    """Execute the request of a page. Raises ValueError, TypeError, KeyError or AttributeError if the request is
+    invalid.
+    """
     match request["do"]:
         case "happen":
             return interventions.ask(request["entry"])
@@ -226,7 +228,7 @@ def _perform(interventions: Interventions, request: dict[str, Any]) -> Future[fl
 
 @contextmanager
 def live_page(directory: Path, port: int, interventions: Interventions) -> Iterator[LivePage]:
-    """Run a web server for the run in this directory inside the context. Raises MachineError if it cannot be
+    """Inside the context, run a web server for the run in this directory. Raises MachineError if the server cannot be
     started.
     """
     server = LivePage(directory, port, interventions)

@@ -1,4 +1,4 @@
-"""Read the chain exports of a swarm, and find out the kind of their events."""
+"""Read the chain exports of a swarm, and find out whether their events are telemetry."""
 
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Logbook:
-    """The chain exports of a swarm by agent.
+    """The chain exports of a swarm, by agent, with the facts that are needed to print them.
 
     names: names of the blocks by hash. telemetry: whether the events come from the source `mavlink`, which is assumed
     for exports without a run. absent: a sentence for each agent of the mission without an export. errors: a sentence
@@ -44,7 +44,7 @@ class Logbook:
         return mission_s if mission_s is not None and abs(mission_s) <= LATEST_S else None
 
     def only(self, agent_id: int) -> "Logbook":
-        """Return a logbook that contains only this agent's export.
+        """Return a logbook that contains only the export of this agent.
 
         Blocks keep their names. Raises ExportError if there is no export.
         """

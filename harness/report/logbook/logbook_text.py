@@ -16,7 +16,9 @@ _BYTES_SHOWN = 8
 
 
 def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
-    """Yield the lines of each agent's chain. The oldest block is first. With `decode`, each event is described."""
+    """Yield the lines of each agent's chain. The oldest block is first. If `decode` is true, each event has a
+    description.
+    """
     vehicle_types = _vehicle_types(logbook) if decode else {}
     for agent_id, export in logbook.exports.items():
         yield f"agent {agent_id}: a chain of {_count(len(export.chain), 'block')}, top {_short(export.top_chain_hash)}"
@@ -60,7 +62,9 @@ def words(event: LoggableEvent, telemetry: bool, of_type: int | None = None) -> 
 
 
 def _vehicle_types(logbook: Logbook) -> dict[int, int]:
-    """Return the type (MAV_TYPE) of each agent's vehicle, from the first change of flight mode that it logged."""
+    """Return the type (MAV_TYPE) of each agent's vehicle. It is known from the first change of flight mode that the
+    agent logged.
+    """
     types: dict[int, int] = {}
     if not logbook.telemetry:
         return types
@@ -74,7 +78,7 @@ def _vehicle_types(logbook: Logbook) -> dict[int, int]:
 
 
 def _time(timestamp_us: int, logbook: Logbook) -> str:
-    """Return a timestamp as text, with its mission second in front if that is a different number."""
+    """Return a timestamp as text. If the mission second is a different number, it stands in front."""
     mission_s = logbook.mission_s(timestamp_us) if logbook.epoch_us else None
     return moment(timestamp_us) if mission_s is None else f"{mission_s:8.1f} s  {moment(timestamp_us)}"
 

@@ -1,4 +1,4 @@
-"""Find the positions of vehicles over time, from logged events or from the recorded flight paths of the run.
+"""Find the positions of vehicles over time, in logged events or in the flight paths that the run recorded.
 
 A vehicle's events are taken from every surviving copy of its blocks: from each chain, deque and reconcile stack of the
 logbook. The track of a lost vehicle therefore reaches as far as other agents hold its blocks.
@@ -34,7 +34,8 @@ class GlobalPosition(Protocol):
 
 @dataclass(frozen=True)
 class LogEntry:
-    """One event in block `block`. `position` is its own position or the vehicle's previous one, or None.
+    """One event in the block `block`. If the event has no position, `position` is the previous position of the vehicle.
+    It is None if there is none.
 
     `position_age_s` is the age of the position at the time of the event, in seconds.
     """
@@ -48,7 +49,9 @@ class LogEntry:
 
 @dataclass(frozen=True)
 class EventTrack:
-    """All events of one agent. The oldest is first. `fixes` contains its positions with timestamps in microseconds."""
+    """All events of one agent. The oldest is first. `fixes` contains the positions of the agent, with timestamps in
+    microseconds.
+    """
 
     agent_id: int
     entries: list[LogEntry]
@@ -56,8 +59,8 @@ class EventTrack:
 
 
 def tracks(logbook: Logbook) -> list[EventTrack]:
-    """Return the track of each agent that logged positions, by agent ID. There are none if the events are not
-    telemetry.
+    """Return the track of each agent that logged positions, in order of agent IDs. The list is empty if the events are
+    not telemetry.
     """
     if not logbook.telemetry:
         return []
@@ -94,7 +97,7 @@ def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[Log
 
 
 def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> EventTrack:
-    """Return a track of these events in order of time. Events with an impossible time are left out."""
+    """Return a track that contains these events in order of time. Events with an impossible time are left out."""
     track = EventTrack(agent_id, [], [])
     possible = [pair for pair in logged if pair[0].timestamp_us <= LAST_TIMESTAMP_US]
     for event, block in sorted(possible, key=lambda pair: pair[0].timestamp_us):
@@ -116,7 +119,9 @@ class RoundedPosition(NamedTuple):
 
 
 def recorded_tracks(record: RunRecord, recorded: VehicleTracks) -> list[EventTrack]:
-    """Return a track without events for each recorded vehicle, relative to the home position in the scenario."""
+    """Return a track without events for each vehicle whose flight path was recorded. The home position in the scenario
+    is the origin of the recorded positions.
+    """
     if record.scenario is None:
         return []
     home = record.scenario.vehicles.field

@@ -1,4 +1,4 @@
-"""Process stories: text files that contain events and, below each event, the reactions of the agents.
+"""Process story files. A story is a text of events in a mission, with the reactions of the agents below each event.
 
 `story_file` reads and rewrites the files, and `sentences` defines the events. `narration` makes the reactions from the
 agents' traces, with names from `story_names`. Any agent writes traces, so a story can test any agent.

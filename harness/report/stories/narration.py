@@ -1,4 +1,5 @@
-"""Describe the actions of agents as text: one moment after another, and within a moment causes before effects.
+"""Describe the actions of agents as text, in order of time. Actions of the same moment are ordered from causes to
+effects.
 
 In a real network, the order of receivers of one message is random. The text therefore does not depend on it. Within an
 instant, actions are ordered by their distance from the first cause, and then by agent ID: a timer ends and an agent
@@ -52,12 +53,14 @@ class AgentReaction:
 
     @property
     def answer(self) -> MessageTrigger | None:
-        """The trigger of the action, if it is the answer to a query or request. Otherwise None."""
+        """The trigger of the action, if the action received the answer to a query or request. None for any other
+        action.
+        """
         trigger = self.runs[0].trigger
         return trigger if isinstance(trigger, MessageTrigger) and trigger.message in ANSWERS else None
 
     def message(self, sequence: int) -> SentMessage | None:
-        """Return the message with this sequence number that the action sent, or None."""
+        """Return the message with this sequence number, if the action sent it. Return None otherwise."""
         return next((sent for run in self.runs for sent in run.sent if sent.seq == sequence), None)
 
     @property
@@ -67,8 +70,8 @@ class AgentReaction:
 
     @property
     def answers_another_agent(self) -> bool:
-        """True if the action received an answer for another agent. Answers are broadcasts, so all agents receive
-        them.
+        """True if the action received an answer that is meant for another agent. All agents receive each answer,
+        because answers are broadcasts.
         """
         if self.answer is None or self.cause is None:
             return False
@@ -77,7 +80,7 @@ class AgentReaction:
 
 
 class StoryWriter:
-    """Writes a story, a text with the steps of a mission, from the traces of all agents."""
+    """A writer of stories. A story is a text with the steps of a mission, written from the traces of all agents."""
 
     def __init__(self, traces: Mapping[int, Trace], roster: Sequence[int]) -> None:
         self._traces = traces
@@ -100,7 +103,7 @@ class StoryWriter:
         return [*lines, *(self._chains(section.until_s) if section.shows_chains else [])]
 
     def _instant(self, actions: Sequence[AgentReaction]) -> Iterator[str]:
-        """Yield the lines for one moment. Agents with equal actions share their lines."""
+        """Yield the lines for one moment. Agents with equal actions are listed in the same lines."""
         equal: dict[tuple[int, int, object], list[AgentReaction]] = {}
         for action in actions:
             key = action.distance, action.agent_id, self._kind(action)
@@ -114,7 +117,7 @@ class StoryWriter:
             yield from (f"  {_listed(agents):<10}{line}" for line in lines)
 
     def _kind(self, action: AgentReaction) -> object:
-        """Return a key. Actions of one agent with equal keys are merged, because they concern the same answer.
+        """Return a key for an action. Actions of one agent with equal keys concern the same answer, and are merged.
 
         Which of several equal answers arrives first, and therefore counts, is random.
         """
@@ -151,7 +154,7 @@ class StoryWriter:
         return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
 
     def _missing_receivers(self, action: AgentReaction, sent: SentMessage) -> str:
-        """Return a note about the agents that did not receive the message.
+        """Return a note about the agents that should have received the message and did not.
 
         An answer only matters to the agent that asked.
         """
@@ -179,7 +182,7 @@ class StoryWriter:
 
 
 def _actions_with_causes(traces: Mapping[int, Trace]) -> list[AgentReaction]:
-    """Return all actions of agents, each with the action that caused it."""
+    """Return all actions of agents. Each action has its cause, which is the action that sent the triggering message."""
     actions = [action for agent_id, trace in traces.items() for action in _actions(agent_id, trace)]
     sent: dict[tuple[int, int], list[AgentReaction]] = defaultdict(list)
     for action in actions:
@@ -205,7 +208,7 @@ def _actions_with_causes(traces: Mapping[int, Trace]) -> list[AgentReaction]:
 
 
 def _set_cause(action: AgentReaction, sent: Mapping[tuple[int, int], Sequence[AgentReaction]]) -> None:
-    """Set the cause of an action that a message triggered."""
+    """Find the action that sent the message that triggered this action, and record it as the cause."""
     run = action.runs[0]
     if not isinstance(run.trigger, MessageTrigger):
         return
@@ -219,7 +222,9 @@ def _set_cause(action: AgentReaction, sent: Mapping[tuple[int, int], Sequence[Ag
 
 
 def _actions(agent_id: int, trace: Trace) -> Iterator[AgentReaction]:
-    """Yield the actions in a trace. Local events belong to the action that triggered them."""
+    """Yield the actions in a trace. A handler run that another handler triggered belongs to the action of
+    that handler.
+    """
     action: AgentReaction | None = None
     for position, run in enumerate(trace.runs):
         if not has_possible_time(run):
@@ -235,7 +240,9 @@ def _actions(agent_id: int, trace: Trace) -> Iterator[AgentReaction]:
 
 
 def _tree(chains: Mapping[int, Sequence[str]], indent: str) -> Iterator[str]:
-    """Yield a line for the common beginning of the chains, and an indented tree for each continuation."""
+    """Yield a line for the common beginning of the chains. Below it, yield an indented tree for each way in which
+    chains continue.
+    """
     common = 0
     while all(len(chain) > common for chain in chains.values()) and (
         len({chain[common] for chain in chains.values()}) == 1

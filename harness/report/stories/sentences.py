@@ -26,7 +26,9 @@ SENTENCES = (
 
 
 class StoryEntries:
-    """The scenario entries for all sentences so far: `script` for events, `timeline` for the rest, and the end."""
+    """The scenario entries for the sentences that were added so far: `script` for logged events, `timeline` for other
+    entries, and the time of the end.
+    """
 
     def __init__(self) -> None:
         self.script: list[dict[str, Any]] = []
@@ -34,8 +36,8 @@ class StoryEntries:
         self.ends_at_s: int | None = None
 
     def add(self, at_s: int, sentence: str) -> None:
-        """Add the scenario entries for one sentence of the story. Raises ScenarioError if the sentence has an unknown
-        form.
+        """Add the scenario entries for one sentence of the story. Raises ScenarioError if no form of sentence
+        matches.
         """
         if sentence == "end":
             self.ends_at_s = at_s

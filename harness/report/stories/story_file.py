@@ -1,5 +1,5 @@
-"""Read and write story files. A story file contains scenario keys, then sentences with their mission seconds, and below
-each sentence the reactions of the agents.
+"""Read and write story files. A story file contains scenario keys, and then sentences that begin with a mission second.
+The reactions of the agents are below each sentence.
 
     # Figure 3.8: the course of a vote.
     agents: 3
@@ -38,7 +38,9 @@ SPEEDUP = 10.0
 
 @dataclass(frozen=True)
 class StorySection:
-    """The place for the reactions after line `line` (from 0), for mission seconds from `from_s` to `until_s`."""
+    """A place in the story file, after line `line` (from 0). It is for the reactions from mission second `from_s` to
+    `until_s`.
+    """
 
     line: int
     from_s: int
@@ -48,8 +50,8 @@ class StorySection:
 
 @dataclass(frozen=True)
 class Story:
-    """The content of a story file, which describes a mission in sentences. `lines` contains the lines without the
-    reactions of agents.
+    """The content of a story file, which describes a mission in sentences. `lines` contains its lines except the
+    reactions of the agents.
     """
 
     path: Path
@@ -60,14 +62,14 @@ class Story:
 
     @property
     def in_virtual_time(self) -> Scenario:
-        """The scenario of the story, with a constant message delay that keeps messages in order."""
+        """The scenario of the story. It has a constant message delay, so that messages stay in order."""
         if self.scenario.network.delay:
             return self.scenario
         network = self.scenario.network.model_copy(update={"delay": DELAY_S})
         return self.scenario.model_copy(update={"network": network})
 
     def with_answers(self, answers: Sequence[Sequence[str]]) -> str:
-        """Return the text of the story file with these reactions: one list of lines for each section."""
+        """Return the text of the story file with new reactions. `answers` has one list of lines for each section."""
         after = {section.line: answer for section, answer in zip(self.sections, answers, strict=True)}
         lines: list[str] = []
         for number, line in enumerate(self.lines):
@@ -81,7 +83,7 @@ class Story:
 
 
 def is_story(path: Path) -> bool:
-    """Return whether the file is a story of this harness. Other tools use the same file name suffix."""
+    """Return true if the file is a story of this harness. Other tools use the same file name suffix."""
     try:
         lines = read_text(path, MAX_BYTES).splitlines()
         return any(_SENTENCE.fullmatch(line) for line in lines[:MAX_LINES])
@@ -90,7 +92,7 @@ def is_story(path: Path) -> bool:
 
 
 def read_story(path: Path) -> Story:
-    """Read a story file. Raises ScenarioError that names the file and the line."""
+    """Read a story file. Raises ScenarioError with the names of the file and the line."""
     try:
         text = read_text(path, MAX_BYTES)
     except (OSError, UnicodeDecodeError) as error:
@@ -149,18 +151,20 @@ def _parsed(path: Path, text: str) -> Story:
 
 
 def _in_its_line(problem: str, entry_lines: Mapping[str, Sequence[int]]) -> str:
-    """Return an error message in which the line of the sentence replaces the name of the scenario entry."""
+    """Return an error message that names the line of the sentence in place of the scenario entry."""
     entry = _ENTRY.match(problem)
     return f"line {entry_lines[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
 
 
 def _gap(lines: Sequence[str]) -> list[str]:
-    """Return an empty line if the last line is a sentence, to separate it from a comment."""
+    """Return an empty line if the last line is a sentence. The empty line separates the sentence from a comment."""
     return [""] if _SENTENCE.fullmatch(lines[-1]) else []
 
 
 def _sections(sentences: Sequence[tuple[int, int, bool]]) -> list[StorySection]:
-    """Return one section for each second, placed after the last sentence of that second."""
+    """Return one section for each mission second in the story. It is placed after the last sentence of that mission
+    second.
+    """
     last = {
         at_s: (line, any(chains for _, other_s, chains in sentences if other_s == at_s)) for line, at_s, _ in sentences
     }

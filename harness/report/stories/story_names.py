@@ -29,7 +29,7 @@ MAX_FULL_CHAIN = 4
 
 
 class LocalChain:
-    """The chain of an agent as its trace describes it: block hashes and chain hashes. The oldest is first."""
+    """The chain of an agent according to its trace, as block hashes and chain hashes. The oldest is first."""
 
     def __init__(self, trace: Trace) -> None:
         try:
@@ -51,7 +51,7 @@ class LocalChain:
 
 
 def _digest(block_hash: str) -> bytes:
-    """Return the hash as bytes, or no bytes if the text is not a hash."""
+    """Return the hash as bytes. Return no bytes if the text is not a hash."""
     try:
         return bytes.fromhex(block_hash)
     except ValueError:
@@ -59,7 +59,7 @@ def _digest(block_hash: str) -> bytes:
 
 
 class StoryNames:
-    """Names of blocks as in the figures of the thesis. A chain is named by its blocks."""
+    """Names of blocks as in the figures of the thesis, such as "1.1". The name of a chain is the list of its blocks."""
 
     def __init__(self, traces: Mapping[int, Trace]) -> None:
         self._blocks = {
@@ -77,19 +77,19 @@ class StoryNames:
                     self._chains.setdefault(chain.chain_hashes[-1], self.of(chain.blocks))
 
     def block(self, block_hash: str) -> str:
-        """Return a name such as "1.1"."""
+        """Return the name of a block, such as "1.1"."""
         return self._blocks.get(block_hash, "an unknown block")
 
     def of(self, block_hashes: Sequence[str]) -> list[str]:
         return [self.block(block_hash) for block_hash in block_hashes]
 
     def chain(self, chain_hash: bytes) -> str:
-        """Return a name of the chain, such as "1.1 2.1", or "1.1 .. 4.2" if it is long."""
+        """Return the name of a chain, such as "1.1 2.1". The name of a long chain has the form "1.1 .. 4.2"."""
         blocks = self._chains.get(chain_hash)
         return "an unknown chain" if blocks is None else _chain_text(blocks)
 
     def chain_below(self, chain_hash: bytes) -> str:
-        """Return the name of the chain without its top block."""
+        """Return the name of the chain that is left without the top block."""
         blocks = self._chains.get(chain_hash)
         return "an unknown chain" if not blocks else _chain_text(blocks[:-1])
 

@@ -42,7 +42,9 @@ class BagMessage(NamedTuple):
 
 
 def messages(path: Path) -> Iterator[BagMessage | UnreadablePart]:
-    """Yield all messages in a ROS bag, and a Damage for each unreadable place between them. Raises OSError."""
+    """Yield all messages in a ROS bag, and an UnreadablePart for each place between them that cannot be read. Raises
+    OSError.
+    """
     number = 0
     with TemporaryDirectory(prefix="ucp-bag-") as directory:
         for item in _items(path, Path(directory)):

@@ -80,7 +80,9 @@ _STEP_BYTES = 16 * 1024
 
 
 def decompress(compression: str, data: bytes, max_bytes: int = MAX_CHUNK_BYTES) -> tuple[bytes, str]:
-    """Return the content as far as it can be decompressed, and the reason why it is incomplete, or ""."""
+    """Return as much of the content as can be decompressed, and the reason why it is incomplete. The reason is "" for
+    complete content.
+    """
     if compression in ("", "none"):
         return data, ""
     decompressor = _decompressor(compression)
@@ -110,7 +112,9 @@ def message_data(data: bytes) -> bytes:
 
 
 def decompress_file(path: Path, copy: Path) -> str:
-    """Decompress a zstd file to `copy`. Return the reason why the content is incomplete, or ""."""
+    """Decompress a zstd file into the file `copy`. Return the reason why the content is incomplete, or "" for complete
+    content.
+    """
     decompressor: Any = _decompressor("zstd")
     written = 0
     with BoundedFile(path, MAX_FILE_BYTES) as file, copy.open("wb") as unpacked_copy:

@@ -46,7 +46,7 @@ class _McapReader:
         self.closed = False
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Yield the messages in the whole file, or in a compressed part of it (chunk).
+        """Yield the messages in the whole file, or in one compressed part of the file (a chunk).
 
         If the chunk is not `whole`, an incomplete last record is no damage.
         """
@@ -92,7 +92,9 @@ class _McapReader:
             yield from self._topics.message(number, log_time, record[_MESSAGE_HEAD.size :])
 
     def _next(self, buffer: Buffer, start: int) -> int | None:
-        """Return the position of the next record that is followed by another record or by the end of the buffer."""
+        """Return the position of the next undamaged record. Such a record is followed by another record or by the end
+        of the buffer.
+        """
         for match in _BEGINNING.finditer(buffer, start):
             if next(self._tries, None) is None:
                 return None
@@ -103,8 +105,8 @@ class _McapReader:
 
 
 def _record_at(buffer: Buffer, position: int) -> tuple[int, int, int]:
-    """Return (operation, start, end) of the record at a position, or zeros if there is none. A chunk may be cut off at
-    its end.
+    """Return (operation, start, end) of the record at a position. Return zeros if there is no record. A record that is
+    a chunk may be truncated.
     """
     if position + _RECORD.size > len(buffer):
         return 0, 0, 0

@@ -52,7 +52,9 @@ def items(path: Path, scratch: Path) -> Iterator[Item]:
 
 
 def _pages_of_truncated(path: Path) -> SqlitePages | None:
-    """Return the pages of a file that is shorter than its header states. Return None for any other file."""
+    """Return the pages of a file that is shorter than its header states. Return None for a file with the
+    stated length.
+    """
     with open_plain_file(path) as file:
         header = file.read(FILE_HEADER_BYTES)
         if len(header) < FILE_HEADER_BYTES:
@@ -64,7 +66,7 @@ def _pages_of_truncated(path: Path) -> SqlitePages | None:
 
 
 def _rows_in_pages(pages: SqlitePages) -> Iterator[Item]:
-    """Yield the messages in the pages in order of time, and finally the damage."""
+    """Yield the messages in the pages in order of time, and then an entry about the damage."""
     topics: dict[Any, tuple[str, str]] = {}
     messages: dict[int, list[Any]] = {}
     for number, values in pages.rows():

@@ -1,4 +1,4 @@
-"""Read the rows of a truncated SQLite file directly from its pages, because the index that leads to them is lost.
+"""Read the rows of a truncated SQLite file directly from its pages, because the index of the pages is lost.
 
 SQLite finds a row by inner pages of a tree. In a file that grew while it was recorded, an inner page often lies behind
 the rows that it leads to. If the end of the file is lost, SQLite then finds no row at all. Each leaf page, however,
@@ -28,7 +28,7 @@ class SqlitePages:
         self._usable_bytes = self._page_bytes - data[20]
 
     def rows(self) -> Iterator[Row]:
-        """Yield the complete rows of all tables, page by page."""
+        """Yield the complete rows of all tables, one page after another."""
         if self._page_bytes < 512 or self._usable_bytes < 480:
             return
         for begin in range(0, len(self._data) - self._page_bytes + 1, self._page_bytes):

@@ -45,7 +45,7 @@ class _BagVersion1Reader:
         self.records = iter(range(MAX_RECORDS))
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Yield the messages in the whole file, or in a compressed part of it (chunk).
+        """Yield the messages in the whole file, or in one compressed part of the file (a chunk).
 
         If the chunk is not `whole`, an incomplete last record is no damage.
         """
@@ -92,12 +92,14 @@ class _BagVersion1Reader:
 
 
 def _declared_length(buffer: Buffer, end: int, data: bytes) -> int:
-    """Return the length field of the record whose data end at `end`. The field is directly before `data`."""
+    """Return the value of the length field of the record whose data end at `end`. The length field is directly before
+    `data`.
+    """
     return int(_U32.unpack_from(buffer, end - len(data) - _U32.size)[0])
 
 
 def _record_at(buffer: Buffer, position: int) -> _Record | None:
-    """Return the record at a position, or None. The end of the buffer may cut off a chunk."""
+    """Return the record at a position. Return None if there is no record. A record that is a chunk may be truncated."""
     if position + _U32.size > len(buffer):
         return None
     (length,) = _U32.unpack_from(buffer, position)
@@ -115,7 +117,7 @@ def _record_at(buffer: Buffer, position: int) -> _Record | None:
 
 
 def _fields(head: bytes) -> dict[str, bytes] | None:
-    """Return the header fields in `head`, or None if they are damaged."""
+    """Return the header fields in the bytes `head`. Return None if the fields are damaged."""
     fields: dict[str, bytes] = {}
     position = 0
     while position < len(head):

@@ -1,4 +1,4 @@
-"""Lay out the page of a merged record. The template escapes all data from vehicles."""
+"""Draw the page of a merged record. The template escapes all data from vehicles."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -88,8 +88,8 @@ def draw(record: MergedRecord, reconciliation: ReconciledExports | None = None) 
 
 
 def _title(record: MergedRecord) -> str:
-    """Return the data of the inception block if they are readable text, otherwise a title with the hash of that
-    block.
+    """Return the data of the inception block as the title if they are readable text. Otherwise return a title with the
+    hash of that block.
     """
     text = base64.b64decode(record.header.inception.block_data).decode("utf-8", errors="replace")
     if text and text.isprintable() and "\ufffd" not in text:
@@ -98,7 +98,7 @@ def _title(record: MergedRecord) -> str:
 
 
 def _headline(record: MergedRecord) -> tuple[str, str]:
-    """Return a short headline, and the name of its style."""
+    """Return a short headline for the page, and the name of the headline's style."""
     losses = []
     if record.missing:
         losses.append("1 vehicle" if len(record.missing) == 1 else f"{len(record.missing)} vehicles")
@@ -139,7 +139,9 @@ def _figures(record: MergedRecord, single_copies: list[str]) -> list[tuple[str, 
 def _trees(
     record: MergedRecord, reconciliation: ReconciledExports | None, ink: Mapping[int, AgentColours]
 ) -> list[tuple[str, Markup]] | None:
-    """Return pictures of the chains before and after the reconcile, or None if a picture would have too many blocks."""
+    """Return pictures of the chains before and after the reconcile. Return None if a picture would have too many
+    blocks.
+    """
     exports = record.collected.exports
     if len(record.blocks) > MAX_TREE_BLOCKS:
         return None
@@ -154,7 +156,7 @@ def _tree(exports: Mapping[int, Export], record: MergedRecord, ink: Mapping[int,
 
 
 def _vehicles(record: MergedRecord, ink: Mapping[int, AgentColours]) -> list[dict[str, Any]]:
-    """Return a table row for each export, and for each vehicle without one."""
+    """Return a table row for each export, and for each vehicle that has no export."""
     rows: list[dict[str, Any]] = [
         {
             "agent_id": used.agent_id,
@@ -189,7 +191,7 @@ def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, AgentColours]) -> 
 
 
 def _marks(matches: Sequence[MatchedLog]) -> dict[int, list[_time_chart.Mark]]:
-    """Return the changes in the flight log of each agent, by the clock of the agent."""
+    """Return the changes in the flight log of each agent, with times on the clock of the agent."""
     marks: dict[int, list[_time_chart.Mark]] = {}
     for match in matches:
         if match.agent_id is not None:

@@ -1,4 +1,4 @@
-"""Draw which vehicle holds which block: a row for each vehicle, and a column for each block in the order of the
+"""Draw which vehicle holds which block. Each vehicle has a row, and each block has a column, in the order of the
 record.
 """
 
@@ -82,7 +82,7 @@ Column = tuple[str, str, Mapping[int, str]]
 
 
 class _BlockRange(NamedTuple):
-    """The columns from `begin` up to `end`, in which the agent holds blocks at `place`.
+    """The columns from `begin` up to `end`, for blocks that the agent holds in the same place `place`.
 
     `fraction` is "part" if not all.
     """
@@ -112,7 +112,9 @@ def _group_of(block: RecordedBlock) -> str:
 
 
 def _places(block: RecordedBlock) -> dict[int, str]:
-    """Return the place of the block on each agent. If an agent holds it in two places, the first one counts."""
+    """Return the place of the block on each agent: chain, deque or others. If an agent holds the block in two places,
+    the first place counts.
+    """
     places: dict[int, str] = {}
     for held in block.line.held:
         for agent_id in held.agents:
@@ -176,7 +178,7 @@ def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Itera
 
 
 def _cell_state(cell: Sequence[Column], agent_id: int) -> tuple[str | None, str]:
-    """Return the place at which the agent holds these blocks, and "part" if it does not hold all of them."""
+    """Return the place at which the agent holds most of these blocks, and "part" if it does not hold all of them."""
     places = Counter(place for _, _, held in cell if (place := held.get(agent_id)) is not None)
     if not places:
         return None, ""

@@ -1,4 +1,5 @@
-"""Draw a map of logged events: the path of each vehicle as a line, and its other events at its last position.
+"""Draw a map of logged events. The path of each vehicle is a line, and an event without a position is at the last
+position of its vehicle.
 
 A ring marks blocks that only one vehicle holds, which the next loss would have destroyed. If blocks of a vehicle were
 lost, its line is dotted between the positions before and after them.
@@ -32,7 +33,7 @@ _WIDTH, _HEIGHT = 900, 560
 
 @dataclass(frozen=True)
 class EventMap:
-    """A map of the positions in events, and sentences about omitted events."""
+    """A map of the positions in events, and sentences about the events that it does not show."""
 
     drawing: Markup
     notes: list[str]
@@ -45,8 +46,8 @@ def draw(
     ink: Mapping[int, AgentColours],
     flown: Sequence[EventTrack] = (),
 ) -> EventMap:
-    """Draw the map. `rare` names blocks on one vehicle only, `lost` numbers each agent's lost blocks, and `flown` are
-    paths from flight logs.
+    """Draw the map. `rare` contains the names of blocks that only one vehicle holds, `lost` the numbers of each agent's
+    lost blocks, and `flown` the paths from flight logs.
 
     There is at least one position.
     """
@@ -148,7 +149,7 @@ def _paths(
 def _pieces(
     track: EventTrack, path: Sequence[PositionFix], lost: Mapping[int, Sequence[int]]
 ) -> Iterable[tuple[bool, Sequence[PositionFix]]]:
-    """Yield the pieces of a path, each with true if the piece is a gap.
+    """Yield the pieces of a path, as (true if the piece is a gap, positions).
 
     A gap is where blocks between two positions were lost.
     """
@@ -169,7 +170,7 @@ def _ordinal(name: str) -> int | None:
 
 
 def _logged(track: EventTrack, single_copies: set[str]) -> Iterable[tuple[bool, int, LogEntry]]:
-    """Yield each event to mark on the map, as (true if only one vehicle holds it, agent ID, event)."""
+    """Yield each event to mark on the map, as (true if only one vehicle holds its block, agent ID, event)."""
     for entry in track.entries:
         rare = entry.block in single_copies
         if entry.position is not None and (rare or not entry.is_position):

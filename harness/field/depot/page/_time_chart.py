@@ -1,5 +1,5 @@
-"""Draw a chart over time with a row for each vehicle: its events, and below them its blocks, shaded by the number of
-holders. Marks show the changes in the flight log of the vehicle.
+"""Draw a chart over time with a row for each vehicle. A row shows the events, below them the blocks, shaded by the
+number of holders, and marks for changes in the flight log.
 """
 
 from bisect import bisect_left
@@ -28,7 +28,9 @@ MAX_NAMED = 8
 
 @dataclass(frozen=True)
 class TimeSpan:
-    """An interval of time in microseconds. `outside` counts the events whose clocks show a different time."""
+    """An interval of time in microseconds. `outside` counts the events with times outside the interval, because of
+    wrong clocks.
+    """
 
     first_us: int
     last_us: int
@@ -36,7 +38,7 @@ class TimeSpan:
 
 
 def time_span_of(record: MergedRecord) -> TimeSpan | None:
-    """Return the interval of nearly all events, or None if there are no events."""
+    """Return the interval that contains nearly all events. Return None if there are no events."""
     times = sorted(timestamp_us for block in record.blocks for timestamp_us, *_ in events_in(block.event_data))
     if not times:
         return None
@@ -49,8 +51,8 @@ def time_span_of(record: MergedRecord) -> TimeSpan | None:
 
 
 def extended(time_span: TimeSpan, marks: Iterable["Mark"]) -> TimeSpan:
-    """Return the interval, extended to the marks before and after it. A mark that is farther away than the length of
-    the interval comes from a wrong clock, and is ignored.
+    """Return the interval, extended to the marks before and after it. A mark is ignored if its distance exceeds the
+    length of the interval, because its clock must be wrong.
     """
     length = time_span.last_us - time_span.first_us
     near = [at for at, _ in marks if time_span.first_us - length <= at <= time_span.last_us + length]
@@ -169,7 +171,9 @@ def _bars(
 
 
 def shade(holders: int, vehicles: int) -> int:
-    """Return the number of the shade for a number of holders: 0 for one holder, and the last one for all vehicles."""
+    """Return the number of the shade for a number of holders. 0 means one holder, and the last number means all
+    vehicles.
+    """
     if holders <= 1:
         return 0
     return SHADES - 1 if holders >= vehicles else 1 if 2 * holders <= vehicles else 2
@@ -221,7 +225,7 @@ def _losses(
     axis: svg.Axis,
     top: float,
 ) -> Iterable[Markup]:
-    """Draw hatched areas for lost blocks, and for the missing end of a vehicle's record."""
+    """Draw hatched areas for lost blocks, and for the end of a vehicle's record if the end is missing."""
     extents = {block.line.name: _extent(block, time_span, axis) for block in blocks}
     ordinals = sorted(int(name.partition(".")[2]) for name in extents if name.partition(".")[2].isdecimal())
     gaps: dict[tuple[float, float], list[str]] = {}
