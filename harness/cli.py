@@ -27,7 +27,8 @@ def _quit(signal_number: int, frame: object) -> None:
 
 
 def _interrupts_are_quiet(quiet: bool) -> None:
-    """Let Ctrl-C end the process at once, as long as it only imports modules. Python would print a traceback.
+    """Let Ctrl-C end the process at once while it only imports modules, because Python would otherwise print a
+    traceback.
 
     A program that merely imports this module keeps its own handler.
     """
@@ -243,7 +244,7 @@ def _harness(
 
 
 class _OutputWithoutBrokenPipe(io.FileIO):
-    """Standard output. If its reader ends early (`| head`), the command continues without output."""
+    """Standard output that tolerates a reader that ends early (`| head`). The command then continues without output."""
 
     def write(self, data: Any, /) -> int:
         try:
@@ -254,7 +255,7 @@ class _OutputWithoutBrokenPipe(io.FileIO):
 
 
 def main() -> NoReturn:
-    """Run the command line. A mistake of the user gives one sentence and an exit status, never a traceback."""
+    """Run the command line. A mistake of the user leads to one sentence and an exit status, never to a traceback."""
     if sys.stdout is None:  # the caller closed it
         sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     elif sys.stdout is (original := sys.__stdout__):

@@ -66,7 +66,7 @@ class UnsupportedError(MachineError):
 
     @classmethod
     def of(cls, agent_id: int, command: Sequence[str], words: str) -> Self:
-        """Return the error for an agent. `words` is the message of the agent, which may be empty."""
+        """Return the error for an agent. `words` is the message from the agent, which may be empty."""
         why = words.rstrip(".") or "it does not say why"
         return cls(f"not supported by agent {agent_id} ({shlex.join(command)}): {why}")
 

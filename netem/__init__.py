@@ -1,4 +1,4 @@
-"""Control the packets between vehicles: network conditions, a virtual network, and the kernel mechanisms that apply
+"""Control the packets between vehicles: network conditions, a virtual network, and the kernel mechanisms that apply the
 conditions.
 
 `__all__` lists the public names. A name is imported at its first use, because the first process of every lab imports

@@ -32,7 +32,7 @@ def text(kind: int, value: str) -> bytes:
 
 
 def parse(data: bytes) -> dict[int, bytes]:
-    """Return the contents of the attributes by kind. If a kind occurs twice, the last one counts."""
+    """Return the contents of the attributes by attribute type. If a type occurs twice, the last attribute counts."""
     payloads = {}
     offset = 0
     while offset + _HEADER.size <= len(data):
@@ -43,5 +43,5 @@ def parse(data: bytes) -> dict[int, bytes]:
 
 
 def parse_number(payload: bytes | None) -> int | None:
-    """Return the value of a 32-bit attribute, or None if it is missing."""
+    """Return the value of a 32-bit attribute. Return None if the attribute is missing."""
     return None if payload is None else int.from_bytes(payload[:4], sys.byteorder)

@@ -12,7 +12,7 @@ from netem.tc import NetemEngine
 
 
 def choose(preference: str | None, fabric: VirtualSwitch, needs: Sequence[str] = ()) -> tuple[Engine, str]:
-    """Return an installed engine for this machine, and the reason for the choice.
+    """Install the first suitable engine that works on this machine. Return the engine, and the reason for the choice.
 
     Without a preference, tc netem comes first, because it supports more. `needs` lists conditions other than loss and
     partition. Only the installation of an engine shows whether the kernel supports it. Raises EngineError with the

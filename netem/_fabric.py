@@ -53,7 +53,7 @@ class VirtualSwitch:
         return _FIRST_PORT_INDEX + self.vehicles.index(vehicle)
 
     def inside(self, vehicle: int | None) -> AbstractContextManager[None]:
-        """Run code in the network of a vehicle, or in the network of the switch for None."""
+        """Run code in the network of a vehicle. For None, run it in the network of the switch."""
         return _namespaces.inside(self.home if vehicle is None else self._namespaces[vehicle], self.home)
 
     def inodes(self) -> dict[int, int]:
@@ -99,7 +99,7 @@ class VirtualSwitch:
 
 
 def _disable_ipv6() -> None:
-    """Disable IPv6 on new links, because it would send packets when no program does."""
+    """Disable IPv6 on new links, because IPv6 would send packets that no program has sent."""
     _sysctl("ipv6/conf/default/disable_ipv6", b"1")
 
 

@@ -103,7 +103,7 @@ def _forwards(port: bytes) -> bool:
 
 
 def flood_broadcasts(port: str, index: int, on: bool) -> NetlinkRequest:
-    """Return a request that makes the bridge send broadcasts of other ports to this port, or stops it."""
+    """Return a request that starts or stops the forwarding of broadcasts from the bridge's other ports to this port."""
     flag = nested(_IFLA_PROTINFO, attribute(_IFLA_BRPORT_BCAST_FLOOD, bytes([on])))
     return NetlinkRequest(
         f"set bcast_flood of {port}", RTM_SETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, index, 0, 0) + flag

@@ -49,11 +49,11 @@ class LabConnection:
         return self._end is None
 
     async def inside(self) -> bool:
-        """Wait for the first report of the process. Return False if it has ended instead."""
+        """Wait for the first report of the process. Return False if the process ends without a report."""
         return await asyncio.shield(self._inside)
 
     async def ask(self, what: str, **arguments: Any) -> Answer:
-        """Send a request. Return its result, and the socket that came with it, if any."""
+        """Send a request. Return its result, and the socket that the answer contains, if any."""
         if self._end is not None:
             raise LabError(self._end)
         number = next(self._numbers)

@@ -40,7 +40,7 @@ class MessageReceiver:
         self.descriptors: deque[int] = deque()
 
     def read(self, source: socket.socket) -> bool:
-        """Read available data. Return False at the end of the stream. Raises BlockingIOError without data."""
+        """Read available data. Return False at the end of the stream. Raises BlockingIOError if there are no data."""
         room = socket.CMSG_SPACE(_MAX_DESCRIPTORS * array.array("i").itemsize)
         data, ancillary, _, _ = source.recvmsg(1 << 16, room, socket.MSG_CMSG_CLOEXEC)
         for level, kind, payload in ancillary:

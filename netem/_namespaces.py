@@ -68,7 +68,7 @@ def command(argv: Sequence[str], *, user_namespace: bool, die_with_parent: bool 
 
 
 def user_namespace_choices() -> tuple[bool, ...]:
-    """Return the values of `user_namespace` to try, in this order.
+    """Return the values of `user_namespace` in the order in which the caller should try them.
 
     Root needs no user namespace unless its rights are limited.
     """
@@ -93,8 +93,8 @@ def probe() -> tuple[bool, str]:
 
 
 def not_executed(message: str) -> tuple[str, str] | None:
-    """Return the program and the reason from a tool's error message about a program that it could not start, or
-    None.
+    """Parse a tool's message that it could not start a program. Return the program and the reason. Return None for any
+    other message.
     """
     match = re.fullmatch(r"(?:unshare|setpriv): failed to execute (.+): (.+)", message)
     return (match[1], match[2]) if match else None

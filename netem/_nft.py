@@ -191,7 +191,9 @@ class NftablesEngine(Engine):
 
 
 def _grouped(parts: list[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
-    """Combine neighbouring parts into groups of at most `_COMMANDS_AT_ONCE` commands. No part is divided."""
+    """Combine successive lists of commands into longer lists of at most `_COMMANDS_AT_ONCE` commands. No list is
+    divided.
+    """
     together: list[dict[str, Any]] = []
     for part in parts:
         if together and len(together) + len(part) > _COMMANDS_AT_ONCE:
@@ -232,7 +234,9 @@ def _loss_rules(chain: str, port: str, loss: float) -> list[dict[str, Any]]:
 
 
 def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
-    """Yield each port in a verdict map of nftables, with the chain of rules for the packets of this port."""
+    """Yield (port, chain) for each port in a verdict map of nftables. The chain contains the rules for packets of this
+    port.
+    """
     for expressions in rules:
         for expression in expressions:
             if "vmap" in expression:
@@ -241,7 +245,7 @@ def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
 
 
 def _only_mark(rules: list[list[dict[str, Any]]]) -> int | None:
-    """Return the mark of the only group from which the receiver accepts packets, or None if it accepts all."""
+    """Return the mark of the only group from which the receiver accepts packets. Return None if it accepts all."""
     marks = [e["match"]["right"] for expressions in rules for e in expressions if "match" in e]
     return marks[0] if marks else None
 

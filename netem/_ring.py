@@ -71,8 +71,8 @@ class CaptureRing:
         return self._socket.fileno()
 
     def take(self) -> Iterator[tuple[int, bytes, bool]]:
-        """Yield the available frames as (time in Unix ns, frame, true if it leaves the port), at most one ring buffer
-        full.
+        """Yield the available frames as (time in Unix ns, frame, true if it leaves the port). One call yields at most
+        the content of one full ring buffer.
         """
         memory = self._memory
         for _ in range(self._blocks):

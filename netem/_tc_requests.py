@@ -71,8 +71,8 @@ _NETEM = struct.Struct("=6I")
 
 @dataclass(frozen=True)
 class TrafficClass:
-    """The conditions and packet counters of one traffic class. The kernel does not report the distribution of its
-    delay.
+    """The network conditions and packet counters of one traffic class. The kernel does not report the distribution of
+    the delay.
     """
 
     link: LinkConditions
@@ -122,7 +122,9 @@ class TrafficControl:
         return [NetlinkRequest("set class of htb", RTM_NEWTCLASS, message, _SET), self.change_class(kind, link)]
 
     def change_class(self, kind: int, link: LinkConditions, *, table: bool = True) -> NetlinkRequest:
-        """Return the request that sets the conditions of a traffic class. Without `table`, its distribution stays."""
+        """Return the request that sets the network conditions of a traffic class. Without `table`, the distribution of
+        the delay stays the same.
+        """
         options = _options(link, table)
         message = self._header(_HTB | kind, (0x8000 | kind) << 16) + text(_KIND, "netem") + options
         return NetlinkRequest("set qdisc netem", RTM_NEWQDISC, message, _SET)
@@ -131,7 +133,9 @@ class TrafficControl:
         return NetlinkRequest("delete class of htb", RTM_DELTCLASS, self._message("htb", _HTB, _HTB | kind))
 
     def mark(self, kind: int, group: int) -> NetlinkRequest:
-        """Return the request that assigns a kind and a group to packets that enter at this port."""
+        """Return the request that assigns the kind and group of the sender (see `netem.tc`) to packets that enter at
+        this port.
+        """
         parameters = attribute(2, struct.pack("=IIiii", 0, 0, _ACT_OK, 0, 0))
         edit = nested(1, text(1, "skbedit"), nested(2, parameters, number(3, _HTB | kind), number(5, group)))
         message = self._filter("basic", _INGRESS, 1, _ONLY, nested(3, edit))
@@ -147,7 +151,9 @@ class TrafficControl:
         return NetlinkRequest("delete filter fw", RTM_DELTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group))
 
     def read_mark(self, netlink: NetlinkSocket) -> tuple[int, int] | None:
-        """Return the kind and group that the kernel assigns to packets that enter at this port."""
+        """Return (kind, group) of the sender, which the kernel assigns to packets that enter at this port. Return None
+        if it assigns none.
+        """
         for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_INGRESS, 0)):
             edit = _inside(parse(entry[_TCMSG.size :]), _OPTIONS, 3, 1, 2)
             kind, group = parse_number(edit.get(3)), parse_number(edit.get(5))
@@ -196,7 +202,9 @@ class TrafficControl:
 
 
 def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
-    """Return the attributes at the end of a path of nested attributes, or none if the path does not exist."""
+    """Return the attributes inside nested attributes, found by the attribute types along `path`. Return none if the
+    path does not exist.
+    """
     for kind in path:
         attributes = parse(attributes.get(kind, b""))
     return attributes
@@ -204,7 +212,7 @@ def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
 
 @lru_cache(maxsize=1 << 12)
 def _options(link: LinkConditions, table: bool) -> bytes:
-    """Return the conditions in the format of netem's TCA_OPTIONS."""
+    """Return the network conditions in the format of netem's TCA_OPTIONS."""
     delay = link.delay or Delay(0)
     latency_ns, jitter_ns = _nanoseconds(delay.mean_s), _nanoseconds(delay.jitter_s)
     loss = 0 if isinstance(link.loss, GilbertElliott) else _share(link.loss)
@@ -243,7 +251,9 @@ def _table(distribution: Distribution) -> bytes:
 
 
 def _link(options: bytes) -> LinkConditions:
-    """Return netem's options as conditions. This is the inverse of `_options`, except for the distribution."""
+    """Return netem's options as network conditions. This is the inverse of `_options`, except for the distribution of
+    the delay.
+    """
     _, limit, loss, _, duplicate, _ = _NETEM.unpack_from(options)
     attributes = parse(options[_NETEM.size :])
     shares = (loss, duplicate, *(parse_number(attributes.get(key)) or 0 for key in (_NETEM_REORDER, _NETEM_CORRUPT)))

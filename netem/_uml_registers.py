@@ -31,8 +31,8 @@ _COMPILE = ("cc", "-O2", "-shared", "-fPIC", "-ffreestanding", "-nostdlib")
 
 
 def needed(kernel: Path | None) -> bool:
-    """Return true if User Mode Linux needs the library on this processor. None as the kernel means any known
-    version.
+    """Return true if User Mode Linux needs the library on this processor. If `kernel` is None, the answer does not
+    depend on the kernel's version.
     """
     if os.environ.get(FORCE):
         return True

@@ -1,4 +1,4 @@
-"""The addresses of vehicles. IP address, MAC address and port follow from the vehicle's ID.
+"""The addresses of vehicles. IP address, MAC address and the name of the switch port follow from the vehicle's ID.
 
 IDs may be 1 to 65535. A /16 network cannot hold all of them, because ID 65535 would be its broadcast address. The last
 two bytes of 10.77.x.y are therefore the ID, and the network is the larger 10.76.0.0/14. No ID reaches its network and

@@ -54,7 +54,8 @@ class LiveCapture:
 
     @classmethod
     async def start(cls, lab: Lab, folder: Path, vehicles: Sequence[int] | None = None) -> LiveCapture:
-        """Start to capture the ports of `vehicles`, by default of all vehicles. Raises LiveCaptureError.
+        """Start to capture frames at the switch ports of `vehicles`. The default is all vehicles. Raises
+        LiveCaptureError.
 
         Frames wait in memory until `begin`.
         """
@@ -85,7 +86,7 @@ class LiveCapture:
         await self._process.send_signal(signal.SIGUSR1)
 
     async def watch(self) -> None:
-        """Wait until the capture ends by itself, then raise LiveCaptureError."""
+        """Wait until the capture ends unexpectedly, then raise LiveCaptureError."""
         raise self._ended(await self._process.wait())
 
     async def stop(self) -> dict[int, dict[str, int]]:

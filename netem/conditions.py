@@ -1,4 +1,4 @@
-"""Represent network conditions (links and partitions) independently of the mechanism that applies them.
+"""Represent network conditions (conditions of links, and partitions) independently of the mechanism that applies them.
 
 As in the thesis, conditions belong to the receiver: each receiver of a broadcast draws separately. In addition, the
 link from one sender to one receiver can have conditions of its own, in one direction. `netem.link` defines the
@@ -22,7 +22,7 @@ __all__ = ["Delay", "Distribution", "GilbertElliott", "LinkConditions", "Network
 
 @dataclass(frozen=True)
 class NetworkConditions:
-    """The conditions of all links at one time.
+    """The network conditions of all links at one time.
 
     For a packet, the first match counts as a whole: `links` (by sender and receiver), then `receivers` (by receiving
     vehicle), then `default`. `partition` holds disjoint groups of vehicle IDs that cannot reach each other; empty
@@ -61,7 +61,7 @@ class NetworkConditions:
         object.__setattr__(self, "partition", groups)
 
     def link(self, sender: int, receiver: int) -> LinkConditions:
-        """Return the conditions of packets from `sender` to `receiver`, without regard to the partition."""
+        """Return the network conditions for packets from `sender` to `receiver`, without regard to the partition."""
         return self.links.get((sender, receiver)) or self.receivers.get(receiver, self.default)
 
     def is_cut(self, sender: int, receiver: int) -> bool:
@@ -75,7 +75,7 @@ class NetworkConditions:
         return not self.partition and all(link.lossless for link in links)
 
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the conditions other than independent loss and partition.
+        """Return the names of all network conditions in use, other than independent loss and partition.
 
         Each occurs once, with its first place: "delay", "receivers 3 reorder", "links 1>2 delay".
         """
@@ -87,7 +87,9 @@ class NetworkConditions:
         return tuple(asked.values())
 
     def differing_links(self) -> Iterator[tuple[int, int, LinkConditions]]:
-        """Yield (sender, receiver, conditions) for each link that differs from the other links to its receiver."""
+        """Yield (sender, receiver, conditions) for each link whose network conditions differ from those of the other
+        links to its receiver.
+        """
         for (sender, receiver), link in self.links.items():
             if link != self.receivers.get(receiver, self.default):
                 yield sender, receiver, link
@@ -102,15 +104,15 @@ class NetworkConditions:
         return tuple(frozenset(members[index]) for index in sorted(members))
 
     def with_partition(self, groups: Iterable[Iterable[int]]) -> NetworkConditions:
-        """Return the conditions with this partition."""
+        """Return these network conditions with this partition."""
         return replace(self, partition=tuple(frozenset(group) for group in groups))
 
     def healed(self) -> NetworkConditions:
-        """Return the conditions without a partition."""
+        """Return these network conditions without a partition."""
         return replace(self, partition=())
 
     def with_listener(self, listener: int, vehicles: Iterable[int]) -> NetworkConditions:
-        """Return the conditions with one more vehicle, whose links to and from `vehicles` are perfect.
+        """Return these network conditions with one more vehicle, whose links to and from `vehicles` are perfect.
 
         The listener must reach all groups. Therefore links with a loss of 1 replace the partition.
         """
@@ -120,7 +122,7 @@ class NetworkConditions:
         return replace(self, links={**self.links, **cut, **heard}, partition=())
 
     def at_speed(self, speedup: float) -> NetworkConditions:
-        """Return the conditions for a mission that runs `speedup` times as fast as wall time.
+        """Return these network conditions in wall time, for a mission that runs `speedup` times as fast as wall time.
 
         A kernel measures wall time. It needs delays that are shorter, and rates that are higher, by this factor.
         """
@@ -134,7 +136,7 @@ class NetworkConditions:
         )
 
     def validate(self, vehicles: Iterable[int]) -> None:
-        """Raise ConditionsError if the conditions name a vehicle that is not in `vehicles`."""
+        """Raise ConditionsError if the network conditions name a vehicle that is not in `vehicles`."""
         known = set(vehicles)
         named = [("receivers", frozenset(self.receivers)), ("links", frozenset(chain.from_iterable(self.links)))]
         named += [(f"partition[{index}]", group) for index, group in enumerate(self.partition)]
@@ -153,7 +155,7 @@ class NetworkConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> NetworkConditions:
-        """Return the conditions in this JSON object, which has the format of `to_json`. Raises ConditionsError."""
+        """Return the network conditions in a JSON object in the format of `to_json`. Raises ConditionsError."""
         keywords(cls, value)
         return cls(
             LinkConditions.from_json(value.get("default", {})),

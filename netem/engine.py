@@ -1,4 +1,5 @@
-"""Define the interface of engines. An engine makes the kernel apply conditions to packets, and reports the result.
+"""Define the interface of engines. An engine makes the kernel apply network conditions to packets, and reports the
+result.
 
 There are two engines: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). For each receiver, both report the kernel's
 counts of passed, lost and cut packets. The counts start with the lab and are not reset by a change. After each change,
@@ -32,7 +33,7 @@ _MAX_WORDS = 600  # characters of conditions in an error message
 
 @dataclass(frozen=True)
 class ReceiverFigures:
-    """The conditions and packet counters of the kernel for one receiver.
+    """The network conditions and packet counters that the kernel reports for one receiver.
 
     `link` applies to all senders except those in `links`. `cut_from` lists the senders that a partition separates.
     `passed`, `lost` (by chance or a full queue) and `cut` count packets since the start of the lab. A broadcast counts
@@ -48,18 +49,20 @@ class ReceiverFigures:
 
     @classmethod
     def of(cls, held: Mapping[int, LinkConditions], cut_from: tuple[int, ...], *counts: int) -> ReceiverFigures:
-        """Return the figures for one receiver from the conditions of each sender."""
+        """Return the object for one receiver. `held` contains the network conditions of each sender. The most frequent
+        ones become `link`.
+        """
         ((usual, _),) = Counter(held.values()).most_common(1) or [(LinkConditions(), 0)]
         differing = {sender: link for sender, link in held.items() if link != usual}
         return cls(usual, differing, cut_from, *counts)
 
     @property
     def loss(self) -> float | GilbertElliott:
-        """The loss of `link`: a probability, or a model of loss in bursts."""
+        """The loss that `link` contains: a probability, or a model of loss in bursts."""
         return self.link.loss
 
     def from_sender(self, sender: int) -> LinkConditions:
-        """Return the conditions for packets of this sender, without regard to the partition."""
+        """Return the network conditions for packets of this sender, without regard to the partition."""
         return self.links.get(sender, self.link)
 
     def to_json(self) -> dict[str, Any]:
@@ -98,28 +101,30 @@ class AppliedConditions:
 
 
 class Engine(ABC):
-    """A mechanism that applies conditions at the ports of the virtual switch."""
+    """A mechanism that applies network conditions at the ports of the virtual switch."""
 
     name: ClassVar[str]
     has_queues: ClassVar[bool]
     """True if the engine supports all conditions. Otherwise it supports only independent loss and partitions."""
 
     def __init__(self, fabric: VirtualSwitch) -> None:
-        """Install the engine, without loss and delay at first. Raises EngineError if the kernel does not support it."""
+        """Install the engine, at first without loss and delay. Raises EngineError if the kernel does not support the
+        engine.
+        """
         self._fabric = fabric
         self._vehicles = fabric.vehicles
         self._in_force = NetworkConditions()
 
     @abstractmethod
     def change(self, conditions: NetworkConditions) -> None:
-        """Request conditions from the kernel. Raises EngineError with the kernel's message if it refuses."""
+        """Request network conditions from the kernel. Raises EngineError with the kernel's message if refused."""
 
     @abstractmethod
     def read(self) -> AppliedConditions:
-        """Return the conditions and counters that the kernel reports."""
+        """Return the network conditions and packet counters that the kernel reports."""
 
     def apply(self, conditions: NetworkConditions) -> AppliedConditions:
-        """Change the conditions, and return the state that the kernel reports afterwards.
+        """Change the network conditions. Return the state that the kernel reports afterwards.
 
         Raises ConditionsError for an unknown vehicle. Raises EngineError if the engine does not support the conditions,
         if the kernel refuses them, or if its state differs from them. Then the previous conditions are restored, or the

@@ -8,7 +8,7 @@ class NetemError(Exception):
 
 
 class ConditionsError(NetemError, ValueError):
-    """An error: conditions are invalid. The message names the key, the value and the allowed values."""
+    """An error: network conditions are invalid. The message names the key, the value and the allowed values."""
 
 
 class NetlinkError(NetemError):
@@ -20,7 +20,7 @@ class NetlinkError(NetemError):
 
 
 class EngineError(NetemError):
-    """An error: an engine cannot be used, or the kernel refused a change of conditions."""
+    """An error: an engine cannot be used, or the kernel refused a change of network conditions."""
 
 
 class LabError(NetemError):
@@ -38,7 +38,7 @@ class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
 
 
 class SpawnError(LabError):
-    """An error: a program could not be started in the virtual network. The message includes that of the operating
+    """An error: a program could not be started in the virtual network. The text includes the message of the operating
     system.
     """
 
@@ -48,4 +48,4 @@ class UmlError(NetemError):
 
 
 class LiveCaptureError(NetemError):
-    """An error: a packet capture could not be started, or ended early."""
+    """An error: a packet capture could not be started, or ended before it was stopped."""

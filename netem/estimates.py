@@ -37,7 +37,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class MachineLateness:
-    """The delays of the machine itself in seconds: of packets in a stream, and of timers."""
+    """The delays that the machine itself adds, in seconds: to packets of a stream, and to timers."""
 
     way_s: Sequence[float]
     timers_s: Sequence[float]
@@ -45,7 +45,7 @@ class MachineLateness:
 
 @dataclass(frozen=True)
 class ReceivedStream:
-    """The packets of one sender that one receiver received. Packets are numbered from 0.
+    """The packets of one sender that one receiver received. The packets are numbered from 0.
 
     `sent_s` are the sending times. `arrivals` are (number, time) of each received copy, in order of time.
     """
@@ -59,12 +59,12 @@ _NOTHING = Estimate(0.0, 0.0, 0.0, 0)
 
 
 def lost(received: ReceivedStream) -> Estimate:
-    """Return the share of lost packets, if losses are independent."""
+    """Estimate the share of lost packets, under the assumption that losses are independent."""
     return share(sum(_losses(received)), len(received.sent_s))
 
 
 def lost_in_bursts(received: ReceivedStream) -> Estimate:
-    """Return the share of lost packets, if losses follow a Markov chain with two states."""
+    """Estimate the share of lost packets, under the assumption that losses follow a Markov chain with two states."""
     losses = _losses(received)
     return share(sum(losses), len(losses), worth=_independence(losses))
 
@@ -88,7 +88,7 @@ def duplicated(received: ReceivedStream) -> Estimate:
 
 
 def undelayed(received: ReceivedStream, delay_s: float) -> Estimate:
-    """Return the share of received packets that took less than half the delay."""
+    """Return the share of received packets whose delay was less than half of `delay_s`."""
     sent_s = received.sent_s
     return share(sum(at_s - sent_s[number] < delay_s / 2 for number, at_s in received.arrivals), len(received.arrivals))
 
@@ -128,7 +128,7 @@ def rate(received: ReceivedStream, packet_bits: int) -> Estimate:
 
 
 def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
-    """Return the number of packets that waited for their delay when one was lost. This is the queue limit.
+    """Estimate the limit of the delay queue: the number of packets that waited in it when a packet was lost.
 
     For each lost packet, some packets must still have waited, because their delay was not over. Others may have waited,
     because they had not arrived yet. The medians of both numbers are the limits.
@@ -151,7 +151,7 @@ def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
 
 
 def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
-    """Return the share of `hits` in `count` draws. Each counts as `worth` independent draws (Wilson, 1927)."""
+    """Return the share of `hits` in `count` draws. Each draw counts as `worth` independent draws (Wilson, 1927)."""
     if count == 0:
         return _NOTHING
     ratio, draws = hits / count, count * worth
@@ -162,7 +162,7 @@ def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
 
 
 def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
-    """Return the mean of independent values from `packets` packets. By default, there is one value per packet."""
+    """Estimate the mean of independent values from `packets` packets. By default, there is one value per packet."""
     if len(values) < 2:
         return _NOTHING
     average, margin = fmean(values), _Z * math.sqrt(variance(values) / len(values))
@@ -170,7 +170,7 @@ def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
 
 
 def deviation(values: Sequence[float]) -> Estimate:
-    """Return the standard deviation of independent values of any distribution."""
+    """Estimate the standard deviation of independent values, whose distribution is unknown."""
     if len(values) < 2:
         return _NOTHING
     middle = fmean(values)
@@ -185,8 +185,8 @@ def _losses(received: ReceivedStream) -> list[bool]:
 
 
 def _independence(losses: Sequence[bool]) -> float:
-    """Return the number of independent draws to which one draw of a correlated sequence is equivalent: (1 - c) / (1 +
-    c).
+    """Return the number of independent draws that give as much information as one draw of a correlated sequence: (1 -
+    c) / (1 + c).
     """
     loss = fmean(losses)
     if not 0 < loss < 1:

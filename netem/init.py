@@ -255,7 +255,9 @@ class LabServer:
     # Children
 
     def _reap(self, _: int) -> None:
-        """Report child processes that ended. Orphans, which the kernel assigns to this process, are only removed."""
+        """Report the child processes that have ended. Orphans, which the kernel assigns to this process, are removed
+        without a report.
+        """
         with contextlib.suppress(BlockingIOError):
             os.read(self._wake, 4096)
         while True:

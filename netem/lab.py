@@ -188,7 +188,7 @@ class Lab:
     async def _start(
         self, engine: EngineName | None, needs: Sequence[str], networks: Mapping[int, int], log: Path
     ) -> str | None:
-        """Build the network. Return the error message of the tool that could not enter namespaces, otherwise None."""
+        """Build the network. Return None on success, or the message of a tool that could not enter namespaces."""
         if not await self._channel.inside():
             await self.close()
             message = _last_line(log)
@@ -221,7 +221,7 @@ class Lab:
 
     @property
     def network(self) -> Self:
-        """The virtual network itself. A network of containers returns the network on which it is built."""
+        """This virtual network. In a network of containers, the same property returns the virtual network under it."""
         return self
 
     async def spawn(
@@ -278,7 +278,7 @@ class Lab:
         return AppliedConditions.from_json(result)
 
     async def read(self) -> AppliedConditions:
-        """Return the conditions and counters that the kernel reports."""
+        """Return the network conditions and packet counters that the kernel reports."""
         result, _ = await self._channel.ask("read")
         return AppliedConditions.from_json(result)
 
@@ -288,7 +288,7 @@ class Lab:
         return {int(vehicle): UdpCounters(**counted) for vehicle, counted in result.items()}
 
     async def watch(self) -> None:
-        """Wait until the virtual network fails by itself, then raise LabError."""
+        """Wait until the virtual network fails, then raise LabError."""
         await self._process.wait()
         raise LabError("The lab's first process ended unexpectedly")
 

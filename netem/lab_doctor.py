@@ -33,7 +33,9 @@ class LabRequirement:
 
 
 def examine() -> list[LabRequirement]:
-    """Return all requirements of a virtual network in order of dependence. This takes about half a second."""
+    """Return all requirements of a virtual network. A requirement follows those on which it depends. This takes about
+    half a second.
+    """
     ok, message = _namespaces.probe()
     requirements = [LabRequirement("namespaces", ok, message, "" if ok else _namespaces.way_out(message))]
     if not ok:

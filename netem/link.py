@@ -1,4 +1,5 @@
-"""Represent the conditions of packets from one vehicle to another: loss, delay, duplicates, reordering, and more.
+"""Represent the network conditions of packets from one vehicle to another: loss, delay, duplicates, reordering, and
+more.
 
 Names and meanings are those of tc-netem(8). The random draws of each packet are independent. JSON omits default values,
 so that a plain loss reads {"loss": 0.1}.
@@ -102,7 +103,7 @@ class Delay:
 
 @dataclass(frozen=True)
 class LinkConditions:
-    """The conditions of packets to one receiver, from all senders or from one.
+    """The network conditions of packets to one receiver, from all senders or from one.
 
     `loss` is the probability, 0 to 1, that a packet is lost, drawn for each packet, or a model of bursts. `duplicate`
     is the probability that a packet arrives twice. It is drawn together with the loss: if a packet is both lost and
@@ -161,7 +162,7 @@ class LinkConditions:
 
     @property
     def remembers(self) -> bool:
-        """True if the result of a packet depends on earlier packets from the same sender to the same receiver."""
+        """True if the fate of a packet depends on earlier packets from the same sender to the same receiver."""
         return isinstance(self.loss, GilbertElliott) or self.rate is not None or self.limit is not None
 
     @property
@@ -172,7 +173,7 @@ class LinkConditions:
         return self.loss
 
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the conditions other than independent loss, such as "delay"."""
+        """Return the names of the network conditions in use, other than independent loss, such as "delay"."""
         asked = {
             "loss in bursts": isinstance(self.loss, GilbertElliott),
             "delay": self.delay is not None,
@@ -185,7 +186,7 @@ class LinkConditions:
         return tuple(key for key, needed in asked.items() if needed)
 
     def at_speed(self, speedup: float) -> Self:
-        """Return the conditions in wall time for a mission that runs `speedup` times as fast.
+        """Return the network conditions in wall time for a mission that runs `speedup` times as fast.
 
         Delays become shorter, and the rate higher.
         """
@@ -209,7 +210,7 @@ class LinkConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> LinkConditions:
-        """Return the conditions in this JSON object, which has the format of `to_json`. Raises ConditionsError."""
+        """Return the network conditions in a JSON object in the format of `to_json`. Raises ConditionsError."""
         known = keywords(cls, value)
         for key, kind in (("loss", GilbertElliott), ("delay", Delay)):
             if isinstance(known.get(key), Mapping):

@@ -1,4 +1,4 @@
-"""Measure how a network treats packets, and compare the results with the requested conditions.
+"""Measure how a network treats packets, and compare the results with the requested network conditions.
 
 A *study* consists of a network, broadcasts in it, and questions about figures of the packets from one sender to one
 receiver. Each receiver has its own conditions, so one stream answers many questions. `measure` gives studies to an
@@ -47,7 +47,7 @@ _FIRST_FREE = 4
 
 @dataclass(frozen=True)
 class MeasuredQuantity:
-    """A comparison to make: the estimate from the packets between two vehicles should equal `asked`."""
+    """A comparison to make: the value that is estimated from the packets between two vehicles should equal `asked`."""
 
     sender: int
     receiver: int
@@ -75,7 +75,7 @@ class NetworkStudy:
 
     @property
     def vehicles(self) -> tuple[int, ...]:
-        """All vehicles of the measurement, including a reference vehicle that no condition affects."""
+        """All vehicles of the measurement, including a reference vehicle with perfect links."""
         conditions = self.conditions
         named = {*conditions.receivers, *chain(*conditions.links), *chain(*conditions.partition)}
         return tuple(sorted({*self.senders, *self.receivers, *named, REFERENCE}))
@@ -87,7 +87,9 @@ Observer = Callable[[NetworkStudy, int], Mapping[tuple[int, int], ReceivedStream
 
 @dataclass(frozen=True)
 class AnswerRow:
-    """A comparison and its result. `before` is the first result if it was wrong, and the measurement was repeated."""
+    """A comparison and its result. If the first result was wrong, the measurement was repeated, and `before` is the
+    first result.
+    """
 
     engine: str
     question: MeasuredQuantity
@@ -109,7 +111,7 @@ class AnswerRow:
 
 @dataclass(frozen=True)
 class EngineMeasurement:
-    """All results for one engine, and the delays of the machine in seconds."""
+    """All measurement results for one engine, and the delays in seconds that the machine itself adds."""
 
     engine: str
     rows: tuple[AnswerRow, ...]
@@ -160,7 +162,8 @@ def _answer(question: MeasuredQuantity, streams: Mapping[tuple[int, int], Receiv
 
 
 def studies(engine: str) -> tuple[NetworkStudy, ...]:
-    """Return the measurements for an engine: loss and partitions for "nftables", all conditions for the others.
+    """Return the measurements for an engine: loss and partitions for "nftables", all network conditions for the other
+    engines.
 
     Duplicates have their own study, because some kernels do not allow them beside other conditions (see `netem.tc`).
     """
@@ -172,7 +175,7 @@ def studies(engine: str) -> tuple[NetworkStudy, ...]:
 
 @dataclass(frozen=True)
 class _LinkCase:
-    """The conditions of a link, and the comparisons to make as (quantity, requested value, estimate, unit)."""
+    """The network conditions of a link, and the comparisons to make as (quantity, requested value, estimate, unit)."""
 
     condition: str
     link: LinkConditions
@@ -187,8 +190,8 @@ def _losses() -> list[_LinkCase]:
 
 
 def _other_conditions(noticed: float) -> list[_LinkCase]:
-    """Return the conditions other than loss and duplicates. `noticed` is the share of corrupted packets that are
-    detected.
+    """Return the network conditions other than loss and duplicates. `noticed` is the share of corrupted packets that
+    are detected.
     """
     bursts = GilbertElliott(p=0.05, r=0.25)
     fixed, jitter_s = Delay(0.1), 0.02
@@ -240,7 +243,7 @@ def _duplicates() -> list[_LinkCase]:
 
 
 def _receivers(cases: Sequence[_LinkCase]) -> NetworkStudy:
-    """Return a measurement with one sender, and a receiver for each of these conditions."""
+    """Return a measurement with one sender. It has one receiver for each of these network conditions."""
     numbered = dict(enumerate(cases, _FIRST_FREE))
     questions = [
         MeasuredQuantity(_SENDER, receiver, case.condition, *figure)
@@ -252,8 +255,8 @@ def _receivers(cases: Sequence[_LinkCase]) -> NetworkStudy:
 
 
 def _pairs() -> NetworkStudy:
-    """Return a measurement with two simultaneous senders, different losses for single links, and one separated
-    vehicle.
+    """Return a measurement with two simultaneous senders. Some single links have their own loss, and one vehicle is
+    separated.
     """
     there, back, rest = 0.4, 0.1, 0.2
     conditions = NetworkConditions(

@@ -1,4 +1,4 @@
-"""Deliver broadcasts in virtual time. Random numbers from a seed decide about losses and delays.
+"""Deliver broadcasts in virtual time. Seeded random numbers decide about losses and delays.
 
 The medium is the third engine beside tc netem and nftables. It applies the same conditions without a kernel and without
 packets. Each receiver of a broadcast draws separately. With neither a delay nor a rate in the conditions, the latency
@@ -47,14 +47,14 @@ class RandomDraws(Protocol):
     """Upper bound, in seconds, of the time from sending to the arrival of any copy."""
 
     def copies_to(self, receiver: int) -> tuple[float, ...]:
-        """Return the delays in seconds of all copies that arrive at this receiver."""
+        """Return the delay in seconds of each copy of the packet that arrives at this receiver."""
 
     def to_all(self) -> list[tuple[int, float]]:
-        """Return (receiver, delay in seconds) for each copy that arrives, in the order of receivers."""
+        """Return (receiver, delay in seconds) for each copy of the packet that arrives, in the order of receivers."""
 
 
 class Medium:
-    """The simulated network between `vehicles`. Conditions are perfect until `apply` is called."""
+    """The simulated network between `vehicles`. Network conditions are perfect until `apply` is called."""
 
     def __init__(self, vehicles: Sequence[int], seed: int, latency: Delay = LATENCY) -> None:
         self.latency = latency
@@ -73,7 +73,7 @@ class Medium:
         self.apply(NetworkConditions())
 
     def apply(self, conditions: NetworkConditions) -> None:
-        """Apply these conditions to later broadcasts. Raises ConditionsError for an unknown vehicle.
+        """Apply these network conditions to broadcasts from now on. Raises ConditionsError for an unknown vehicle.
 
         Messages under way are not affected. A link keeps its queue if the old and the new conditions both need one. As
         in a kernel, loss in bursts starts in the good state after each change of the link's conditions.
@@ -88,7 +88,7 @@ class Medium:
         self.latest = max(self.latest, *(air.latest for air in self._air))
 
     def certain_delays(self) -> tuple[float, float] | None:
-        """Return the smallest and largest delay in seconds, or None if messages may be lost."""
+        """Return the smallest and largest delay in seconds. Return None if messages may be lost."""
         if not all(air.certain for air in self._air):
             return None
         return min(air.soonest_of_all for air in self._air), max(air.latest for air in self._air)
@@ -122,7 +122,7 @@ class Medium:
 
 
 class _SenderLinks(Protocol):
-    """The links of one sender under one set of conditions."""
+    """The links of one sender while the network conditions stay the same."""
 
     soonest_of_all: float
     latest: float
@@ -236,7 +236,7 @@ def _draw(stream: Random, count: int) -> array[int]:
 
 
 class _GeneralSenderLinks:
-    """Links with any conditions. The random numbers of each receiver are independent of the other receivers."""
+    """Links with any network conditions. The random numbers of each receiver are independent of the other receivers."""
 
     soonest_of_all = 0.0
     latest = inf
@@ -290,7 +290,9 @@ class _Link:
             self._last, self._departures = before._last, before._departures
 
     def enqueue(self, now: float, bits: int, lots: _Copy, second: _Copy | None = None) -> tuple[float, ...]:
-        """Return the delays of the copies that arrive: of a packet sent at the time `now`, and of its duplicate."""
+        """Send a packet at the time `now`. Return the delay of each copy that arrives: of the packet, and of its
+        duplicate if there is one.
+        """
         conditions = self.conditions
         loss, turn, corruption, reordering, latency = lots
         lost = self._loses(loss, turn)

@@ -1,4 +1,4 @@
-"""Provide the packets for measurements: real packets in a virtual network, or packets in virtual time."""
+"""Provide the packets for measurements: real packets in a virtual network, or simulated packets in virtual time."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ _TRY_AGAIN = "this machine is too busy to measure just now: try again when it is
 
 
 def in_medium(seed: int) -> Observer:
-    """Return a function that measures simulated packets, which have no delays of the machine. All depend on the
-    seed.
+    """Return a function that measures simulated packets, which have no delays of the machine. All its results depend on
+    the seed.
     """
     streams = itertools.count()
 
@@ -134,7 +134,7 @@ def check(
     received_packets: Mapping[tuple[int, int], Sequence[PacketArrival]],
     counted: AppliedConditions,
 ) -> None:
-    """Raise DisturbedError if the machine lost packets. With corruption, the cause of a loss is unknown."""
+    """Raise DisturbedError if the machine lost packets. If packets were corrupted, the cause of a loss is unknown."""
     for vehicle, report in reports.items():
         links = [link for link in received_packets if link[1] == vehicle]
         if report["overflow"]:
@@ -153,7 +153,7 @@ class PacketArrival(NamedTuple):
 
 
 def _arrivals(report: Mapping[str, Any], own: range) -> list[PacketArrival]:
-    """Return the received packets of one sender, which have these numbers."""
+    """Return the received packets whose numbers are in `own`, the numbers of one sender. Count them from 0."""
     each = zip(report["numbers"], report["at_s"], report["delays_s"], strict=True)
     return [PacketArrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
 

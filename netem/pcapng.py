@@ -80,7 +80,7 @@ class PcapngFile:
         self._append(b"".join((head, frame, bytes(padding), _DIRECTIONS[outbound], _BLOCK_LENGTH.pack(length))))
 
     def statistics(self, at_ns: int, received: int, dropped: int) -> None:
-        """Append the number of frames at the interface, and the number of those that this file lacks."""
+        """Append the number of frames at the interface, and the number of frames that are missing in this file."""
         counts = _option(_ISB_IFRECV, struct.pack("<Q", received)) + _option(_ISB_IFDROP, struct.pack("<Q", dropped))
         at = struct.pack("<III", 0, at_ns >> 32, at_ns & 0xFFFFFFFF)
         self._append(_block(_STATISTICS, at + counts + _END_OF_OPTIONS))

@@ -109,7 +109,7 @@ class LogDistance:
 
 
 def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], float]:
-    """Return the loss rate of each pair of vehicles, rounded to steps. Pairs without loss are omitted."""
+    """Return the loss rate for each pair of vehicles, rounded to steps. Pairs without loss are omitted."""
     losses: dict[frozenset[int], float] = {}
     for first, second in combinations(places, 2):
         if lost := round(radio.loss(places[first].distance_m(places[second])) * STEPS) / STEPS:

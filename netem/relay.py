@@ -72,7 +72,7 @@ class ReceivedBroadcast:
     """The Ethernet frame behind its `virtio_net_hdr`."""
 
     def udp_data(self, port: int) -> bytes | None:
-        """Return the data of an unfragmented IPv4 UDP datagram to this port, or None for any other frame."""
+        """Return the data of an unfragmented IPv4 UDP datagram to this port. Return None for any other frame."""
         at = _VNET_BYTES + _ETHERNET_BYTES
         frame = self.frame
         if frame[at - 2 : at] != _IPV4 or len(frame) < at + _IP_MIN_BYTES:
@@ -88,7 +88,8 @@ class ReceivedBroadcast:
 
 
 class Relay:
-    """The broadcasts to these vehicles, taken over between `open` and `close`. Raises OSError without packet sockets.
+    """A relay that takes the broadcasts to these vehicles out of the switch between `open` and `close`. Raises OSError
+    if packet sockets are not available.
 
     `others` are further vehicles of the lab. The relay takes their broadcasts too, but the switch still floods the
     broadcasts of all vehicles to them.
@@ -125,7 +126,7 @@ class Relay:
         self._flood(False)
 
     def close(self) -> None:
-        """Let the switch deliver broadcasts again."""
+        """Let the switch deliver broadcasts as before `open`."""
         self._flood(True)
         self._input.close()
 
@@ -162,7 +163,7 @@ class Relay:
 
 
 def _socket(protocol: int) -> socket.socket:
-    """Return a packet socket that receives frames of this protocol. Protocol 0 receives none."""
+    """Return a packet socket that receives frames of this Ethernet protocol. It receives none if the protocol is 0."""
     packets = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(protocol))
     packets.setsockopt(_SOL_PACKET, _VNET_HDR, 1)
     return packets

@@ -1,4 +1,4 @@
-"""The engine "netem": it applies all conditions with the kernel's netem at the switch ports.
+"""The engine "netem": it applies all network conditions with the kernel's netem at the switch ports.
 
 A packet gets two numbers at its sender's port: the group of its sender in a partition, and the *kind* of its sender.
 All receivers treat senders of one kind alike. At the receiver's port it passes two stages. Packets of other groups are
@@ -47,7 +47,7 @@ _SURE_JITTER_S = (2**31 - 1) / 1e9
 
 
 def may_refuse(conditions: NetworkConditions) -> bool:
-    """Return true if some kernels with netem refuse these conditions. The module's docstring explains why."""
+    """Return true if some kernels with netem refuse these network conditions. The module's docstring explains why."""
     links = (conditions.default, *conditions.receivers.values(), *conditions.links.values())
     return any(link.duplicate or (link.delay and link.delay.jitter_s > _SURE_JITTER_S) for link in links)
 
@@ -62,14 +62,16 @@ class _RemovedClassTotals:
 
 @dataclass
 class _ClassState:
-    """The last conditions of a traffic class, or None after the kernel refused them. `distribution` names its table."""
+    """The network conditions that were last set for a traffic class, or None if the kernel refused them. `distribution`
+    is that of the delay.
+    """
 
     link: LinkConditions | None
     distribution: Distribution = "uniform"
 
 
 class NetemEngine(Engine):
-    """An engine for all conditions of netem, for each pair of sender and receiver."""
+    """An engine that applies all network conditions of netem, for each pair of sender and receiver."""
 
     name = "netem"
     has_queues = True
@@ -143,7 +145,7 @@ class NetemEngine(Engine):
         self._loss_conditions = figures
 
     def _set(self, receiver: int, links: dict[int, LinkConditions]) -> None:
-        """Set the conditions at the receiver's port. Only differences are sent to the kernel."""
+        """Set the network conditions at the receiver's port. Only differences are sent to the kernel."""
         port, held = self._ports[receiver], self._classes[receiver]
         requests: list[NetlinkRequest] = []
         changed: dict[int, _ClassState] = {}
@@ -162,7 +164,7 @@ class NetemEngine(Engine):
         held.update(changed)
 
     def _move(self, kinds: _Numbers, groups: _Numbers) -> None:
-        """Move all senders from their old groups to the new ones."""
+        """Assign all senders to their new kinds and groups."""
         kind, group = _numbers(kinds), _numbers(groups)
         new = {vehicle: (kind[vehicle], group[vehicle]) for vehicle in self._vehicles}
         accepting = [vehicle for vehicle in self._vehicles if group[vehicle] not in self._accepted[vehicle]]
@@ -202,7 +204,7 @@ class NetemEngine(Engine):
                     self._removed[receiver].lost += counted.dropped
 
     def _read_classes(self) -> dict[int, dict[int, TrafficClass]]:
-        """Return the traffic classes at each receiver's port."""
+        """Return the traffic classes at the port of each receiver."""
         classes = TrafficControl.classes(self._netlink)
         return {vehicle: classes.get(port.index, {}) for vehicle, port in self._ports.items()}
 
@@ -248,7 +250,9 @@ class NetemEngine(Engine):
         return ReceiverFigures.of(held, tuple(cut_from), passed, lost, cut)
 
     def _with_distribution(self, link: LinkConditions, receiver: int, kind: int) -> LinkConditions:
-        """Return the conditions that the kernel reports, with the distribution, which it does not report."""
+        """Return the network conditions that the kernel reports, and add the distribution of the delay, which the
+        kernel omits.
+        """
         holds = self._classes[receiver].get(kind)
         if link.delay is None or not link.delay.jitter_s or holds is None or holds.distribution == "uniform":
             return link
@@ -256,7 +260,9 @@ class NetemEngine(Engine):
 
 
 def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[frozenset[int]]:
-    """Return groups of senders that have the same conditions at every receiver."""
+    """Divide senders into groups that have the same network conditions at every receiver. A sender on a link with
+    memory is alone.
+    """
     shared = (conditions.default, *conditions.receivers.values())
     own: dict[int, list[object]] = {vehicle: [] for vehicle in vehicles}
     for sender, receiver, link in conditions.differing_links():
@@ -272,7 +278,7 @@ def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[fro
 
 
 def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> dict[int, LinkConditions]:
-    """Return the conditions of one receiver for each group of senders.
+    """Return one receiver's network conditions for each group of senders.
 
     A single vehicle has conditions for itself.
     """
@@ -282,7 +288,7 @@ def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> d
 
 
 def _number(sets: Iterable[frozenset[int]], before: _Numbers, taken: Iterable[int]) -> _Numbers:
-    """Return numbers for sets of vehicles. A set that existed before keeps its number."""
+    """Assign numbers to sets of vehicles. A set that had a number before keeps it."""
     used = {*taken, *before.values()}
     free = (number for number in range(1, MAX_KIND) if number not in used)
     return {members: before[members] if members in before else next(free) for members in sets}

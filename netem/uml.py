@@ -277,7 +277,7 @@ def _write(target: BinaryIO, data: bytes) -> None:
 
 
 def _exit_status(received: bytes) -> int | None:
-    """Return the exit status, or None if its line is not complete yet."""
+    """Return the exit status. Return None if the line with the status is not complete yet."""
     *lines, _ = received.split(b"\n")
     return next((int(line) for line in lines if line.strip()), None)
 

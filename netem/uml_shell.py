@@ -57,8 +57,8 @@ def guests(proc: Path = Path("/proc")) -> list[Path]:
 
 
 def enter(folder: Path, argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
-    """Run a program in the virtual machine with this terminal, and return its exit status. Raises UmlError if that
-    fails.
+    """Run a program, connected to this terminal, in the virtual machine. Return its exit status. Raises UmlError if the
+    program cannot be run.
     """
     try:
         with (folder / _LOCK).open("w") as lock:
@@ -131,7 +131,7 @@ def _copy_until_end(folder: Path, token: bytes, keys: int, screen: io.FileIO) ->
 
 
 def _certain_length(output: bytes) -> int:
-    """Return the length of the output that certainly does not belong to the end mark."""
+    """Return the length of the output that cannot be a part of the end mark."""
     at = output.rfind(b"\0", -END_MARK_BYTES)
     return at if at >= 0 else len(output)
 

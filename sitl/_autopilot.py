@@ -215,7 +215,9 @@ class Autopilot:
         return ACCEPTED
 
     def load(self, mission: Sequence[Any]) -> None:
-        """Replace the mission. A mission in progress continues with the items of the same numbers."""
+        """Replace the mission. A mission in progress continues with the item that has the same number in the new
+        mission.
+        """
         self.mission = mission
         if not self._in_mission:
             self.current_item = 0
@@ -380,7 +382,9 @@ class Autopilot:
         self._begin(self._model.go_to(self.motion, place, speed_ms, self._place_before(number)), self._item_reached)
 
     def _place_before(self, number: int) -> LocalPlace | None:
-        """Return the place of the previous mission item, or None if it has no place."""
+        """Return the place of the previous mission item, without regard to changes of speed. Return None if this item
+        has no place.
+        """
         for item in reversed(self.mission[1:number]):
             match item.command:
                 case mavlink.MAV_CMD_NAV_WAYPOINT | mavlink.MAV_CMD_NAV_LOITER_TIME:
@@ -391,7 +395,9 @@ class Autopilot:
         return None
 
     def _place_after(self, number: int) -> LocalPlace | None:
-        """Return the place of the next mission item other than a change of speed, or None."""
+        """Return the place of the next mission item that is not a change of speed. Return None if there is no such
+        item.
+        """
         places = (item for item in self.mission[number + 1 :] if item.command != mavlink.MAV_CMD_DO_CHANGE_SPEED)
         item = next(places, None)
         return None if item is None else self.place(item.frame, item.x, item.y, item.z)

@@ -1,4 +1,4 @@
-"""Compute the motion of a copter, with ArduCopter's default parameters or measurements with ArduCopter 4.7."""
+"""Compute the motion of a copter, from ArduCopter's default parameters or from measurements with ArduCopter 4.7."""
 
 from __future__ import annotations
 
@@ -70,6 +70,6 @@ class CopterMotion:
         return [*segments, RestSegment(end_of(segments), 0.0)]
 
     def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
-        """Take off, and stay above that place."""
+        """Take off, and stay above the place of the take-off."""
         climb = self.take_off(start, altitude_m)
         return [*climb, RestSegment(end_of(climb), math.inf)]

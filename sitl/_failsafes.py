@@ -98,11 +98,13 @@ class Failsafes:
         return max(SLOWEST_MS, speed_ms - head_ms) if head_ms else speed_ms
 
     def volts(self, used: float) -> float:
-        """Return the voltage of the battery after use of this share of it, 0 to 1."""
+        """Return the battery voltage after the share `used` of the charge, 0 to 1, was used."""
         return max(0.0, self.parameters[VOLTS] - BATTERY_USED_V * used)
 
     def action(self, failsafe: Failsafe) -> str | None:
-        """Return the flight mode to which a failsafe of the battery, a link or the fence switches, or None."""
+        """Return the flight mode that the vehicle enters when this failsafe acts. Return None if it stays in its mode.
+        The failsafe concerns the battery, a link or the fence.
+        """
         kind = self._vehicle_type
         if failsafe == "fence":
             return FENCE_ACTIONS[kind].get(self.parameters[FENCE_ACTION])
@@ -128,7 +130,7 @@ class Failsafes:
         return silent and self._is_on(WHEN_SILENT)
 
     def look(self, now_s: float, used: float, place: LocalPlace, station_heard_s: float | None) -> Failsafe | None:
-        """Return the next failsafe that acts now, or None. The caller repeats the call until it returns None.
+        """Return the next failsafe that acts now. Return None if there is none. The caller repeats the call until then.
 
         `place` is in metres from home. `station_heard_s` is the time of the last heartbeat of the ground station. None
         means that it was never heard, and the vehicle does not miss it then.

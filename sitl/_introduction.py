@@ -25,7 +25,9 @@ _GIVEN = ProcedureStep("the parameters that it was given")
 
 
 class VehicleIntroduction:
-    """The requests for version and parameters. `given` contains parameters that the vehicle has, or must get now."""
+    """The requests for version and parameters. `given` contains parameters that the vehicle must have. The pilot sets
+    those that differ.
+    """
 
     purpose = "introduce itself"
 
@@ -60,7 +62,7 @@ class VehicleIntroduction:
                 link.request_parameter(name)  # ArduPilot lists none of a group that is switched off
 
     def _ask_for_list(self) -> None:
-        """Request all parameters at first, and later those that are still missing."""
+        """Request all parameters until the first one arrives. When no more arrive, request the missing ones."""
         link = self._link
         if link.parameter_count is None:
             link.request_parameters()
@@ -74,5 +76,5 @@ class VehicleIntroduction:
 
 
 def _as_float(value: float) -> float:
-    """Return the value as a 32-bit float, which is the precision of MAVLink."""
+    """Return the value rounded to a 32-bit float, which is the precision of MAVLink."""
     return float(struct.unpack("<f", struct.pack("<f", value))[0])

@@ -187,7 +187,9 @@ class FallSegment:
 
 
 class PlannedMotion:
-    """A sequence of segments that begins at `begin_s`. Times are seconds of any one clock."""
+    """A sequence of segments that begins at `begin_s`. All times are seconds of the same clock, which the caller
+    chooses.
+    """
 
     def __init__(self, begin_s: float, segments: Sequence[MotionSegment]) -> None:
         """Create a motion from at least one segment. Only the last segment may be infinite."""
@@ -200,7 +202,7 @@ class PlannedMotion:
         return self._begin_s[-1] if isinstance(self._segments[-1], RestSegment) else self.end_s
 
     def at(self, now_s: float) -> MotionState:
-        """Return the motion at the time `now_s`, or at the nearer end of the sequence if that time is outside it."""
+        """Return the motion at the time `now_s`. For a time outside the sequence, use its nearer end."""
         index = max(0, bisect.bisect_right(self._begin_s, now_s) - 1)
         segment = self._segments[index]
         return segment.at(min(max(0.0, now_s - self._begin_s[index]), segment.duration_s))

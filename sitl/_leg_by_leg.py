@@ -17,7 +17,8 @@ FAST = 4.0  # limit of a vehicle's speed as a multiple of the commanded one
 def leg_by_leg(
     waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState
 ) -> tuple[list[MotionSegment], MotionSegment]:
-    """Return the segments up to the last completed waypoint, and the motion after them without further commands.
+    """Return the segments up to the last completed waypoint, and the motion that follows if the pilot sends no further
+    commands.
 
     A waypoint that takes longer than the pilot's time limit is the last one.
     """
@@ -43,7 +44,7 @@ def leg_by_leg(
 def _made_s(
     course: PlannedMotion, since_s: float, waypoint: Waypoint, vehicle_type: VehicleType, limit_s: float
 ) -> float:
-    """Return the time at which the motion completes a waypoint, or infinity if it does not do so before `limit_s`."""
+    """Return the time at which the motion completes a waypoint. Return infinity if that is not before `limit_s`."""
     now_s = since_s
     while now_s < limit_s:
         place = course.at(now_s).point

@@ -33,7 +33,9 @@ class FrameSplitter:
 
 
 def _length(stream: bytes, at: int) -> int | None:
-    """Return the length of the frame that begins here, or None if none begins or its length is not known yet."""
+    """Return the length of the frame that begins here. Return None if no frame begins here or its length is not known
+    yet.
+    """
     if stream[at] == _V2:
         return 12 + stream[at + 1] + 13 * (stream[at + 2] & _SIGNED)
     return 8 + stream[at + 1] if stream[at] == _V1 else None

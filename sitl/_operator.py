@@ -76,7 +76,7 @@ class CommandLog:
 
 
 def _command(message: Any) -> str | None:
-    """Return the name of the command in a COMMAND_LONG or COMMAND_INT."""
+    """Return the name of the command in a message COMMAND_LONG or COMMAND_INT."""
     number = getattr(message, "command", None)
     if number is None:
         return None

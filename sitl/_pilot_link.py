@@ -124,7 +124,8 @@ class PilotLink(asyncio.Protocol):
 
     @property
     def real_time_factor(self) -> float | None:
-        """The simulated seconds per second since the first message, divided by the speedup, or None.
+        """The simulated seconds per second of real time since the first message, divided by the speedup. None if too
+        little time has passed.
 
         1.0 means a fast enough machine.
         """

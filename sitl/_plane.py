@@ -122,8 +122,8 @@ class PlaneMotion:
 
 
 def _until_heading_for(there: LocalPlace, centre: LocalPlace, here: MotionState) -> float:
-    """Return the angle in radians to continue on a circle, until the plane flies towards a place within ArduPlane's
-    tolerance.
+    """Return the angle in radians by which to continue on a circle, until the plane flies towards a place within
+    ArduPlane's tolerance.
 
     0 if the place is so near that the plane never heads for it.
     """
@@ -234,7 +234,7 @@ class _TurnToPlace(NamedTuple):
 
 
 def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather_left_m: float) -> _TurnToPlace | None:
-    """Return the turn with the shorter path, or None if the place is inside both possible circles."""
+    """Return the turn with the shorter path. Return None if the place is inside both possible circles."""
     ways = []
     for side in (1, -1):  # to the right, to the left
         centre = _beside(start, side * radius_m)
@@ -258,7 +258,9 @@ def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather
 
 
 def _back_on_line(here: LocalPlace, before: LocalPlace, place: LocalPlace) -> LocalPlace | None:
-    """Return the point to aim at on the line between two places, or None if the place itself is as near."""
+    """Return the point to aim at on the line between two places. Return None if the plane can aim at the second place
+    itself.
+    """
     north, east = place.north_m - before.north_m, place.east_m - before.east_m
     length_m = math.hypot(north, east)
     if length_m < NEAR_M:
@@ -281,7 +283,7 @@ def _on_circle(place: LocalPlace, radius_m: float, bearing_rad: float) -> LocalP
 
 
 def _towards(place: LocalPlace, other: LocalPlace, length_m: float) -> LocalPlace:
-    """Return the point at this distance from a place, in the direction of the other place."""
+    """Return the point at this distance from a place in the direction of the other place, but not beyond it."""
     away_m = max(math.dist(place[:2], other[:2]), NEAR_M)
     part = min(1.0, length_m / away_m)
     north_m, east_m = (a + part * (b - a) for a, b in zip(place[:2], other[:2], strict=True))
@@ -297,5 +299,5 @@ def _ahead(start: MotionState, length_m: float) -> LocalPlace:
 
 
 def _beside(start: MotionState, right_m: float) -> tuple[float, float]:
-    """Return north and east of the point at this distance to the right of the vehicle."""
+    """Return the position (north, east) of the point at this distance to the right of the vehicle."""
     return start.north_m - right_m * math.sin(start.yaw_rad), start.east_m + right_m * math.cos(start.yaw_rad)

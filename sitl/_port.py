@@ -18,7 +18,7 @@ MAX_UNSENT_BYTES = 65_536
 
 
 class VehiclePort:
-    """A TCP server on 127.0.0.1. Raises OSError if the port is not available."""
+    """A TCP server on 127.0.0.1 for one client. Raises OSError if the TCP port is not available."""
 
     def __init__(self, number: int, autopilot: Autopilot, selector: selectors.BaseSelector) -> None:
         self._autopilot = autopilot

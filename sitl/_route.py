@@ -81,12 +81,14 @@ def is_near(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) ->
 
 
 def to_go_m(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
-    """Return the remaining distance over the ground in metres, which is negative inside the tolerance."""
+    """Return the remaining distance over the ground in metres. It is negative inside the tolerance."""
     return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
 
 
 def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> int | None:
-    """Return the index of the waypoint at which a plane's landing begins, or None. The landing is always a mission."""
+    """Return the index of the waypoint at which a plane's landing begins. Return None if the route has no landing. The
+    landing is always a mission.
+    """
     return len(waypoints) - 2 if vehicle_type == "plane" and waypoints[-1].kind == "land" else None
 
 

@@ -32,7 +32,7 @@ class Airframe:
 
 
 def airframe(name: str | None, vehicle_type: VehicleType) -> Airframe:
-    """Return the frame with this name. For None, return the default frame of the vehicle type.
+    """Return the frame with this name. If the name is None, return the default frame of the vehicle type.
 
     Raises VehicleError if no frame has this name. The error names the nearest frame of the type.
     """
@@ -144,7 +144,9 @@ _TABLE = _table()
 
 
 def stacked(vehicle_type: VehicleType) -> list[str]:
-    """Return the names of all parameter files that frames of the type's usual program need in addition to its own."""
+    """Return the names of the parameter files that frames use in addition to the usual file of the vehicle type. Only
+    frames of the type's usual program count.
+    """
     program, own = BINARIES[vehicle_type], DEFAULTS[vehicle_type]
     frames = (frame for frame in _TABLE.values() if frame.program == program)
     return sorted({name for frame in frames for name in frame.defaults} - {own})

@@ -93,8 +93,8 @@ class ArduPilot:
 
     @property
     def lack(self) -> str | None:
-        """A sentence about missing default parameters, without which a vehicle may refuse to arm. None if all are
-        there.
+        """A sentence about missing default parameters, without which a vehicle may refuse to arm. None if no file is
+        missing.
         """
         if not self.missing:
             return None
@@ -232,7 +232,7 @@ class ArduPilot:
                 return {"LOG_FILE_TIMEOUT": PATIENT_S}
 
     def _bounded(self) -> list[str]:
-        """The beginning of a command line that limits the size of files to that of the log.
+        """The beginning of a command line that limits the size of each file to the maximum size of the log.
 
         ArduPilot treats the limit as a slow disk, and stops writing. It would start another log after LOG_FILE_TIMEOUT
         seconds. `ulimit -f` counts blocks of 512 bytes (POSIX).
@@ -266,7 +266,9 @@ def models(binary: Path) -> list[str]:
 
 
 def build_of(binary: Path) -> FirmwareVersion | None:
-    """Return the version and the commit in a binary, as it prints them at its start, or None."""
+    """Return the version and the commit that a binary contains and prints at its start. Return None if it contains
+    none.
+    """
     try:
         with binary.open("rb") as file:
             found = _BUILD.search(file.read(MAX_BINARY_BYTES))
@@ -280,7 +282,9 @@ MAX_BINARY_BYTES = 200_000_000  # one with its debugging information has 80 MB
 
 
 def default_parameters(binary: Path, name: str) -> Path | None:
-    """Return a file of default parameters in ArduPilot's source tree or next to the binary, or None."""
+    """Return a file of default parameters in ArduPilot's source tree or next to the binary. Return None if there is no
+    such file.
+    """
     for directory in autotest(binary.resolve().parent):
         for path in (directory / name, directory / "default_params" / name, directory / "models" / name):
             if path.is_file():
@@ -294,7 +298,9 @@ def _own_defaults(sysid: int) -> str:
 
 
 def _not_a_program(head: bytes) -> str | None:
-    """Return the error about a file that begins with these bytes but is not a usable binary, or None."""
+    """Return the reason why a file that begins with these bytes is not a usable binary. Return None if it may be
+    usable.
+    """
     if not head:
         return "is empty"
     if head.startswith(b"#!"):  # a wrapper of the user's own

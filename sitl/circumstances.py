@@ -39,7 +39,8 @@ class NotSimulatedError(VehicleError):
 
 @dataclass(frozen=True)
 class SimulatedFailure:
-    """An event to simulate, such as a GPS failure. `what` completes "simulate ...". Each of `ways` contains parameters.
+    """An event to simulate, such as a GPS failure. `what` completes "simulate ...". Each of `ways` contains parameters
+    that cause the event.
 
     `station_is_heard` begins or ends the vehicle's contact with its ground station. None leaves it unchanged.
     """
@@ -126,7 +127,9 @@ async def _heard(
     ask: Callable[[], None],
     limit_s: float,
 ) -> Mapping[str, float] | None:
-    """Return the answer, or None. The request is repeated until a time limit or the end of the connection."""
+    """Repeat a request until the answer arrives, the time limit passes or the connection ends. Return the answer, or
+    None without an answer.
+    """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + limit_s
     while loop.time() < deadline and not link.closed.is_set():

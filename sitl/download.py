@@ -166,7 +166,7 @@ def _endless(url: str) -> DownloadError:
 
 
 def _kept(part: Path, noted: Path) -> tuple[int, _PartialDownload] | None:
-    """Return the size and origin of an earlier partial download, or None."""
+    """Return the size and origin of an earlier partial download. Return None if there is none."""
     try:
         have, origin = part.stat().st_size, _PartialDownload(**json.loads(noted.read_text()))
         return (have, origin) if have else None
@@ -182,13 +182,15 @@ def _fits(answer: Any, have: int, origin: _PartialDownload) -> bool:
 
 
 def _validator(answer: Any) -> str | None:
-    """Return the version mark of the file: a strong ETag, or else Last-Modified, or else None."""
+    """Return the version mark of the file: a strong ETag, otherwise Last-Modified. Return None if the server sent
+    neither.
+    """
     etag: str = answer.headers.get("ETag", "")
     return etag if etag.startswith('"') else answer.headers.get("Last-Modified")
 
 
 def _size(url: str, answer: Any, limit: int) -> int:
-    """Return the size that the server announces. Raises DownloadError if it announces none, or more than `limit`."""
+    """Return the size that the server announces. Raises DownloadError if there is none, or above `limit` bytes."""
     size: int | None = answer.length
     if size is None:
         raise _endless(url)

@@ -158,7 +158,9 @@ def install(
 
 
 class _ReleaseServer:
-    """One release of one vehicle type on ArduPilot's server or a mirror. Raises RequestError for an invalid `base`."""
+    """One release of one vehicle type, on ArduPilot's server or on the mirror `base`. Raises RequestError if `base` is
+    invalid.
+    """
 
     def __init__(
         self, vehicle: VehicleType, version: str, board: _ProcessorKind, base: str | None, stall_s: float
@@ -219,7 +221,7 @@ class _ReleaseServer:
         return f"{self._source}/ArduPilot/ardupilot/{build.commit}/{_AUTOTEST}"
 
     def _fetch_parameters(self, path: Path, build: _FirmwareBuild, places: tuple[str, ...]) -> DownloadedFile | None:
-        """Download a parameter file from the first address that has it. Return None if there is none."""
+        """Download a parameter file from the first address that has it. Return None if no address has it."""
         for place in places:
             url = f"{self._tree(build)}/{place}"
             try:
@@ -278,7 +280,7 @@ def _intact(vehicle: VehicleType, directory: Path) -> bool:
 
 
 def _use(installed: InstalledVersion, already: bool) -> InstallOutcome:
-    """Make this version the one that runs use, and remove unfinished installations."""
+    """Select this version for runs, and remove unfinished installations."""
     home = installed.directory.parent
     link = home / f".{CURRENT}"
     link.unlink(missing_ok=True)
@@ -306,7 +308,7 @@ def _locked(home: Path, watcher: InstallWatcher) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _ways_out(home: Path) -> Iterator[None]:
-    """Add a solution to network errors, and convert disk errors to CacheError."""
+    """Add a solution to the message of network errors, and convert disk errors to CacheError."""
     try:
         yield
     except UnreachableError as error:

@@ -79,7 +79,9 @@ class GroundStation(asyncio.DatagramProtocol):
         self._vehicles[sysid] = vehicle
 
     def reach(self, sysid: int, *, reachable: bool) -> None:
-        """Start or stop forwarding between a vehicle and the ground station. Without it, messages are lost."""
+        """Start or stop forwarding between a vehicle and the ground station. While forwarding is stopped, messages are
+        lost.
+        """
         if reachable:
             self._out_of_reach.discard(sysid)
         else:
@@ -162,7 +164,7 @@ class GroundStation(asyncio.DatagramProtocol):
 
 
 class _VehicleConnection(asyncio.Protocol):
-    """The connection to the port of one vehicle for ground stations."""
+    """The connection to one vehicle's port for ground stations."""
 
     def __init__(self, vehicle_id: int, forward: Callable[[list[bytes]], None]) -> None:
         self.vehicle_id = vehicle_id

@@ -95,7 +95,9 @@ class InstalledVersion:
 
     @cached_property
     def damage(self) -> str | None:
-        """A description of the first file that was changed after its download, or None. All files are read for this."""
+        """A description of the first problem with the installed files, such as a change after the download. None if all
+        are intact. All files are read for this.
+        """
         if self.manifest is None:
             return f"{MANIFEST} is missing or cannot be read"
         for name in dict.fromkeys((self.binary.name, DEFAULTS[self.vehicle], *self.manifest.files)):
@@ -126,7 +128,9 @@ def all_installed(vehicle: VehicleType, environ: Mapping[str, str]) -> list[Inst
 
 
 def current(vehicle: VehicleType, environ: Mapping[str, str]) -> InstalledVersion | None:
-    """Return the version that was installed last, or None. Raises UnusableBinaryError if it is damaged."""
+    """Return the version that was installed last. Return None without an installation. Raises UnusableBinaryError if
+    the version is damaged.
+    """
     try:
         directory = (cache(environ) / vehicle / CURRENT).resolve(strict=True)
     except (OSError, VehicleError):

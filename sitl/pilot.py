@@ -98,7 +98,7 @@ class Pilot:
             raise ParameterError(f"vehicle {self.vehicle_id} knows {phrase}")
 
     async def get_ready(self, flight: PilotProcedure) -> None:
-        """Execute the steps before arming. Return when all of them have stayed complete for READY_FOR_S seconds.
+        """Execute the steps before arming. Return when all steps have stayed complete for READY_FOR_S seconds.
 
         ArduPilot repeats its checks, and has further ones in other modes. It may therefore report ready and then not
         ready. Raises FlightError.
@@ -134,7 +134,7 @@ class Pilot:
         return values
 
     def shortfall(self, flight: PilotProcedure) -> str | None:
-        """Return a sentence if the vehicle should have left its home position and has not, otherwise None."""
+        """Return a sentence if the vehicle should have left its home position and has not. Return None otherwise."""
         if self.state.has_moved or self._terminated or self._handed_over or self._befallen:
             return None
         awaited = self._awaited.name if self._awaited else "its end"
@@ -234,7 +234,7 @@ class _StepWaitingTimes:
         self.patience_s = 0.0  # of our time: then it is worth looking again, even if nothing is heard
 
     def lost(self) -> str | None:
-        """Return the reason if the connection to the vehicle is lost, otherwise None."""
+        """Return the reason if the connection to the vehicle is lost. Return None otherwise."""
         now = time.monotonic()
         if self._link.closed.is_set():
             return "it ended the connection"
@@ -246,7 +246,7 @@ class _StepWaitingTimes:
         return None
 
     def overdue(self, step: ProcedureStep) -> str | None:
-        """Return the reason if a time limit of the step has passed, otherwise None."""
+        """Return the reason if a time limit of the step has passed. Return None otherwise."""
         link, now = self._link, time.monotonic()
         if self._step is not None:
             if self._time_s is not None and link.state.time_s is not None:
@@ -268,6 +268,8 @@ class _StepWaitingTimes:
         return SILENCE_S / min(1.0, self._link.speedup)
 
     def _streams(self) -> dict[str, float]:
-        """Return the times of the last message, and of the last heartbeat and position if there was one."""
+        """Return the time of the last message. Add the times of the last heartbeat and of the last position, if there
+        was one.
+        """
         times = {"it has sent no heartbeat": self._link.heartbeat_at, "it has sent no position": self._link.position_at}
         return {"it has been silent": self._link.heard_at, **{what: at for what, at in times.items() if at is not None}}

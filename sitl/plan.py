@@ -61,7 +61,7 @@ class GoTo:
 
 @dataclass(frozen=True)
 class Loiter:
-    """Stay at the place of the previous leg for `seconds` of simulated time. A plane circles."""
+    """Stay at the place of the previous leg for `seconds` of simulated time. A plane flies circles around the place."""
 
     seconds: float
 
@@ -99,7 +99,7 @@ class Plan:
 
 
 def _problem(leg: Leg, first: bool, last: bool, vehicle_type: VehicleType) -> str | None:
-    """Return a sentence about the error in a leg of the flight plan, or None."""
+    """Return a sentence about the error in a leg of the flight plan. Return None if the leg has no error."""
     if vehicle_type == "rover" and isinstance(leg, TakeOff | Land):
         return "a rover neither takes off nor lands"
     match leg:

@@ -47,7 +47,7 @@ class PilotProcedure(Protocol):
     purpose: str
 
     def next_step(self) -> ProcedureStep | None:
-        """Return the first incomplete step, or None if all are complete. Raises HopelessError."""
+        """Return the first incomplete step. Return None if all steps are complete. Raises HopelessError."""
 
     def ask(self, step: ProcedureStep) -> None:
         """Request a step from the vehicle. The pilot calls this once per heartbeat until the step is complete."""
@@ -94,7 +94,7 @@ class Commander:
         self.link.ask_for_mode(MODES[self.vehicle_type][name])
 
     def arming(self) -> ProcedureStep | None:
-        """Return the next step of arming, or None if the vehicle is armed."""
+        """Return the next step of arming. Return None if the vehicle is armed."""
         if self.state.armed:
             return None
         return ARM if self.state.ready_to_arm and self.state.position else READY
@@ -106,7 +106,9 @@ class Commander:
         return self.link.acks.get(command) == int(mavlink.MAV_RESULT_ACCEPTED)
 
     def refused(self, commands: Sequence[int]) -> bool:
-        """Return true if the vehicle answered one of these commands with MAV_RESULT_FAILED. Each answer counts once."""
+        """Return true if the vehicle answered one of these commands with MAV_RESULT_FAILED. Each answer is counted only
+        once.
+        """
         failed = [command for command in commands if self.link.acks.get(command) == int(mavlink.MAV_RESULT_FAILED)]
         for command in failed:
             del self.link.acks[command]

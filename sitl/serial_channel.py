@@ -152,8 +152,8 @@ class ClientChannel:
         return int(mavlink.MAV_RESULT_UNSUPPORTED) if number is None else self._autopilot.set_mode(number)
 
     def _reposition(self, message: Any) -> int:
-        """Execute MAV_CMD_DO_REPOSITION, and return its result code. param1 is the speed, and param2 may request GUIDED
-        mode.
+        """Execute MAV_CMD_DO_REPOSITION, and return its result code. In the message, param1 is the speed, and param2
+        may request GUIDED mode.
         """
         vehicle = self._autopilot
         if message.get_type() != "COMMAND_INT":
@@ -167,7 +167,9 @@ class ClientChannel:
         return vehicle.go_to(vehicle.place(message.frame, message.x, message.y, message.z))
 
     def _position_target(self, message: Any) -> None:
-        """Process a complete target position without an answer. A plane ignores it, as ArduPlane does."""
+        """Process a message with a complete target position. The vehicle sends no answer. A plane ignores the message,
+        as ArduPlane does.
+        """
         vehicle = self._autopilot
         whole = not message.type_mask & NO_POSITION and message.coordinate_frame in FRAMES
         if whole and vehicle.vehicle_type != "plane":

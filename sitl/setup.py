@@ -1,4 +1,4 @@
-"""Settings that may differ between vehicles of one type: frame, parameters, arguments, debugger and log size."""
+"""Settings that may differ between vehicles of the same type: frame, parameters, arguments, debugger and log size."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def named(name: str, beside: Path | None, environ: Mapping[str, str]) -> Home:
 
 
 def swarm(path: Path) -> dict[int, HomeOffset]:
-    """Return the offsets of a swarm by number, from 0. Raises VehicleError."""
+    """Return the offsets of the vehicles of a swarm by vehicle number, from 0. Raises VehicleError."""
     offsets: dict[int, HomeOffset] = {}
     for number, key, values in _lines(path):
         where = f"{path}, line {number}"
@@ -79,7 +79,7 @@ def swarm(path: Path) -> dict[int, HomeOffset]:
 
 
 def _files(beside: Path | None, environ: Mapping[str, str]) -> Iterator[Path]:
-    """Yield the possible files: next to the scenario, in the user's own directory, and next to the binaries."""
+    """Yield the files that may exist: next to the scenario, in the user's own directory, and next to the binaries."""
     if beside is not None:
         yield beside / LOCATIONS
     home = Path(environ.get("HOME", "."))

@@ -95,8 +95,8 @@ class Home:
         return Home(max(-90.0, min(90.0, lat)), (lon + 180.0) % 360.0 - 180.0, self.alt_m, self.heading_deg)
 
     def metres_to(self, lat_deg: float, lon_deg: float, alt_m: float) -> tuple[float, float, float]:
-        """Return the offset of another place from this one, in metres north, east and up. This method is the inverse of
-        `offset`.
+        """Return the offset of another place from this place, in metres north, east and up. This method is the inverse
+        of `offset`.
         """
         north_m = (lat_deg - self.lat_deg) * METRES_PER_DEGREE
         degrees_east = (lon_deg - self.lon_deg + 180.0) % 360.0 - 180.0
@@ -138,7 +138,7 @@ class VehicleKind(Protocol):
 
     @property
     def lack(self) -> str | None:
-        """A sentence about a missing requirement for flight, with a solution, or None."""
+        """A sentence with a solution about a missing requirement for flight. None if nothing is missing."""
 
     @property
     def uses_udp(self) -> bool:

@@ -37,7 +37,7 @@ def answer_wait_s(datagram: bytes, spread_s: float) -> float:
 
 
 class WaitingAnswers:
-    """The answers of one agent that wait to be sent."""
+    """The delayed answers of one agent, which wait for their sending times."""
 
     def __init__(self, agent_id: int, spread_s: float) -> None:
         self._agent_id = agent_id
@@ -46,7 +46,7 @@ class WaitingAnswers:
         self._count = 0
 
     def next_s(self) -> float | None:
-        """Return the mission second at which the next answer is due, or None if no answer waits."""
+        """Return the mission second at which the next answer is due. Return None if no answer waits."""
         return self._waiting[0][0] if self._waiting else None
 
     def exchange(self, outbox: list[Outgoing], now: float) -> list[Outgoing]:

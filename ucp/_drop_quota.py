@@ -1,4 +1,4 @@
-"""A quota for dropped datagrams in the trace, because any sender can cause them.
+"""A limit for the space that dropped datagrams take in the trace, because any sender can send such datagrams.
 
 A flood of datagrams that are dropped would fill the disk of a vehicle. The agent therefore writes them whole only
 within a quota. It counts the others, and writes their number. The trace thus accounts for each datagram, and its size
@@ -28,7 +28,7 @@ class DropQuota:
         self._counts: Counter[str] = Counter()
 
     def lines(self, entry: DroppedDatagram) -> Iterator[DroppedDatagram]:
-        """Yield the entries to write for a dropped datagram. Within the quota, it is the entry itself."""
+        """Yield the trace entries to write now: this entry if it is within the quota, and the counts that are due."""
         self._left_bytes = min(QUOTA_BYTES, self._left_bytes + (entry.t - self._at_s) * BYTES_PER_S)
         self._at_s = entry.t
         size = LINE_BYTES + len(entry.datagram.text)
@@ -41,7 +41,7 @@ class DropQuota:
             yield from self.counts(entry.t)
 
     def counts(self, t: float) -> Iterator[DroppedDatagram]:
-        """Yield an entry for each reason with the number of datagrams since the previous one."""
+        """Yield an entry for each reason with the number of datagrams that were not written since the last count."""
         self._counted_at_s = t
         for reason, count in self._counts.items():
             yield DroppedDatagram(t, reason, RecordedBytes(""), count)

@@ -8,8 +8,8 @@ MAX_PARTS = 100
 
 
 def check_request(request: dict[str, Any]) -> None:
-    """Raise ValueError if a request contains NaN, a lone surrogate, or too many parts. Python's JSON parser accepts
-    them.
+    """Raise ValueError if a request contains NaN, a lone surrogate, or too many parts. Python's JSON parser accepts all
+    three of these.
     """
     try:
         text = json.dumps(request, allow_nan=False, ensure_ascii=False)

@@ -155,7 +155,7 @@ class Agent:
             self.replace_handlers(handlers)
 
     def replace_handlers(self, wrong: Iterable[EventHandler[Any]]) -> None:
-        """Replace the correct handlers of these names by wrong ones. All other handlers become correct again."""
+        """Replace the correct handlers of these names by wrong handlers. All others are reset to the correct ones."""
         handlers = HANDLERS | {handler.name: handler for handler in wrong}
         self._on_message = {message: handlers[handler.name] for message, handler in ON_MESSAGE.items()}
         self._on_timer = {timer: handlers[handler.name] for timer, handler in ON_TIMER.items()}
@@ -177,7 +177,7 @@ class Agent:
     def receive_message(
         self, sender: int, sequence: int, message: Message, now: float, datagram: RecordedBytes | None = None
     ) -> None:
-        """Handle a decoded message, or drop it if its sender or block belongs to no other agent of the mission.
+        """Handle a decoded message, or drop it if `drop_reason` returns a reason.
 
         `datagram` is the encoded message, for the trace. Dropped messages are counted in `dropped`.
         """
@@ -206,7 +206,7 @@ class Agent:
             raise ValueError(f"an event of {event.encoded_bytes} bytes is more than max_event_bytes {largest}")
 
     def next_timer(self) -> float | None:
-        """Return the mission second at which `handle_timer` is due, or None if no timer runs and no answer waits."""
+        """Return the mission second at which `handle_timer` is due. Return None if no timer or answer is pending."""
         timer = self._next_running_timer()
         deadline = None if timer is None else timer.deadline
         answer_s = self.next_answer()
@@ -215,11 +215,11 @@ class Agent:
         return min(answer_s, deadline)
 
     def next_answer(self) -> float | None:
-        """Return the mission second at which the next delayed answer is due, or None if no answer waits."""
+        """Return the mission second at which the next delayed answer is due. Return None if no answer waits."""
         return None if self._waiting_answers is None else self._waiting_answers.next_s()
 
     def _next_running_timer(self) -> Timer | None:
-        """Return the timer that expires next, or None if no timer runs."""
+        """Return the timer that expires next. Return None if no timer runs."""
         soonest, ends = None, math.inf
         for timer in self.state.timers:
             deadline = timer.deadline
@@ -228,7 +228,7 @@ class Agent:
         return soonest
 
     def silent_until(self) -> float | None:
-        """Return the mission second until which the agent answers no message because it reconciles, or None.
+        """Return the mission second until which a running reconcile keeps the agent from answering messages.
 
         That is when the running timer of its reconcile expires. None if it does not reconcile, or no such timer runs.
         """
@@ -275,7 +275,7 @@ class Agent:
         self._handle(now, OperatorTrigger("reconcile"), None, self._on_local_event["Reconcile Begin"])
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
-        """Return the messages that handlers have sent, in order, as (sequence, message), and forget them.
+        """Return the messages that handlers have sent, in order, as (sequence number, message). Then forget them.
 
         `answer_spread_s` has no effect on them. A driver of the network calls `datagrams_to_send`.
         """
@@ -297,7 +297,7 @@ class Agent:
         return [encode(self.agent_id, sequence, message) for sequence, message, _ in self._due_to_send()]
 
     def trace(self) -> list[Entry]:
-        """Return the handler runs and dropped datagrams since the previous call, in order."""
+        """Return the trace entries since the previous call, in order: runs of handlers, and dropped datagrams."""
         trace, self._trace = self._trace, []
         return trace
 
@@ -317,7 +317,7 @@ class Agent:
         handler: EventHandler[Any],
         *inputs: object,
     ) -> None:
-        """Run a handler, and then the handlers that it triggered, in order. `trace_input` is written to the trace."""
+        """Run a handler, then all handlers that it triggers, in order. `trace_input` is written to the trace."""
         core = self._core
         core.now, core.running = now, handler
         branch = handler.run(core, *inputs)
@@ -367,7 +367,7 @@ class Agent:
 
 
 def drop_reason(agent_id: int, roster: Container[int], sender: int, message: Message) -> str | None:
-    """Return the reason why the agent drops a valid message, or None if it handles the message."""
+    """Return the reason why the agent drops a valid message. Return None if the agent handles the message."""
     if sender == agent_id:
         return "own sender"
     if sender not in roster:
@@ -378,7 +378,7 @@ def drop_reason(agent_id: int, roster: Container[int], sender: int, message: Mes
 
 
 def tally_of(core: Core, handler: EventHandler[Any]) -> Tally | None:
-    """Return the vote counts or the choice of the handler for the trace, or None if it has neither."""
+    """Return the vote counts of the handler, or its choice, for the trace. Return None if it has neither."""
     if handler.tally is None:
         return None
     if handler.tally == "majority_response_block_hash":

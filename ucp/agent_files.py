@@ -40,7 +40,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 class ReservedSpace:
-    """Space on the disk for the export, which other files cannot take.
+    """Disk space that is reserved for the export, so that other files cannot take it.
 
     The space is that of a file without a name, so it is free again when the process ends.
     """
@@ -52,7 +52,7 @@ class ReservedSpace:
             os.posix_fallocate(self._descriptor, 0, RESERVED_BYTES)
 
     def release(self) -> bool:
-        """Free the space. Return false if it was free already."""
+        """Release the reserved space. Return false if it was released before."""
         if self._descriptor is None:
             return False
         os.close(self._descriptor)
@@ -112,7 +112,7 @@ class TraceFile:
 
 
 def leave_space(file: BinaryIO) -> None:
-    """Raise OSError if the file system has only the space left that stores and exports need."""
+    """Raise OSError if the file system has no more free space than stores and exports need."""
     system = os.fstatvfs(file.fileno())
     if system.f_bavail * system.f_frsize < min(
         MAX_KEPT_FREE_BYTES, system.f_blocks * system.f_frsize * KEPT_FREE_SHARE
@@ -121,7 +121,7 @@ def leave_space(file: BinaryIO) -> None:
 
 
 def _end_of_last_line(file: BinaryIO) -> int:
-    """Return the position after the last complete line of the file, or 0."""
+    """Return the position after the last complete line of the file. Return 0 if no line is complete."""
     end = file.seek(0, os.SEEK_END)
     while end:
         begin = max(0, end - CHUNK_BYTES)

@@ -47,8 +47,8 @@ class Chain:
         return chain_hash in self._height_of_chain_hash
 
     def successor(self, chain_hash: bytes) -> Block | None:
-        """Return the block after the position with this chain hash, or None at the top. Raises KeyError if the hash is
-        unknown.
+        """Return the block that follows the block with this chain hash. Return None at the top of the chain. Raises
+        KeyError if the chain hash is unknown.
         """
         height = self._height_of_chain_hash[chain_hash]
         return self._blocks[height] if height < len(self._blocks) else None

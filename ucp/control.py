@@ -30,7 +30,7 @@ class UnsupportedCommandError(CommandError):
 
 
 class ControlServer:
-    """A server that executes `commands` by name. At its end, it removes its socket file."""
+    """A server that executes `commands` by name. When it ends, it removes its socket file."""
 
     def __init__(self, path: Path, commands: dict[str, Command], loop: Loop) -> None:
         self._path = path

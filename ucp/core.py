@@ -21,7 +21,7 @@ Seal = Callable[[bytes, int], bytes]
 
 
 class Core(AgentState):
-    """The state of an agent, the operations on it, and their results since the agent last took them.
+    """The state of an agent, and the operations on it. Their results stay here until the agent takes them.
 
     `outbox` has the (sequence, message, recorded datagram) to broadcast. `changes`, `announced` and `started` are the
     changes, messages and timers of the running handler, as in a trace. They and the recorded datagrams exist only with
@@ -149,7 +149,7 @@ class Core(AgentState):
         return block
 
     def remove_from_stack(self, block_hash: bytes) -> Block | None:
-        """Remove the block from the reconcile stack, and return it. Return None if the stack does not contain it."""
+        """Remove this block from the reconcile stack, and return it. Return None if the stack does not contain it."""
         for position in range(len(self.reconcile_stack) - 1, -1, -1):  # the mutual successor is mostly on top
             if self.reconcile_stack[position].block_hash == block_hash:
                 block = self.reconcile_stack.pop(position)

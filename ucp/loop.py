@@ -77,7 +77,7 @@ class Loop:
         self._running = False
 
     def run(self) -> None:
-        """Run the loop until `stop` is called. It may run again afterwards."""
+        """Run the loop until `stop` is called. The caller may then start it a second time."""
         while self._running:
             self._call_back(self._selector.select(self._seconds_to_next_timer()))
             self._call_due_timers()
@@ -98,7 +98,7 @@ class Loop:
             self._call(readable if events & selectors.EVENT_READ and readable else writable)
 
     def _seconds_to_next_timer(self) -> float | None:
-        """Return the number of seconds until the next scheduled call, or None if there is none."""
+        """Return the number of seconds until the next scheduled call. Return None if no call is scheduled."""
         return max(0.0, self._timers[0][0] - time.monotonic()) if self._timers else None
 
     def _call_due_timers(self) -> None:

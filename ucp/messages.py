@@ -47,7 +47,7 @@ class MalformedDatagramError(ValueError):
 
 @dataclass(unsafe_hash=True, slots=True)
 class BlockAddRequest:
-    """A request for votes on a block that will follow the position with this chain hash (Algorithms 2 and 3)."""
+    """A request for votes on a block to append after the position with this chain hash (Algorithms 2 and 3)."""
 
     NAME: ClassVar[str] = "Block Add Request"
     WIRE: ClassVar[Fields] = {"block_hash": FieldKind.HASH, "chain_hash": FieldKind.HASH}
@@ -252,7 +252,7 @@ CARRY_A_BLOCK = frozenset((CommitBlock, BlockResponse))
 
 
 def block_named(message: Message) -> bytes | None:
-    """Return the hash of the block that a message concerns, or None if it concerns no block."""
+    """Return the hash of the block that a message concerns. Return None if it concerns no block."""
     if type(message) in CARRY_A_BLOCK:
         return message.block.block_hash  # type: ignore[union-attr]
     return getattr(message, "block_hash", None)

@@ -61,7 +61,7 @@ def read_text(path: Path, most_bytes: int) -> str:
 
 
 def check_weight(text: str | bytes, most: int = MAX_JSON_WEIGHT) -> None:
-    """Raise ValueError if a JSON text weighs more than `most`. Commas and brackets in strings count."""
+    """Raise ValueError if a JSON text has a weight (memory) above `most`. Commas and brackets in strings count."""
     if isinstance(text, str):
         weight = text.count(",") + 4 * (text.count("[") + text.count("{"))
     else:
@@ -71,7 +71,7 @@ def check_weight(text: str | bytes, most: int = MAX_JSON_WEIGHT) -> None:
 
 
 def parse_json(text: str | bytes, *, strict: bool = True, most_weight: int = MAX_JSON_WEIGHT) -> Any:
-    """Return the value of a JSON text within limits of nesting and weight. Raises ValueError.
+    """Return the value of a JSON text, with limits on its nesting and its weight. Raises ValueError.
 
     Bytes are UTF-8; `json.loads` would also accept UTF-16. With `strict` false, strings may contain control characters.
     """

@@ -268,7 +268,7 @@ class ChainHashSuccessorQuery(Packet):
 
 
 class NextInSequenceResponse(Packet):
-    """An answer of reconcile phase 2. The `block_hash` None means "Is Top Of Chain"."""
+    """An answer in reconcile phase 2. A `block_hash` of None means "Is Top Of Chain"."""
 
     name = messages.NextInSequenceResponse.NAME
     fields_desc = _fields(messages.NextInSequenceResponse.WIRE)
@@ -319,7 +319,7 @@ def opened(packet: Packet, opener: "DatagramOpener") -> Packet:
 
 
 def message_of(packet: Packet) -> tuple[int, int, Message]:
-    """Return the (sender, sequence, message) of a packet. Raises MalformedDatagramError if it is not a valid
+    """Return (sender, sequence number, message) of a packet. Raises MalformedDatagramError if the packet is not a valid
     message.
     """
     header = packet.getlayer(UCP)

@@ -10,8 +10,8 @@ SEAL_BYTES = 48
 
 
 def sealed_to(initial_data: bytes) -> bytes | None:
-    """Return the depot's public key (X25519) in the data of an inception block, or None if event data are not
-    encrypted.
+    """Return the depot's public key (X25519) that the data of an inception block contain. Return None if event data are
+    not encrypted.
     """
     key = initial_data[-DEPOT_KEY_BYTES:]
     return key if initial_data[:-DEPOT_KEY_BYTES].endswith(DEPOT_TAG) else None

@@ -49,7 +49,7 @@ class SecuredState:
     revocations: tuple[bytes, ...] = ()
 
     def replay(self, entry: dict[str, Any]) -> None:
-        """Add the new data of an entry in the file."""
+        """Add the data in one entry of the store file."""
         self.started_us = max(self.started_us, int(entry.get("started_us", 0)))
         new = {bytes.fromhex(name): base64.b64decode(text) for name, text in entry.get("signatures", {}).items()}
         self.signatures = {**self.signatures, **new}
@@ -58,7 +58,7 @@ class SecuredState:
         self.revocations = (*self.revocations, *map(base64.b64decode, entry.get("revocations", ())))
 
     def entry(self, before: "SecuredState | None" = None) -> dict[str, Any]:
-        """Return the data that are new since `before`, as an entry for the file."""
+        """Return the data that are new since `before`, as one entry for the store file."""
         new: dict[str, Any] = {}
         if before is None:
             new["started_us"] = self.started_us
@@ -72,7 +72,7 @@ class SecuredState:
 
 @dataclass(slots=True)
 class StoredState:
-    """The stored blocks of an agent by place, and the hashes of the blocks that it completed.
+    """The stored blocks of an agent (chain, deque and reconcile stack), and the hashes of the blocks that it completed.
 
     The chain has its oldest block first, the deque its front first, the stack its top last. `secured` is None without
     keys.
@@ -96,11 +96,11 @@ class StoredState:
         yield from self.stack
 
     def encode(self) -> bytes:
-        """Return the blocks of chain, deque and reconcile stack, in this order. Each follows its length (u16)."""
+        """Return the blocks of chain, deque and reconcile stack, in this order. A length (u16) precedes each block."""
         return b"".join(len(data).to_bytes(2, "big") + data for data in (block.block_data() for block in self.blocks()))
 
     def check(self) -> None:
-        """Raise ValueError if no agent can be in this state."""
+        """Raise ValueError if this state is impossible for an agent."""
         held = [block.block_hash for block in self.blocks()]
         if len({*held}) < len(held) or not {*self.completed} <= {*held}:
             raise ValueError("a block is in two places, or one that it completed in none")
@@ -124,8 +124,8 @@ class StoredState:
                 self.stack.remove(block)
 
     def replay(self, entry: dict[str, Any], known: dict[str, Block]) -> None:
-        """Apply all changes of an entry in the file, and add its blocks to `known`, an index of all blocks so far by
-        hash.
+        """Apply all changes in one entry of the store file. Add its blocks to `known`, an index by hash of all blocks
+        so far.
         """
         for agent_id, timestamp_us, event_data in entry["blocks"]:
             block = block_on_disk(agent_id, timestamp_us, base64.b64decode(event_data))
@@ -236,7 +236,7 @@ class Store:
 
 
 def read_store(path: Path) -> tuple[Any, StoredState]:
-    """Return the header of a store, or None if it is empty, and the state after all complete entries.
+    """Return the header of a store and the state after all complete entries. The header is None in an empty store.
 
     Raises OSError, or StoreError for an entry with the right checksum that no agent wrote.
     """

@@ -30,7 +30,7 @@ class Timer:
             self.deadline = None
 
     def resume(self, now: float) -> None:
-        """Continue after a pause. If no time has passed since then, the deadline is exactly the same as before."""
+        """Continue after a pause. If the pause had no duration, the deadline is exactly the same as before."""
         if self._paused is not None:
             paused_at, deadline = self._paused
             self.deadline = deadline + (now - paused_at)

@@ -28,7 +28,7 @@ class Encodable(Protocol):
 
 
 class RecordedBytes:
-    """Recorded bytes. `text` is their base64 form. `content` is the decoded object, or None if the bytes come from a
+    """Recorded bytes. `text` is their base64 form. `content` is the decoded object. It is None if the bytes come from a
     file.
 
     Sender and receivers of a datagram share one object.
@@ -37,7 +37,7 @@ class RecordedBytes:
     __slots__ = ("_text", "content")
 
     def __init__(self, text: str | None = None, content: Encodable | None = None) -> None:
-        """Create the object from base64 text or from a decoded object. One of them is enough."""
+        """Create the object from base64 text or from a decoded object. The caller may omit one of the two."""
         self._text = text
         self.content = content
 
@@ -72,7 +72,7 @@ class RecordedBytes:
 
 @dataclass(slots=True)
 class SentMessage:
-    """A sent message in a trace line. `block` is the hash of the block that it concerns, or None.
+    """A sent message in a trace line. `block` is the hash of the block that the message concerns, or None.
 
     `datagram` is None in a trace of version 1, which lacks it.
     """

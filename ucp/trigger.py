@@ -1,4 +1,4 @@
-"""Define triggers, the reasons why a handler runs. Each kind has its own class.
+"""Define triggers, the reasons why a handler runs. There is a class for each kind of reason.
 
 A trace writes a trigger as a JSON object (`to_json`). `parse` reads one, and pydantic does so wherever a field has the
 type `Trigger`. An object that names no kind, several kinds, or a kind with missing or wrong values is an

@@ -10,8 +10,8 @@ from struct import Struct
 
 
 class FieldKind(Enum):
-    """The kind of a field in a message. For a field of fixed size, the value is its format in Python's `struct`,
-    big-endian.
+    """The type of a field in a message. The value of a member with a fixed size is its big-endian format in Python's
+    `struct`.
     """
 
     U8 = "B"

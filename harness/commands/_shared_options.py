@@ -53,8 +53,8 @@ def _may_hold_scenario(path: Path) -> bool:
 
 
 def opener_of(bundle: Path | None) -> "DatagramOpener | None":
-    """Return an object that decrypts the datagrams of a secured mission, or None without a key file. Raises KeysError,
-    MachineError.
+    """Return an object that decrypts the datagrams of a secured mission. Return None without a key file. Raises
+    KeysError, MachineError.
     """
     if bundle is None:
         return None
@@ -76,7 +76,9 @@ DepotKey = Annotated[
 
 
 def depot_of(path: Path | None) -> "Depot | None":
-    """Return the key that decrypts event data, from a file, or None without a file. Raises KeysError, MachineError."""
+    """Return the key, read from a file, that decrypts event data. Return None without a file. Raises KeysError,
+    MachineError.
+    """
     if path is None:
         return None
     with extra("secure", "--depot-key"):
@@ -91,7 +93,7 @@ KeysOption = Annotated[
 
 
 def trusted_keys(path: Path | None) -> "PublicKeys | None":
-    """Return the public keys in a file or directory that the user trusts, or None without a path.
+    """Return the public keys that the user trusts, from a file or directory. Return None without a path.
 
     Raises KeysError, MachineError.
     """

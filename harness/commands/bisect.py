@@ -144,7 +144,7 @@ class _PlayRequest:
     limit_s: float
 
     def workshops(self, directory: Path) -> list[SubjectPlayer]:
-        """Return an object for each agent command that plays the scenario or record. Raises HarnessError."""
+        """Return a player of the scenario or record for each agent command. Raises HarnessError."""
         subject = subject_of(self.subject, self.seed, self.agent)
         workshops = []
         for number, command in enumerate(self.commands):
@@ -206,7 +206,9 @@ def _try_once(
 
 
 def _changes(before: Outcome | None, outcomes: Sequence[Outcome], of_records: bool) -> list[str]:
-    """Return the differences from the expected result, from the record, or from the first result."""
+    """Return the differences between the results and the expected result. Without an expected result, compare with the
+    record or the first result.
+    """
     if before is not None:
         return [sentence for outcome in outcomes for sentence in differences(before, outcome)]
     if of_records:

@@ -51,7 +51,7 @@ def chain_command(
 def _write_maps(
     map_tracks: list[EventTrack], shown: logbook.Logbook, geojson_file: Path | None, kml_file: Path | None
 ) -> None:
-    """Write the paths of vehicles to the requested files. Raises ExportError if there are none."""
+    """Write the paths that the vehicles took to the requested map files. Raises ExportError if there are no paths."""
     if not map_tracks:
         why = "the events are not of vehicles, and the run has no recorded tracks"
         if shown.telemetry:

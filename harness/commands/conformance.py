@@ -97,7 +97,7 @@ def conformance_command(
 
 
 def _test_all(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *, virtual: bool) -> int:
-    """Test each agent, write the page with all results, and return the highest exit status."""
+    """Test each agent, write the page with all results, and return the highest of their exit statuses."""
     console = output(highlight=False)
     outcomes: dict[str, ConformanceResults | str] = {}
     for name, command in agents.items():

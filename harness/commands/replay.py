@@ -81,7 +81,7 @@ def _play(console: Console, records: Sequence[RecordedTrace], until: float | Non
 def _step_through(
     console: Console, record: RecordedTrace, until: float | None, at_start: bool, breaks: Sequence[str], debug: bool
 ) -> NoReturn:
-    """Step through a record by the user's commands. When the commands end, replay the rest."""
+    """Step through a record as the user's commands demand. When the commands end, replay the remaining steps."""
     _print_problems(record)
     names = ReplayNames(record)
     player = RecordPlayer(record, until, IN_USE if debug else REFERENCE)

@@ -42,7 +42,7 @@ def output(*, stderr: bool = False, highlight: bool = True) -> Console:
 
 
 def show_result(console: Console, result: checker.Result, record: RunRecord) -> None:
-    """Print verdicts and figures. `record` contains the expectations of the scenario."""
+    """Print verdicts and numeric results. `record` contains the expectations of the scenario."""
     expect, table = record.expect, Table.grid(padding=(0, 2))
     for key, judgement in result.judgements.items():
         expected = expect.remark(key, judgement.verdict) == AS_EXPECTED
@@ -81,7 +81,7 @@ def show_rogue(console: Console, injected: list[RogueInjection]) -> None:
 
 
 def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Path) -> NoReturn:
-    """Print the result of a matrix and exit. Without a table, print JSON."""
+    """Print the result of a matrix and exit. Without a table to print, print JSON."""
     if table is None:
         print_json(record.to_json())
     else:

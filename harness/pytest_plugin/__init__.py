@@ -116,7 +116,7 @@ def swarm(request: pytest.FixtureRequest) -> Iterator[Swarm]:
 
 @pytest.fixture
 def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
-    """Provide the verdicts and figures of one run of the scenario in the marker `scenario`."""
+    """Provide the verdicts and numeric results of one run of the scenario that the marker `scenario` names."""
     from harness.pytest_plugin._fixtures import scenario_for
 
     yield from scenario_for(request.node)
@@ -124,7 +124,7 @@ def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
-    """Judge the run as a part of its test, and not after it. A violation is then a failure of the test."""
+    """Judge the run as a part of its test, not after the test. A violation is then a failure of the test."""
     try:
         yield
     except Exception:

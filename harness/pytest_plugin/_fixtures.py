@@ -24,7 +24,7 @@ DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1, "variant": None}
 
 
 def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
-    """Yield the swarm of a test. If the test is aborted, the run ends here."""
+    """Yield the swarm of a test. If the test is aborted, its run ends here."""
     with ExitStack() as stack:
         with one_sentence():
             options = SessionOptions.of(node.config)
@@ -46,7 +46,7 @@ def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
 
 
 def scenario_for(node: pytest.Item) -> Iterator[Findings]:
-    """Play the scenario that the marker names, and yield its verdicts and figures."""
+    """Play the scenario that the marker names. Yield its verdicts and numeric results."""
     with one_sentence():
         options = SessionOptions.of(node.config)
         path, keys = _marked(node)
@@ -92,14 +92,14 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
 
 
 def _variant(marked: Any, node: pytest.Item, options: SessionOptions) -> Path | None:
-    """Return the file of the variant from the command line, or else from the marker. Raises ScenarioError."""
+    """Return the file of the variant from the command line. If it names none, use the marker. Raises ScenarioError."""
     if marked is not None and not isinstance(marked, str | Path):
         raise ScenarioError(f"`variant` is {marked!r}: use the path of a Python file")
     return options.variant or (node.path.parent / marked if marked is not None else None)
 
 
 def _backend_and_seed(backend: Any, seed: Any, options: SessionOptions) -> tuple[BackendName, int]:
-    """Return the backend and seed from the command line, or else from the marker. Raises ScenarioError."""
+    """Return the backend and seed from the command line. If it names none, use the marker. Raises ScenarioError."""
     if backend not in BACKEND_NAMES:
         *names, last = map(repr, BACKEND_NAMES)
         raise ScenarioError(f"`backend` is {backend!r}: use {', '.join(names)} or {last}")

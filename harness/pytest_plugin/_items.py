@@ -131,13 +131,15 @@ class StoryItem(pytest.Item):
             pytest.fail(f"{self.path} cannot be written: {error.strerror}", pytrace=False)
 
     def _played_text(self, archive: RunArchive) -> str:
-        """Return the text of a story file in which the reactions are those of the agents in this run."""
+        """Return the text of a story file with the same inputs, but with the reactions of the agents in this run."""
         narrator = StoryWriter(archive.traces, self._story.scenario.roster)
         answers = [narrator.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
         return self._story.with_answers(answers)
 
     def _unknown_word(self, archive: RunArchive) -> str | None:
-        """Return a description of the first name in a trace that stories do not support, or None."""
+        """Return a description of the first name in a trace that stories do not support. Return None if they support
+        all names.
+        """
         for agent_id, trace in archive.traces.items():
             if unknown := first_unknown(unknown_names(trace.runs)):
                 return f"{unknown} in the trace of agent {agent_id}"

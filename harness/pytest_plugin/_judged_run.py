@@ -23,7 +23,8 @@ from harness.scenario.expect import Expect
 
 
 class RunOfOneTest:
-    """The run of a test. `finish` ends and judges it. If its argument is true, it waits until the agents are idle.
+    """The run of a test. `finish` ends the run and judges it. If its argument is true, it first waits until the agents
+    are idle.
 
     `variant` is the file of the protocol variant of the run, or None.
     """
@@ -48,7 +49,7 @@ class RunOfOneTest:
         self.passed = True
 
     def end_of_failed_test(self) -> str:
-        """Return the findings about the run as text, to print them together with the failure of the test."""
+        """Return the findings about the run as text. They are printed together with the failure of the test."""
         try:
             finished = self._finish(False)
         except HarnessError as error:

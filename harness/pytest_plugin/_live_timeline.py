@@ -65,7 +65,9 @@ class LiveTimeline(GrowingTimeline):
         await self.release(swarm)
 
     def queue_action(self, action: Action, answer: Future[Any]) -> None:
-        """Queue an action. `answer` receives its result or its error, unless the run ends before."""
+        """Queue an action. `answer` receives its result or its error, unless the run ends before the action is
+        performed.
+        """
         self._actions.put_nowait((action, answer))
 
     def stop(self) -> None:
@@ -88,7 +90,7 @@ class LiveTimeline(GrowingTimeline):
         return at_s
 
     async def undo(self, swarm: mission.Swarm, at_s: float) -> None:
-        """End the network change that began at `at_s`, if it has not ended before."""
+        """End the network change that began at `at_s`. Do nothing if the change has ended already."""
         document = self.scenario.model_dump()
         (entry,) = (entry for entry in document["timeline"] if entry["at_s"] == at_s)
         over_s = _next_instant(max(swarm.now(), self._played_s))
@@ -148,7 +150,8 @@ class LiveTimeline(GrowingTimeline):
         await swarm.release(number, self.scenario.fates[number])
 
     async def until_run(self, swarm: mission.Swarm, sought: SoughtRun, limit_s: float) -> int | None:
-        """Continue until an agent runs this handler and branch. Return its ID, or None at `limit_s`.
+        """Continue until an agent runs this handler and takes this branch. Return the agent's ID. Return None if none
+        does by `limit_s`.
 
         Raises ScenarioError for an unknown handler, branch or agent.
         """
@@ -182,7 +185,8 @@ class LiveTimeline(GrowingTimeline):
         await self.until(swarm, mission_s)
 
     async def until_idle(self, swarm: mission.Swarm, limit_s: float) -> RunOutcome | None:
-        """Continue until all agents have voted since the last action and are idle. Return None at `limit_s`.
+        """Continue until all agents have voted since the last action and are idle. Return None if this does not happen
+        by `limit_s`.
 
         The snapshot is taken while no chain changes, because real processes run on. Only a vote shows an agent that its
         chain differs from the others' (Section 3.2).
@@ -205,7 +209,7 @@ class LiveTimeline(GrowingTimeline):
         return None
 
     def _silent(self) -> set[int]:
-        """Return the agents that log no more events, and therefore never vote on a block of their own."""
+        """Return the agents that log no more events. These agents never again vote on a block of their own."""
         silent: set[int] = set()
         for fault in self.scenario.faults_in_order():
             if fault.stops_events:
@@ -245,7 +249,7 @@ class LiveTimeline(GrowingTimeline):
 
 
 def _next_instant(mission_s: float) -> float:
-    """Return a slightly later time, by which all earlier messages have been sent."""
+    """Return a slightly later time. All earlier messages have been sent by then."""
     return round(mission_s + INSTANT_S, 3)
 
 

@@ -14,7 +14,7 @@ from harness.scenario.load import parse
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """The options of a pytest session. An option that is not given is None."""
+    """The options of a pytest session. An option is None if the user does not give it."""
 
     backend: BackendName | None
     seed: int | None

@@ -34,7 +34,7 @@ def _places(config: pytest.Config) -> list[Path]:
 
 
 def _matching(root: Path, pattern: str) -> Iterable[Path]:
-    """Return the paths that match a path in pytest's configuration, which may be a pattern."""
+    """Return the paths that match one entry in pytest's configuration. The entry is a path or a pattern."""
     path = root / pattern
     return [path] if path.exists() else root.glob(pattern)
 

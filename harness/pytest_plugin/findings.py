@@ -1,4 +1,4 @@
-"""Provide the verdicts and figures of a run for tests."""
+"""Provide the verdicts and numeric results of a run for tests."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ EVIDENCE_SHOWN = 5
 
 @dataclass(frozen=True, repr=False)
 class JudgementInTest:
-    """A verdict with its number or key. In a failing assert, its text contains the reason."""
+    """A verdict with its number or key. A failing `assert` shows it together with its reason."""
 
     key: str
     name: str
@@ -77,7 +77,7 @@ class Findings:
 
     @property
     def figures(self) -> dict[str, float | int | None]:
-        """The figures in run.json, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
+        """The numeric results in run.json, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
         return self.result.figures
 
     def chain(self, agent: int) -> list[str]:

@@ -35,8 +35,8 @@ class RunEndedError(Exception):
 
 
 class _ActionContext(AbstractContextManager[None]):
-    """The result of an action, for use with `with`. At the end of the block it undoes the action, unless the block
-    failed.
+    """The result of an action, for use with `with`. The action is undone at the end of the `with` block, unless the
+    block failed.
     """
 
     def __init__(self, undo: Callable[[], object]) -> None:
@@ -91,7 +91,7 @@ class Swarm:
                 raise
 
     def partition(self, *groups: list[int], for_s: float | None = None) -> AbstractContextManager[None]:
-        """Separate the groups of agents from each other. Agents in no group form another group.
+        """Separate the groups of agents from each other. Agents that are in no group form an additional group.
 
         `with swarm.partition([1, 2]):` heals at the end of its block.
         """
@@ -154,7 +154,9 @@ class Swarm:
         return _ActionContext(partial(self._act, lambda swarm: self._timeline.let_go(swarm, number)))
 
     def release(self, message: str | None = None, **which: Any) -> None:
-        """Deliver the messages that `hold` holds back by these criteria, or all such messages."""
+        """Deliver the messages that a call of `hold` with the same criteria holds back. Without criteria, deliver all
+        messages held back.
+        """
         __tracebackhide__ = True
         self._act(lambda swarm: self._timeline.release(swarm, **_of_message(message, which)))
 
@@ -182,7 +184,7 @@ class Swarm:
         return [*super().__dir__(), *_VERBS]
 
     def _inject(self, verb: str, message: str | None = None, **keys: Any) -> None:
-        """Let the rogue node (a sender outside the swarm) send this from now on."""
+        """Let the rogue node (a sender outside the swarm) send these datagrams from now on."""
         __tracebackhide__ = True
         self._change(**{verb: _of_message(message, keys)})
 
@@ -254,7 +256,7 @@ class Swarm:
 
     @property
     def figures(self) -> dict[str, float | int | None]:
-        """The present figures, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
+        """The present numeric results, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
         __tracebackhide__ = True
         return self._findings().figures
 
@@ -274,7 +276,7 @@ class Swarm:
         return self.directory / "report.html"
 
     def _findings(self) -> Findings:
-        """Return the verdicts and figures, computed at the first query after an action."""
+        """Return the verdicts and numeric results. They are computed at the first query after an action."""
         __tracebackhide__ = True
         if self._seen is None:
             self._seen = self._judge_by_now(self._run_action(_snapshot))

@@ -1,1 +1,3 @@
-"""Play many runs of a scenario: in a matrix of conditions, or with many seeds to search for violations."""
+"""Play many runs of a scenario: in a matrix of network conditions and other values, or with many seeds to search for
+violations.
+"""

@@ -39,7 +39,7 @@ class ChannelAccess(Protocol):
 
 
 class DutyCycle:
-    """The rule to send at once, unless the station has used up its share of the time.
+    """The access rule of a station that sends at once, unless it has used up its share of the time.
 
     After a frame of T seconds a station is silent until T / duty after the beginning of this frame (ETSI EN 300 220, as
     LoRaWAN devices apply it).
@@ -78,7 +78,9 @@ class DutyCycle:
 
 
 class TimeSlots(DutyCycle):
-    """The rule to send only in the station's own time slot. A frame that no longer fits waits for the next slot."""
+    """The access rule of a station that sends only in its own time slot. A frame that no longer fits waits for the next
+    slot.
+    """
 
     def __init__(self, count: int, radio: TimeSlotRadio) -> None:
         super().__init__(count, radio)

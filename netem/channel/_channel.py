@@ -86,13 +86,13 @@ class Channel:
         return frame.number
 
     def next_event(self) -> float | None:
-        """Return the time in seconds at which the next frame begins or ends, or None if all queues are empty."""
+        """Return the time in seconds at which the next frame begins or ends. Return None if all queues are empty."""
         ends, due = self._next_end, self._access.next_due
         next_ns = ends if ends < due else due
         return None if next_ns == NEVER else next_ns / NANOSECONDS
 
     def advance(self, now: float) -> list[EndedTransmission]:
-        """Play all events up to the time `now`, and return the transmissions that have ended since the last call, in
+        """Play all events up to the time `now`. Return the transmissions that have ended since the previous call, in
         order.
         """
         self._play(nanoseconds(now))
@@ -147,7 +147,8 @@ class Channel:
         self._access.begun(sensed, now)
 
     def _overlap(self, frames: list[RadioFrame], now: int) -> list[RadioFrame]:
-        """Decide which receivers begin to receive these frames, and which other frames are disturbed.
+        """Decide which receivers begin to receive these frames. For each frame, mark the receivers at which other
+        frames disturb it.
 
         Return the frames that further stations sense from now on.
 
@@ -175,7 +176,7 @@ class Channel:
         return self._sum_energy(air, totals)
 
     def _sum_energy(self, air: list[RadioFrame], totals: Sequence[float]) -> list[RadioFrame]:
-        """Let stations sense the total power of all frames, until it falls below their detection level.
+        """Make stations sense the total power of all frames, until it falls below their detection level.
 
         Return the frames that further stations sense from now on.
         """

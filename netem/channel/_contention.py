@@ -23,7 +23,9 @@ _WORD_BITS = 32
 
 
 class CarrierSense:
-    """The waiting times of all stations. `draws` contains a random number stream for each station."""
+    """The random waiting times of all stations before they send. `draws` contains a random number generator for each
+    station.
+    """
 
     def __init__(self, radio: WifiRadio, draws: Sequence[Random]) -> None:
         self.next_due = NEVER
@@ -64,7 +66,7 @@ class CarrierSense:
         self.next_due = min(self.next_due, due)
 
     def begun(self, frames: list[RadioFrame], now: int) -> None:
-        """Let the stations that sense these frames wait. Stations that are due earlier send nevertheless.
+        """Make each station that senses these frames wait. A station whose sending time is earlier sends nevertheless.
 
         This runs for each frame and each waiting station, so it counts the slots itself.
         """
@@ -126,7 +128,7 @@ class CarrierSense:
         return False
 
     def _wait_for_longer(self, stations: int, now: int) -> None:
-        """Let these stations wait for the longer interval EIFS instead of DIFS from now on."""
+        """Make these stations wait for the longer interval EIFS instead of DIFS from now on."""
         early, late = now + self._difs, now + self._eifs
         for station in (*self._due, *self._resting):
             if stations >> station & 1 and self._from[station] == early:
@@ -151,7 +153,7 @@ class CarrierSense:
         return self._draws[station].getrandbits(_WORD_BITS) * self._choices >> _WORD_BITS
 
     def _busy_until(self, station: int, now: int, active: Iterable[RadioFrame]) -> int:
-        """Return the time at which the frames end that the station senses now, or 0 if there are none."""
+        """Return the end time of the last frame that the station senses now. Return 0 if it senses none."""
         began_by = now - self._sense
         return max(
             (frame.ends_ns for frame in active if frame.sensed >> station & 1 and frame.begins_ns <= began_by),

@@ -32,7 +32,9 @@ class FrameFate(StrEnum):
 
 @dataclass(slots=True, eq=False)
 class RadioFrame:
-    """A frame. Times are nanoseconds. Sets of receivers are bits, as in `FrameReach`."""
+    """A frame, from the queue of its sender to the end of its transmission. Times are nanoseconds. In a set of
+    receivers, each bit stands for one receiver.
+    """
 
     number: int
     sender: int
@@ -124,7 +126,7 @@ class EndedTransmission:
 
 
 def numbers(receivers: int) -> Iterator[int]:
-    """Yield the numbers of the receivers in this set of bits, in ascending order."""
+    """Yield the numbers of the receivers in this set (one bit for each receiver), in ascending order."""
     while receivers:
         lowest = receivers & -receivers
         yield lowest.bit_length() - 1

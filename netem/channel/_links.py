@@ -40,7 +40,7 @@ _LIGHT_M_PER_S = 299_792_458.0
 
 @cache
 def linear(centibels: int) -> float:
-    """Convert a level in 0.01 dB to a power, relative to 10^-6 of level 0."""
+    """Convert a level in 0.01 dB to a power. A level of 0 gives the power 10^6."""
     if centibels < _SILENT // 2:
         return 0.0
     tens, step = divmod(centibels, 1000)
@@ -49,7 +49,7 @@ def linear(centibels: int) -> float:
 
 @cache
 def _deviations(shadowing_db: float) -> list[int]:
-    """Return equally probable values of a normal distribution in 0.01 dB."""
+    """Return values of a normal distribution in 0.01 dB, all of which are equally probable."""
     return [round(100 * shadowing_db * quantile / SCALE) for quantile in table("normal", _TABLE_SIZE)]
 
 
@@ -186,8 +186,8 @@ class RadioLinks:
         return _MeanReach(levels, near, far, cut)
 
     def _path_loss(self, one: Place, other: Place) -> int:
-        """Return the path loss between two places: that of the log-distance model or of a flat ground, whichever is
-        greater.
+        """Return the path loss between two places: the greater of that of the log-distance model and that of a flat
+        ground.
 
         Two rays: Rappaport, Wireless Communications, 2nd ed., eq. 4.52, far from the antennas.
         """
@@ -209,7 +209,9 @@ class RadioLinks:
         self._shift(elapsed_s / self._radio.shadowing_s)
 
     def _shift(self, exponent: float | None) -> None:
-        """Draw random numbers for the shadowing again. Without an exponent, nothing of the old shadowing remains."""
+        """Replace the random shadowing values. Each new value keeps a part of the previous one. Without an exponent, it
+        keeps nothing.
+        """
         shadow, moved_m = self._shadow, self._moved_m
         known = -1.0
         kept = rest = 0.0

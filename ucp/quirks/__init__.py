@@ -55,7 +55,7 @@ def check_quirk(name: str, value: object) -> None:
 
 
 def active_quirks(quirks: Mapping[str, bool | float]) -> dict[str, float]:
-    """Return the deliberate errors that are switched on, that is, neither false nor 0."""
+    """Return the deliberate errors that have a value other than false and 0, and are therefore switched on."""
     return {name: float(quirks[name]) for name in QUIRKS if quirks.get(name)} if quirks else {}
 
 

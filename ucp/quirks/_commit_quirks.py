@@ -233,8 +233,8 @@ def commit_others_twice(good: Helper, core: Core, block: Block) -> None:
 
 
 def run_as_if_not_reconciling(good: Handler, core: Core, *inputs: int | Message) -> str:
-    """Run the correct handler `good` with the flag `reconcile_in_progress` set to False, and restore the flag
-    afterwards.
+    """A deliberate mistake: run the correct handler `good` as if no reconcile were in progress, and restore the flag
+    `reconcile_in_progress` afterwards.
     """
     reconciling, core.reconcile_in_progress = core.reconcile_in_progress, False
     try:
@@ -244,14 +244,14 @@ def run_as_if_not_reconciling(good: Handler, core: Core, *inputs: int | Message)
 
 
 def commit_twice(commit: Helper, core: Core, block: Block) -> None:
-    """Commit a block twice, without the chain's guard against duplicates."""
+    """A deliberate mistake: commit a block twice, without the chain's guard against duplicates."""
     core.chain.__class__ = UnguardedChain
     commit(core, block)
     commit(core, block)
 
 
 class UnguardedChain(Chain):
-    """A chain that accepts the same block twice."""
+    """A deliberate mistake: a chain that accepts the same block twice."""
 
     def append(self, block: Block) -> None:
         self._block_of_hash.pop(block.block_hash, None)

@@ -13,7 +13,7 @@ BURST = 32
 
 
 class VerificationBudget:
-    """Tokens for wrong signatures. `per_s` tokens return in each mission second. An infinite `per_s` sets no limit."""
+    """A budget of tokens for wrong signatures. It gains `per_s` tokens each mission second. Infinity sets no limit."""
 
     __slots__ = ("_per_s", "_since_s", "_tokens")
 
@@ -23,13 +23,13 @@ class VerificationBudget:
         self._since_s: float | None = None
 
     def has_token(self, now: float) -> bool:
-        """Return whether a signature may be verified at mission second `now`."""
+        """Return whether a token is left at mission second `now`, so that a signature may be verified."""
         if self._tokens < BURST and self._since_s is not None:
             self._tokens = min(BURST, self._tokens + (now - self._since_s) * self._per_s)
         self._since_s = now
         return self._tokens >= 1
 
     def take(self) -> None:
-        """Take the token for a wrong signature."""
+        """Remove one token, because a signature was wrong. An infinite budget does not change."""
         if self._per_s < math.inf:
             self._tokens -= 1

@@ -1,4 +1,4 @@
-"""Challenges: the proof that a sender exists now, as in the Echo option of OSCORE (RFC 9175).
+"""Challenge messages, with which a receiver makes a sender prove that it is active now (compare Echo in RFC 9175).
 
 An incarnation that has not received everything since the start of the mission cannot distinguish a new datagram from a
 recorded one: its replay windows are incomplete. It broadcasts a *challenge*. Each other vehicle answers with an *echo*,
@@ -23,7 +23,7 @@ ALL = 0
 
 
 class PendingChallenges:
-    """The challenges of one incarnation. A target is an agent ID or `ALL`."""
+    """The challenge messages of one incarnation. The target of a challenge is an agent ID or `ALL`."""
 
     def __init__(self) -> None:
         self.first_at: float | None = None
@@ -39,7 +39,7 @@ class PendingChallenges:
         return bool(self._due)
 
     def ask(self, target: int, now: float) -> None:
-        """Schedule a challenge, unless one was sent recently."""
+        """Schedule a challenge to this target, unless one was sent recently."""
         if now >= self._sent_at.get(target, now - CHALLENGE_INTERVAL_S) + CHALLENGE_INTERVAL_S:
             self._due.add(target)
 
@@ -52,9 +52,9 @@ class PendingChallenges:
         return due
 
     def sent(self, target: int, sequence: int) -> None:
-        """Record the sequence of a challenge."""
+        """Record the sequence number of a challenge that was sent to this target."""
         self._pending[target] = sequence
 
     def is_pending(self, sequence: int, sender: int) -> bool:
-        """Return whether an echo of `sender` answers the newest challenge to it."""
+        """Return whether `sequence` is the number of the newest challenge to this sender or to all vehicles."""
         return sequence in (self._pending.get(ALL), self._pending.get(sender))

@@ -1,4 +1,4 @@
-"""Epochs of the group secret.
+"""Epochs of the group secret: periods of mission time, each with its own secret.
 
 Mission time is divided into epochs. A one-way function computes the group secret of an epoch from the secret of the
 epoch before it. A vehicle keeps the secrets of the clock's epoch and of the one before, and erases older ones. An
@@ -30,7 +30,7 @@ MAX_CACHED_KEYS = 4096
 
 
 class EpochSecrets:
-    """The group secrets of one vehicle.
+    """The group secrets that one vehicle keeps, one for each epoch.
 
     `save` is called with the vehicle's new bundle after each change of the clock's epoch. The new bundle no longer
     contains the older secrets.
@@ -68,7 +68,7 @@ class EpochSecrets:
         return max(self._bundle.epoch, self._followed)
 
     def set_clock(self, now: float) -> None:
-        """Set the clock to mission second `now`, and erase older secrets if its epoch is a later one."""
+        """Set the clock to mission second `now`. If this begins a later epoch, erase older secrets."""
         if now < self._until_s:
             return
         if self._started_s is None:
@@ -86,11 +86,11 @@ class EpochSecrets:
         return 0 <= later <= MAX_EPOCHS_AHEAD or (later == -1 and self._previous_secret is not None)
 
     def follow(self, epoch: int) -> None:
-        """Send at least in this epoch. A vehicle with the group secret sent in it."""
+        """Send in this epoch or a later one, because a vehicle with the group secret has sent in it."""
         self._followed = max(self._followed, min(epoch, self._bundle.epoch + MAX_EPOCHS_FOLLOWED))
 
     def _advance_to(self, epoch: int) -> None:
-        """Move the clock to a later epoch, and erase the secrets of epochs before the previous one."""
+        """Move the clock to a later epoch. Keep the secret of the epoch directly before it, and erase older secrets."""
         before, secret = self._previous_secret, self._bundle.group_secret
         for _ in range(epoch - self._bundle.epoch):
             before = secret

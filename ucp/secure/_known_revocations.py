@@ -12,7 +12,7 @@ from ucp.secure.revocation import Revocation, RevocationError, listed_agents, re
 
 
 class KnownRevocations:
-    """Revocations that the authority signed. None of them is covered by another one."""
+    """Revocations that the authority signed. None of them lists only agents that another one also lists."""
 
     def __init__(self, authority: bytes, mission: bytes) -> None:
         self._authority = authority
@@ -25,16 +25,16 @@ class KnownRevocations:
 
     @property
     def bodies(self) -> tuple[bytes, ...]:
-        """The bodies of the revocations."""
+        """The encoded bodies of the revocations."""
         return tuple(revocation.encode() for revocation in self._held)
 
     def adds_nothing(self, body: bytes) -> bool:
-        """Return whether a body lists known agents only. The signature is not verified."""
+        """Return whether a body lists only agents that are known as revoked. The signature is not verified."""
         listed = listed_agents(body)
         return listed is not None and listed <= self.revoked
 
     def add(self, body: bytes) -> bool:
-        """Add the body of a revocation, and return whether it lists a further agent. Raises RevocationError."""
+        """Add the body of a revocation. Return whether it lists a newly revoked agent. Raises RevocationError."""
         revocation = Revocation.decode(body, self._authority, self._mission)
         if revocation.revoked <= self.revoked:
             return False
@@ -44,7 +44,7 @@ class KnownRevocations:
         return True
 
     def restore(self, bodies: Iterable[bytes]) -> None:
-        """Add revocations from disk. Those of other keys than the present ones are left out."""
+        """Add revocations that were read from the disk. Leave out those that the present authority did not sign."""
         for body in bodies:
             with suppress(RevocationError):
                 self.add(body)

@@ -9,7 +9,7 @@ from ucp.state import AgentState
 
 
 class BlockSignatures:
-    """Signatures by block hash.
+    """The makers' signatures of blocks, by block hash.
 
     A signature is verified once per block. The signature of a received block that the agent did not accept is
     discarded.
@@ -53,7 +53,7 @@ class BlockSignatures:
             self._by_hash.pop(block.block_hash, None)
 
     def restore(self, signatures: Mapping[bytes, bytes]) -> None:
-        """Add the signatures that were on disk."""
+        """Add signatures that were read from the disk."""
         self._by_hash.update(signatures)
 
     def _sign(self, block: Block) -> bytes:

@@ -23,7 +23,7 @@ class ReplayWindow:
         self._words = [2**_WORD_BITS - 1 if first else 0] * _WORDS
 
     def is_fresh(self, sequence: int) -> bool:
-        """Return whether the number is inside or above the window, and was not accepted before."""
+        """Return whether this sequence number is inside or above the window, and was not accepted before."""
         if sequence > self._newest:
             return True
         if sequence <= self._newest - WINDOW:
@@ -31,7 +31,7 @@ class ReplayWindow:
         return not self._words[sequence // _WORD_BITS % _WORDS] >> sequence % _WORD_BITS & 1
 
     def accept(self, sequence: int) -> None:
-        """Record a number as accepted. `is_fresh(sequence)` must be true."""
+        """Record a sequence number as accepted. `is_fresh(sequence)` must be true."""
         word = sequence // _WORD_BITS
         newest_word = self._newest // _WORD_BITS
         if sequence > self._newest:

@@ -12,10 +12,10 @@ _TAG = b"UCP block\0"
 
 
 def sign_block(maker: Signer, mission: bytes, block_data: bytes) -> bytes:
-    """Return the signature of the block with this BD (64 bytes)."""
+    """Return the signature (64 bytes) of the block with this block data."""
     return maker.sign(_TAG + mission + block_data)
 
 
 def block_claim(public_key: bytes, mission: bytes, block_data: bytes, signature: bytes) -> UnverifiedSignature:
-    """Return the claim that the owner of this public key signed the block with this BD in this mission."""
+    """Return the unverified claim that the owner of this public key signed this block data in this mission."""
     return UnverifiedSignature(public_key, signature, _TAG + mission + block_data)

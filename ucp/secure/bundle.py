@@ -51,7 +51,7 @@ class PublicKeys:
 
     @property
     def fingerprint(self) -> str:
-        """The SHA-256 of all public keys of the mission, in hexadecimal. Other keys have another fingerprint."""
+        """The SHA-256 of all public keys of the mission, in hexadecimal. Different keys have different fingerprints."""
         text = json.dumps(self.to_json(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(b"UCP public keys\0" + text.encode("ascii")).hexdigest()
 
@@ -100,7 +100,7 @@ class Bundle:
     started_us: int | None = None
 
     def at_epoch(self, epoch: int, group_secret: bytes) -> "Bundle":
-        """Return the bundle of the same vehicle in a later epoch."""
+        """Return the bundle of the same vehicle for a later epoch, which has this group secret."""
         return replace(self, epoch=epoch, group_secret=group_secret)
 
     def used(self) -> "Bundle":
@@ -186,7 +186,7 @@ def load_bundle(path: Path) -> Bundle:
 
 
 def write_bundle(path: Path, bundle: Bundle) -> None:
-    """Write a bundle with mode 0600, and replace an older one. Raises OSError."""
+    """Write a bundle to a file of mode 0600, and replace an older file. Raises OSError."""
     write_key_file(path, bundle.to_json(), secret=True)
 
 

@@ -49,11 +49,11 @@ class SenderKeys:
         self._iv = int.from_bytes(derived[KEY_BYTES:], "big")
 
     def encrypt(self, position: int, plain: bytes, clear: bytes) -> bytes:
-        """Return the ciphertext and its tag. The caller must use each position once."""
+        """Return the ciphertext and its tag. The caller must use each position (and thus each nonce) only once."""
         return self._aead.encrypt(self._nonce(position), plain, clear)
 
     def decrypt(self, position: int, ciphertext: bytes, clear: bytes) -> bytes | None:
-        """Return the plaintext. None if ciphertext, tag and clear header do not belong together."""
+        """Return the plaintext. Return None if ciphertext, tag and clear header do not belong together."""
         try:
             return self._aead.decrypt(self._nonce(position), ciphertext, clear)
         except InvalidTag:
@@ -64,7 +64,7 @@ class SenderKeys:
 
 
 class UnverifiedSignature(NamedTuple):
-    """The claim that the owner of a public key signed some bytes with this signature."""
+    """The claim, not yet verified, that the owner of a public key signed some bytes with this signature."""
 
     public_key: bytes
     signature: bytes
@@ -72,7 +72,7 @@ class UnverifiedSignature(NamedTuple):
 
 
 def verify(claim: UnverifiedSignature) -> bool:
-    """Return whether the claim is true. Malformed keys and signatures give False."""
+    """Return whether the signature is valid. Return False for malformed keys and signatures."""
     try:
         _load_public_key(claim.public_key).verify(claim.signature, claim.signed)
     except (InvalidSignature, ValueError):

@@ -70,7 +70,7 @@ class ClearHeader(NamedTuple):
 
     @property
     def position(self) -> int:
-        """The position that selects the nonce. Messages and control datagrams have sequences of their own."""
+        """The number that selects the nonce. Messages and control datagrams have separate number ranges."""
         return self.sequence if self.type < REVOCATION else CONTROL_POSITION + self.sequence
 
     def pack(self, length: int) -> bytes:
@@ -115,5 +115,5 @@ ADDED_BYTES: dict[str, int] = {
 
 
 def sealed_bytes(message: Message) -> int:
-    """Return the length of the secured datagram of `message` in bytes."""
+    """Return the length in bytes of the secured datagram that carries `message`."""
     return datagram_bytes(message) + ADDED_BYTES[message.NAME]

@@ -1,4 +1,4 @@
-"""The signed head of a chain export.
+"""The signed head of a chain export, which protects the whole export against changes.
 
 Signatures of blocks cover neither the order nor the number of blocks. The head covers both, and all other content of
 the export: a reader of the export recomputes the head's values and verifies the vehicle's signature. An attacker
@@ -24,7 +24,7 @@ _FIELDS = struct.Struct(">I16sIQI32s32s32sH")
 
 @dataclass(frozen=True)
 class ExportHead:
-    """The values that a vehicle signs. `completed` and `held` are digests. `revoked` has ascending agent IDs."""
+    """The values that a vehicle signs. `completed` and `held` are digests. `revoked` lists ascending agent IDs."""
 
     agent_id: int
     boot: bytes
@@ -39,7 +39,7 @@ class ExportHead:
     revoked: Sequence[int]
 
     def sign(self, signer: Signer, mission: bytes) -> dict[str, Any]:
-        """Return the head as it is exported."""
+        """Sign the head, and return it as the JSON object for the export."""
         return {
             "mission": mission.hex(),
             "boot": self.boot.hex(),
@@ -53,7 +53,7 @@ class ExportHead:
         }
 
     def claim(self, public_key: bytes, mission: bytes, signature: bytes) -> UnverifiedSignature:
-        """Return the claim that the owner of this public key signed the head in this mission."""
+        """Return the unverified claim that the owner of this public key signed the head in this mission."""
         return UnverifiedSignature(public_key, signature, self._signed_bytes(mission))
 
     def _signed_bytes(self, mission: bytes) -> bytes:

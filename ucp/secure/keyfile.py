@@ -34,7 +34,7 @@ def read_key_file(path: Path, schema: str, parse: Callable[[dict[str, Any]], T],
 
 
 def read_any_key_file(path: Path, kinds: Mapping[str, tuple[bool, Callable[[dict[str, Any]], T]]]) -> T:
-    """Read a key file of one of several schemas. `kinds` maps each schema to whether it is secret, and to its parser.
+    """Read a key file that has one of several schemas. `kinds` maps each schema to (is secret, parser).
 
     Raises KeyFileError like `read_key_file`.
     """
@@ -77,7 +77,7 @@ def _read(path: Path) -> tuple[dict[str, Any], int]:
 
 
 def write_key_file(path: Path, document: Mapping[str, Any], *, secret: bool) -> None:
-    """Write a key file and replace an older one atomically. A reader sees either the complete old or new file.
+    """Write a key file and replace an older one atomically. A reader sees the complete old or the complete new file.
 
     Other users can read a `secret` file at no moment. Raises OSError.
     """

@@ -72,7 +72,7 @@ class Revocation:
 
 
 def listed_agents(body: bytes) -> frozenset[int] | None:
-    """Return the agents that a body lists, without verifying its signature. None if it has the wrong length."""
+    """Return the agents that a body lists. Its signature is not verified. Return None if its length is wrong."""
     if len(body) < _HEAD.size:
         return None
     _, count = _HEAD.unpack_from(body)

@@ -28,7 +28,7 @@ _DATAGRAM = b"UCP datagram\0"
 
 
 class AnsweredRequest(NamedTuple):
-    """The request that a response answers, identified by its sender, boot and sequence."""
+    """The request that a response answers, identified by its sender, boot and sequence number."""
 
     sender: int
     boot: bytes
@@ -59,7 +59,7 @@ def signing_domain(mission: bytes) -> bytes:
 def decrypt(
     keys: SenderKeys, datagram: bytes, clear: ClearHeader, domain: bytes, public_key: bytes
 ) -> tuple[bytes, UnverifiedSignature]:
-    """Return the body of a sealed datagram, and the claim of its signature, which the caller must still verify.
+    """Return the body of a sealed datagram, and its signature, which the caller must still verify.
 
     Raises MalformedDatagramError if the keys do not decrypt the datagram.
     """
@@ -100,7 +100,7 @@ class Signer(Protocol):
 
 @dataclass(frozen=True)
 class CryptoFunctions:
-    """The functions of bytes and keys that a session calls.
+    """The cryptographic functions that a session calls. Their results depend only on bytes and keys.
 
     The defaults compute each result. A simulation replaces them by functions with the same arguments that cache
     results.

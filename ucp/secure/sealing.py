@@ -61,7 +61,7 @@ class Depot:
 
 
 def make_seal(bundle: Bundle, draw_key: Callable[[], bytes] | None = None) -> Seal | None:
-    """Return the function with which this vehicle seals its event data. None if its mission does not seal.
+    """Return the function with which this vehicle seals event data. Return None if its mission does not seal them.
 
     `draw_key` returns a random ephemeral key, 32 bytes. Without it, ephemeral keys are derived, for virtual time.
     """
@@ -79,7 +79,7 @@ def make_seal(bundle: Bundle, draw_key: Callable[[], bytes] | None = None) -> Se
 
 
 def _derived_key(bundle: Bundle, data: bytes) -> bytes:
-    """Return an ephemeral key that follows from the vehicle's private key and all data of a block."""
+    """Return an ephemeral key that is computed from the vehicle's private key and all data of a block."""
     derivation = HMAC(bundle.private_key, SHA256())
     derivation.update(b"UCP ephemeral key\0" + data)
     return derivation.finalize()

@@ -41,7 +41,7 @@ class OutgoingDatagram(NamedTuple):
 
 
 def make_boot(started_us: int, random_bytes: bytes) -> bytes:
-    """Return the boot of an incarnation: its start in microseconds UTC, and 8 random bytes."""
+    """Return the boot value of a new incarnation: its start in microseconds UTC, and 8 random bytes."""
     boot = _BOOT_TIME.pack(started_us) + random_bytes
     assert len(boot) == BOOT_BYTES
     return boot
@@ -82,7 +82,7 @@ class SecuredAgent(Agent):
         return {**export_chain(self.state, exported_at_us, self.signatures), "head": self.sign_head(exported_at_us)}
 
     def sign_head(self, exported_at_us: int) -> dict[str, Any]:
-        """Return the signed head of an export at this time. Each head has the next number."""
+        """Return the signed head of an export at this time. Each head is numbered one higher than the previous one."""
         self._exports += 1
         head = head_of(self.state, self.session.boot, self._exports, exported_at_us, self.revoked)
         return head.sign(self.session.private_key, self.session.mission)
@@ -157,7 +157,7 @@ class SecuredAgent(Agent):
         return [outgoing.sealed for outgoing in self.sealed_to_send()]
 
     def sealed_to_send(self) -> Sequence[OutgoingDatagram]:
-        """Return the datagrams to broadcast now, in order. Answers wait by `answer_spread_s`."""
+        """Return the datagrams to broadcast now, in order. The setting `answer_spread_s` delays answers."""
         due = self._due_to_send()
         if not (due or self._revocation_due or self.session.has_control_datagrams):
             return ()
@@ -189,7 +189,7 @@ class SecuredAgent(Agent):
         return self._revocations.revoked
 
     def _receive_revocation(self, body: bytes, sender: int, now: float) -> None:
-        """Accept a revocation from the air. Raises MalformedDatagramError."""
+        """Accept the body of a revocation that another vehicle has sent. Raises MalformedDatagramError."""
         if self._revocations.adds_nothing(body):
             raise MalformedDatagramError("known already")
         budget = self.session.revocation_budget
@@ -202,7 +202,7 @@ class SecuredAgent(Agent):
             raise
 
     def revoke(self, body: bytes, now: float, origin: Mapping[str, Any] | None = None) -> None:
-        """Accept the body of a revocation. A revocation of known agents only has no effect.
+        """Accept the body of a revocation. A body that lists no newly revoked agent has no effect.
 
         `origin` is written to the trace. Raises MalformedDatagramError if the authority did not sign the revocation.
         """

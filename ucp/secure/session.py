@@ -71,7 +71,7 @@ class _SenderIncarnation:
 
 
 class Session:
-    """The session of one incarnation of a vehicle.
+    """The keys and counters with which one incarnation of a vehicle seals and opens datagrams.
 
     `boot` consists of the incarnation's start in microseconds UTC (8 bytes) and 8 random bytes. `save_bundle` is called
     with the new bundle at once, so that a later incarnation knows of this one, and after each change of the epoch.
@@ -136,7 +136,7 @@ class Session:
         block_signature: bytes | None,
         revocations: int,
     ) -> bytes:
-        """Return the sealed datagram of a message. The caller must use each sequence once, up to LAST_SEQUENCE."""
+        """Return the sealed datagram of a message. Each sequence number up to LAST_SEQUENCE may be used once."""
         self.record_sent(sequence, message)
         self._next_sequence = max(self._next_sequence, sequence + 1)
         code = TYPE_CODES[type(message)]
@@ -297,7 +297,7 @@ class Session:
             self._held.clear()
 
     def _decrypt(self, datagram: bytes, clear: ClearHeader) -> tuple[SenderKeys, bytes, UnverifiedSignature]:
-        """Return keys, body and claim of a datagram. Raises MalformedDatagramError if its tag is wrong."""
+        """Return keys, body and unverified signature of a datagram. Raises MalformedDatagramError for a wrong tag."""
         keys = self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot)
         return keys, *self.crypto.decrypt(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
 
@@ -313,12 +313,12 @@ class Session:
         return body
 
     def count_wrong_signature(self, sender: int) -> None:
-        """Take a token for a wrong signature from the budget of the sender."""
+        """Remove a token from the sender's budget, because a signature in its name was wrong."""
         self._budgets[sender].take()
 
     def is_newest_request(self, request: AnsweredRequest, code: int) -> bool:
-        """Return true if a response of type `code` counts. It does not count if a newer request of its type by the same
-        sender is known.
+        """Return true if a response of type `code` to this request counts. It does not count if a newer request of the
+        same type and sender is known.
 
         If this vehicle sent the request, it must be its newest. A request of another vehicle need not have been
         received.

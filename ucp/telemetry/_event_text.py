@@ -15,7 +15,7 @@ _STATES = (  # MAV_STATE
 
 
 def vehicle_type(event_id: int, data: bytes) -> int | None:
-    """Return the vehicle type (MAV_TYPE) that an event contains, or None if it contains none."""
+    """Return the vehicle type (MAV_TYPE) in this event. Return None if the event contains none."""
     if event_id != _records.MODE_CHANGE or len(data) != _records.MODE_CHANGE_DATA.size:
         return None
     kind: int = _records.MODE_CHANGE_DATA.unpack(data)[1]

@@ -78,7 +78,7 @@ class Position(NamedTuple):
 
 
 def position_of(event_id: int, data: bytes) -> Position | None:
-    """Return the position in an event, or None if it is another event, cannot be read, or is out of range."""
+    """Return the position in an event. Return None if it is another event, cannot be read, or is out of range."""
     if event_id != POSITION:
         return None
     try:

@@ -1,4 +1,4 @@
-"""The entry point that pytest loads. It loads the plugin unless other packages have the names of the harness's
+"""The entry point that pytest loads. It loads the plugin unless foreign packages have the names of the harness's
 packages.
 
 A project may have a folder with the name of one of our packages, and one process can import only one of both. In this
@@ -19,7 +19,7 @@ OURS = {"harness": "pytest_plugin", "ucp": "quirks", "sitl": "pilot.py", "netem"
 
 
 def find_foreign_packages() -> list[Path]:
-    """Return other packages that have the names of our packages and that Python imports first."""
+    """Return packages from elsewhere that have the names of our packages and that Python imports in their place."""
     here = Path.cwd()
     places = [here / name for name in OURS if (here / name / "__init__.py").exists()]
     for name in OURS:

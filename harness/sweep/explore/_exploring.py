@@ -17,7 +17,7 @@ from harness.sweep.explore._smaller import replays, scenario_of, shrink, size
 
 @dataclass(frozen=True, slots=True)
 class ViolatingRun:
-    """A run with bad verdicts: its seed, and the numbers or keys of the failed checks."""
+    """A run with bad verdicts: its seed, and the numbers or keys of the checks that failed."""
 
     seed: int
     keys: tuple[str, ...]
@@ -39,7 +39,7 @@ class SearchResult:
 
 
 def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> SearchResult:
-    """Play the seeds in order until a run violates a check. A swarm that only needs more time does not count.
+    """Play the seeds in order until a run violates a check. A run whose swarm only needs more time violates none.
 
     The result is the first such seed, for any number of `jobs`. Ctrl-C ends the search early. Raises HarnessError if
     the scenario cannot be played.
@@ -75,7 +75,7 @@ SEEDS = 1000
 
 @dataclass(frozen=True)
 class ShrunkScenario:
-    """The smallest scenario that still violates: its file, and the number of steps that led to it."""
+    """The smallest scenario found that still violates the check: its file, and the number of steps that led to it."""
 
     path: Path
     seed: int
@@ -107,8 +107,8 @@ class Explored:
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """Functions that report progress. `on_step` is called with the number of runs so far, and the size of the scenario
-    as text.
+    """Functions that report progress. `on_step` is called with the number of runs so far, and the size of the present
+    scenario as text.
     """
 
     on_violation: Callable[[ViolatingRun], None] = field(default=lambda violation: None)
@@ -172,7 +172,7 @@ def smallest_of(
     max_runs: int,
     on_step: Callable[[int, str], None],
 ) -> tuple[Document, str, bool]:
-    """Return the smallest document for which `still` is true, a description of the steps, and true if the user
+    """Return the smallest document found for which `still` is true, a description of the steps, and true if the user
     interrupted the search.
     """
     interrupted = False

@@ -26,7 +26,7 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class RecordedEvent:
-    """A logged event of an agent. `completes` is true if it completed a block."""
+    """An event that an agent logged. `completes` is true if the event completed a block."""
 
     at_s: float
     agent: int
@@ -52,7 +52,7 @@ class LostMessage:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recorded run with its verdict. Events and lost messages are in order of time."""
+    """A recorded run with its verdict. Its events and its lost messages are in order of time."""
 
     result: Result
     logged: list[RecordedEvent]
@@ -105,7 +105,7 @@ class _EventRecorder(MemoryRecorder):
 
 
 class _RecordingScript(FateScript):
-    """Delivery rules that also record the messages that are lost by a rule or by chance."""
+    """Delivery rules that record each message that they or chance lose."""
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _EventRecorder) -> None:
         super().__init__(fates, roster, name_of)

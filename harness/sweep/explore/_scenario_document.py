@@ -41,7 +41,7 @@ def with_key(document: Document, key: str, value: Any) -> Document:
 
 
 def at(document: Document, key: str) -> Any:
-    """Return the value of the key, which is a path with dots, or None."""
+    """Return the value of the key, which is a path with dots. Return None if the key is missing."""
     value: Any = document
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None
@@ -65,7 +65,7 @@ def with_script(document: Document, logged: list[RecordedEvent], drops: list[Doc
 
 
 def with_drops(document: Document, drops: list[Document]) -> Document:
-    """Replace the rules of the document that lose messages. Its other delivery rules stay."""
+    """Replace the delivery rules of the document that lose messages. Its rules with another effect stay."""
     others = [fate for fate in document.get("fates", []) if "drop" not in fate]
     return with_key(document, "fates", [*drops, *others])
 
@@ -86,7 +86,7 @@ def fate_by_count(lost: LostMessage) -> Document:
 
 
 def fate_by_time(lost: LostMessage, slack_s: float) -> Document:
-    """Return a rule that loses all messages of this type from this sender at about this time.
+    """Return a delivery rule that loses all messages of this type from this sender at about this time.
 
     It stays valid when other messages disappear from the run.
     """
@@ -118,7 +118,7 @@ def _silent(layer: Document) -> Document:
 
 
 def _silent_change(change: Document) -> Document:
-    """Return a timeline entry, or the repeated part of a schedule, without its loss."""
+    """Return a change without its message loss. It is a timeline entry or the repeated part of a schedule."""
     silent = {**change, **_silent(change)}
     return {**silent, "network": _without_loss(change["network"])} if "network" in change else silent
 
@@ -159,7 +159,9 @@ def keep_agents(document: Document, kept: Collection[int]) -> Document:
 
 
 def _network(network: Document, kept: Collection[int]) -> Document:
-    """Return the network section with the conditions of all agents or of the kept ones."""
+    """Return the network section without the conditions of single receivers and links that are not among the kept
+    agents.
+    """
     receivers = {name: value for name, value in network.get("receivers", {}).items() if int(name) in kept}
     links = [_filter_lists(link, ("from", "to"), kept) for link in network.get("links", [])]
     network = with_key(network, "receivers", receivers)
@@ -204,7 +206,7 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
 
 
 def _datagram(datagram: Document, kept: Collection[int]) -> Document:
-    """Return the datagram with the remaining receivers, or without receivers if its source is removed."""
+    """Return the datagram with those receivers that are kept. If its source is removed, return it without receivers."""
     from_kept = datagram["source"] in kept
     reaches = {agent: at_s for agent, at_s in datagram["reaches"].items() if from_kept and int(agent) in kept}
     return {**datagram, "reaches": reaches}
@@ -234,7 +236,7 @@ def timeline(document: Document) -> list[Document]:
 
 
 def event_times(document: Document) -> list[float]:
-    """Return the times of all events, changes and ends of changes, in order."""
+    """Return, in order, the times of all events and timeline entries, and the times at which temporary changes end."""
     passes = {entry["at_s"] + entry["for_s"] for entry in timeline(document) if "for_s" in entry}
     return sorted({entry["at_s"] for entry in (*script(document), *timeline(document))} | passes)
 
@@ -260,7 +262,7 @@ def _limit_duration(entry: Document, last_s: float) -> Document:
 
 
 def move_times(document: Document, to: Callable[[float], float]) -> Document:
-    """Return the scenario document with the function `to` applied to all its times."""
+    """Return the scenario document with each time replaced by the result of the function `to`."""
     for key in ("events.script", "timeline"):
         document = with_key(document, key, [_move_entry_times(entry, to) for entry in at(document, key) or []])
     document = with_key(document, "fates", [_move_fate_times(fate, to) for fate in document.get("fates", [])])
@@ -271,7 +273,7 @@ def move_times(document: Document, to: Callable[[float], float]) -> Document:
 
 
 def _move_fate_times(fate: Document, to: Callable[[float], float]) -> Document:
-    """Change the arrival times in a delivery rule. Rules without arrival times keep their time limits."""
+    """Change the arrival times in a delivery rule. A rule without arrival times keeps its time limits."""
     if "arrivals" not in fate:
         return fate
     return {

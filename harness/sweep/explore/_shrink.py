@@ -53,8 +53,8 @@ class Shrinker:
         self._pace_s = 1.0
 
     def first(self, candidates: Iterable[Document]) -> int | None:
-        """Use the first candidate scenario that still violates the check. Return its index, or None. Raises
-        BudgetSpentError.
+        """Play candidate scenarios, and adopt the first that still violates the check. Return its index. Return None if
+        none does. Raises BudgetSpentError.
         """
         if self.runs >= self._max_runs:
             raise BudgetSpentError
@@ -77,7 +77,7 @@ class Shrinker:
         return None
 
     def _new(self, candidates: Iterable[Document]) -> Iterator[tuple[int, Scenario, Document]]:
-        """Yield the candidates that are valid scenarios and were not tried before."""
+        """Yield the candidate scenarios that are valid and were not tried before."""
         seen = {_key(self.best)}
         for index, document in enumerate(candidates):
             key = _key(document)
@@ -109,7 +109,7 @@ class Shrinker:
 
 
 def _leaving_out(items: Sequence[T], parts: int) -> Iterator[list[T]]:
-    """Yield `items` without one of `parts` parts, for each part.
+    """Divide `items` into `parts` parts. For each part, yield all items outside it.
 
     The last part comes first, because least depends on it.
     """

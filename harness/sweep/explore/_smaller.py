@@ -59,8 +59,8 @@ def shrink(shrinker: Shrinker, record: Record) -> None:
 
 
 def replays(document: Document, recording: Recording) -> Iterator[Document]:
-    """Yield candidates that may reproduce the recorded run without random numbers. The last one is `document`
-    itself.
+    """Yield candidate scenarios that may reproduce the recorded run without random numbers. The last candidate is
+    `document` itself.
     """
     lost = [loss for loss in recording.lost if not loss.by_quirk]
     everything = with_script(document, recording.logged, [fate_by_count(loss) for loss in recording.lost])
@@ -161,7 +161,7 @@ def _use_defaults(shrinker: Shrinker) -> None:
 
 
 def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
-    """Build the same blocks at the same times from one event each."""
+    """Change the scenario so that a single event completes each block, at the same time as in the recorded run."""
     document = shrinker.best
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes
     if at(document, "settings.max_block_bytes") == largest or not script(document):
@@ -197,7 +197,7 @@ def _reduce_gaps(shrinker: Shrinker) -> None:
 
 
 def _time_shift(moment: float, earlier: float) -> Callable[[float], float]:
-    """Return a function that moves `moment` and all later times to an earlier time."""
+    """Return a function that moves `moment` to the time `earlier`, and all later times by the same amount."""
     return lambda at_s: round(at_s - moment + earlier, 6) if at_s >= moment else at_s
 
 

@@ -23,7 +23,9 @@ def informative(
     budget_s: float,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[MatrixTask]:
-    """Yield tasks until the budget is used up. `runs` has the finished results, and grows between two tasks."""
+    """Yield tasks until the time budget is used up. `runs` contains the finished results. The caller adds results
+    between two tasks.
+    """
     until = clock() + budget_s
     begun = Counter(task.point for task in runs)
     left: dict[MatrixPoint, list[MatrixTask]] = {}
@@ -38,7 +40,7 @@ def informative(
 
 
 def _information(point: MatrixPoint, runs: Mapping[MatrixTask, Run], begun: int) -> float:
-    """Return the width of the widest interval of the cell, as the runs that have begun will probably leave it."""
+    """Return the expected width of the cell's widest confidence interval after all runs that have begun so far."""
     if begun < _FIRST_RUNS:
         return float(2 * _FIRST_RUNS - begun)
     ended = [run.figures for task, run in runs.items() if task.point == point and run.judged]

@@ -29,7 +29,7 @@ class CellRecord(BaseModel):
 
 
 class Run(CellRecord):
-    """The result of one run: its figures, and its verdicts by number or key.
+    """The result of one run: its numeric results, and its verdicts by number or key.
 
     A run without a verdict has a reason: in `failed` for an error, or in `unsupported` if an agent lacks a feature.
     """
@@ -54,7 +54,8 @@ class Run(CellRecord):
 
 
 class Cell(CellRecord):
-    """The summary of the runs with one combination of values. `failed` and `unsupported` count runs without figures.
+    """The summary of the runs with one combination of values. `failed` and `unsupported` count runs without numeric
+    results.
 
     `estimates` has an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` has the seeds
     of the runs with a bad verdict, by check. `unfinished` has the seeds of the runs that only needed more time.
@@ -82,7 +83,7 @@ def is_wrong(verdict: Verdict) -> bool:
 
 
 def sum_up(point: MatrixPoint, runs: Sequence[Run], *, grows: bool = False) -> Cell:
-    """Return the summary of these runs. With `grows`, also estimate the figures for laws of growth."""
+    """Return the summary of these runs. With `grows`, also estimate the numeric results for laws of growth."""
     failed = sum(run.failed is not None for run in runs)
     unsupported = sum(run.unsupported is not None for run in runs)
     judged = [run for run in runs if run.judged]

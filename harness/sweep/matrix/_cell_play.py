@@ -24,7 +24,7 @@ from harness.sweep.matrix._run_steps import fingerprint
 
 
 class JudgedRun(NamedTuple):
-    """A judged run. `steps` is its fingerprint, empty without traces."""
+    """A judged run. `steps` is the fingerprint of its handler runs. It is empty without traces."""
 
     played: RunOutcome
     result: Result
@@ -106,7 +106,7 @@ class RunPlayer:
         )
 
     def refuse(self, points: Iterable[MatrixPoint]) -> None:
-        """Check before the first run that all combinations of values can be played.
+        """Check, before the first run, that all combinations of values can be played.
 
         Raises HarnessError if a backend or this machine cannot play one of them.
         """

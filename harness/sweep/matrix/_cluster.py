@@ -28,7 +28,7 @@ SAME_VERSIONS = ("dask", "distributed", "ucp-harness")
 def cluster(
     tasks: Sequence[T], work: Callable[[T], R], address: str, *, what: str | None = None
 ) -> Iterator[Iterator[tuple[T, R | FailedTask]]]:
-    """Yield each task with its result in order of completion. `address` is the Dask scheduler (tcp://host:port).
+    """Yield (task, result) for each task in order of completion. `address` is the Dask scheduler (tcp://host:port).
 
     Outcomes, errors and interrupts are as in `harness.run.parallel.sweep`. The workers must be able to import `work`.
     At the end of the block, unfinished tasks are cancelled.

@@ -23,7 +23,7 @@ from harness.sweep.matrix._run_steps import FirstChange
 
 
 class Change(CellRecord):
-    """A changed figure. `metric` was `before` and is `now`.
+    """A numeric result that has changed. `metric` is its name. Its value was `before`, and is now `now`.
 
     `difference` is the mean difference of the runs with the same seed, with its corrected interval. It is null if the
     runs are not compared in pairs.
@@ -37,7 +37,7 @@ class Change(CellRecord):
 
 
 class ChangedRuns(CellRecord):
-    """The seeds of the simulated runs that differ from the earlier night, among `pairs` compared runs.
+    """The seeds of the simulated runs that differ from the same runs of the earlier night, among `pairs` compared runs.
 
     `first` has the first changed handler run of the first `MAX_NAMED` of them.
     """
@@ -48,7 +48,7 @@ class ChangedRuns(CellRecord):
 
 
 class CulpritCommit(BaseModel):
-    """A commit, and the figure of the run before and after it."""
+    """A commit, and the numeric result of the run before and after this commit."""
 
     hash: str
     date: str
@@ -59,7 +59,8 @@ class CulpritCommit(BaseModel):
 
 
 class Culprit(CellRecord):
-    """The commits that changed a worse figure of the run with this seed, oldest first.
+    """The commits that changed a numeric result that became worse, in the run with this seed. The oldest commit is
+    first.
 
     `problem` is the reason why the search did not find all of them, or null.
     """
@@ -95,7 +96,7 @@ class Comparison(BaseModel):
 
 
 def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
-    """Yield the changes in the order of `now`. Combinations that only one of the matrices has are left out."""
+    """Yield the changes in the order of `now`. Leave out combinations of values that only one matrix has."""
     earlier = {cell.point: cell for cell in before}
     for cell in now:
         if cell.point not in earlier:
@@ -110,7 +111,7 @@ def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
 def compare_pairs(
     before: Sequence[Cell], now: Sequence[Cell], runs_before: Sequence[Run], runs_now: Sequence[Run]
 ) -> tuple[list[Change], list[ChangedRuns]]:
-    """Compare the runs of equal seeds, for all combinations of values that both matrices have."""
+    """Compare each pair of runs with equal seeds, for all combinations of values that both matrices have."""
     earlier = {cell.point: cell for cell in before}
     runs = {run.task: run for run in runs_before}
     pairs: dict[MatrixPoint, list[tuple[Run, Run]]] = {}
@@ -146,7 +147,7 @@ def compare_pairs(
 
 
 def _differ(was: Run, run: Run) -> bool:
-    """Return true if the runs differ. Without two fingerprints, only figures and verdicts are compared."""
+    """Return true if the two runs differ. If a fingerprint is missing, compare only numeric results and verdicts."""
     steps_differ = bool(was.steps and run.steps) and was.steps != run.steps
     return steps_differ or (was.figures, was.verdicts) != (run.figures, run.verdicts)
 
@@ -168,7 +169,7 @@ def _differences(metric: Metric, pairs: Sequence[tuple[Run, Run]]) -> list[float
 
 
 def _moved(before: Estimate, now: Estimate) -> str | None:
-    """Return the direction of a change if the confidence intervals do not overlap. Otherwise return None."""
+    """Return the direction of a change if the confidence intervals do not overlap. Return None if they overlap."""
     if before.low is None or before.high is None or now.low is None or now.high is None:
         return None
     if now.high < before.low:

@@ -1,4 +1,5 @@
-"""Find the commits that made a figure worse, by playing one run at commits between the baseline and tonight.
+"""Find the commits that made a numeric result worse. The search plays one run at commits between the baseline and
+tonight.
 
 A run in virtual time is the same each time, so one run is enough: the one whose figure changed most. A search by halves
 finds the first commit with another figure. If that figure is not yet the one of tonight, the search goes on after this
@@ -31,7 +32,8 @@ class _TimeIsUpError(Exception):
 def find_culprits(
     tonight: MatrixRecord, baseline: MatrixRecord, budget_s: float, report_progress: Callable[[str], None]
 ) -> list[Culprit]:
-    """Search the commits for each cell with a worse figure in virtual time, until the budget is used up.
+    """Search for commits until the budget is used up: for each cell in virtual time with a numeric result that became
+    worse.
 
     The repository is the clone from which the harness runs. Ctrl-C ends the search.
     """
@@ -59,7 +61,7 @@ def _paired_regressions(record: MatrixRecord) -> list[Change]:
 
 
 def _worst_seed(tonight: MatrixRecord, baseline: MatrixRecord, change: Change) -> int:
-    """Return the seed of the run whose figure became worse by the largest amount."""
+    """Return the seed of the run whose numeric result became worse by the largest amount."""
     metric = BY_NAME[change.metric]
     sign = 1 if metric.worse == "higher" else -1
     before = {run.seed: metric.of(run.figures) for run in baseline.results if run.point == change.point}
@@ -68,7 +70,7 @@ def _worst_seed(tonight: MatrixRecord, baseline: MatrixRecord, change: Change) -
 
 
 class _CulpritSearch:
-    """The search for one run. Appends to the commits of `culprit`."""
+    """The search for the commits that changed one run. It appends them to the commits of `culprit`."""
 
     def __init__(
         self,
@@ -105,7 +107,7 @@ class _CulpritSearch:
             raise HarnessError("the run has the same figure at both commits, so no commit is named")
 
     def _first_after(self, good: str, bad: str, figure: float | None) -> str:
-        """Return the first commit after `good` whose figure differs."""
+        """Return the first commit after `good` at which the numeric result differs from `figure`."""
         step = self._history.begin(good, bad)
         while not isinstance(step, SuspectCommits):
             try:
@@ -119,7 +121,7 @@ class _CulpritSearch:
         return step.first[0]
 
     def _figure(self, commit: str) -> float | None:
-        """Return the figure of the run at this commit."""
+        """Return the numeric result of the run at this commit."""
         if commit not in self._figures:
             if time.monotonic() > self._deadline:
                 raise _TimeIsUpError

@@ -1,4 +1,4 @@
-"""Estimate the means and shares of figures over several runs, with 95 % confidence intervals.
+"""Estimate the means and shares of numeric results over several runs, with 95 % confidence intervals.
 
 A share of runs has Wilson's interval, which is also valid near 0 and 100 %. A mean has Student's interval. A single run
 has no interval, because it contains no information about the spread.
@@ -17,7 +17,7 @@ CONFIDENCE = 0.95
 
 
 class Estimate(BaseModel):
-    """The mean of a figure over `n` runs, with its confidence interval.
+    """The mean of a numeric result over `n` runs, with its confidence interval.
 
     `low` and `high` are the limits of its 95 % interval, null for a single run. Without runs, all are null.
     """
@@ -84,7 +84,7 @@ Figures = Mapping[str, float | int | None]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A figure of a run. `of` returns its value, or None if the run does not determine it.
+    """A kind of numeric result of a run. `of` returns its value, or None if the run does not determine it.
 
     `unit` is a share of the runs, a share in each run, or a number. `worse` is the worse direction, None if neither is.
     """

@@ -1,4 +1,4 @@
-"""Fit laws for the growth of figures with the number of agents and the number of blocks.
+"""Fit laws for the growth of numeric results with the number of agents and the number of blocks.
 
 The mission's length is no variable of its own, because a longer mission costs more only through its larger number of
 blocks. The laws "over blocks" therefore compare missions of several lengths.
@@ -19,7 +19,7 @@ Load = Literal["any", "below 1", "from 1"]
 
 
 class Growth(BaseModel):
-    """A power law for the growth of the figure `metric`. It is fitted to single runs.
+    """A power law for the growth of the numeric result `metric`. It is fitted to single runs.
 
     The runs have this `backend` and `loss`. They also have this `duration_s`, this number of `agents`, and a cell with
     this `load`; null stands for all of them.
@@ -36,7 +36,7 @@ class Growth(BaseModel):
 
 
 def overloaded(cell: Cell) -> bool:
-    """Return true if agents complete blocks faster than they can commit them."""
+    """Return true if agents complete blocks faster than the swarm can commit them."""
     load = cell.estimates["load"].mean if "load" in cell.estimates else None
     return load is not None and load >= 1
 

@@ -1,4 +1,4 @@
-"""Compute the figures that only a matrix with several swarm sizes or mission lengths needs."""
+"""Compute the numeric results that only a matrix with several swarm sizes or mission lengths needs."""
 
 from harness.scenario import Scenario
 from harness.sweep.matrix._estimate import BY_NAME as BY_NAME_IN_EVERY_MATRIX
@@ -21,7 +21,7 @@ BY_NAME = BY_NAME_IN_EVERY_MATRIX | {metric.name: metric for metric in METRICS}
 
 
 def growth_figures(scenario: Scenario, mission_s: float, figures: Figures) -> Figures:
-    """Return the figures of a run for laws of growth, derived from the checker's figures.
+    """Return the numeric results of a run for laws of growth, derived from those of the checker.
 
     `mission_s`: the length of the run with the time to settle. Rates per minute are rates over that time.
     `load`: the number of blocks that are completed while one vote lasts. Only one vote at a time can succeed. At load 1

@@ -190,7 +190,7 @@ def _place_of(item: Cell | Growth, panel: GrowthPanel) -> ChartLineKey:
 
 
 def _name(matrix: Matrix, losses: Sequence[float], place: ChartLineKey) -> str:
-    """Return the values in which a line differs from the other lines, as text."""
+    """Return a name for a line: the values, such as the loss rate, by which it differs from the other lines."""
     return ", ".join(
         [
             *([f"{words.percent(place.loss)} loss"] if len(losses) > 1 else []),
@@ -221,7 +221,7 @@ def _panel(record: MatrixRecord, panel: GrowthPanel, area: ChartArea) -> Markup:
 
 
 def _line(panel: GrowthPanel, line: PanelLine, across: Axis, up: Axis) -> Markup:
-    """Draw the dots with tooltips, and the fitted law. Without a law, draw straight lines between the dots."""
+    """Draw the points of a line with tooltips, and the fitted law. Without a law, join the points by straight lines."""
     points = [(x, y, cell) for cell in line.cells if (x := _x(panel, cell)) and (y := _y(panel, cell)) is not None]
     ends = _ends(panel, line) or [(x, y) for x, y, _ in points]
     parts = [svg.line([(across(x), up(y)) for x, y in ends], line.number)] if ends else []
@@ -243,7 +243,7 @@ def _power(panel: GrowthPanel, line: PanelLine, law: Law, prefix: str, x: float,
 
 
 def _ends(panel: GrowthPanel, line: PanelLine) -> list[tuple[float, float]]:
-    """Return the ends of the law's line, at the first and the last dot."""
+    """Return the two end points of the law's line: at the first and the last point of the data."""
     xs = [x for cell in line.cells if (x := _x(panel, cell)) and _y(panel, cell)]
     if not line.law or not xs:
         return []
@@ -273,7 +273,7 @@ def _up(panel: GrowthPanel, lines: Sequence[PanelLine], area: ChartArea) -> Axis
 
 
 def _x(panel: GrowthPanel, cell: Cell) -> float | None:
-    """Return the value of a cell on the horizontal axis, or None if a logarithmic axis cannot show the value."""
+    """Return the value of a cell on the horizontal axis. Return None if a logarithmic axis cannot show the value."""
     return float(cell.agents) if panel.over == "agents" else _mean("blocks", cell) or None
 
 

@@ -32,7 +32,9 @@ EXPLANATION = (
 
 @dataclass(frozen=True, slots=True)
 class GrowthTables:
-    """The tables for one loss rate and backend: means, and a row of laws for each group of runs and variable."""
+    """The tables for one loss rate and backend: a table of means, and a table of laws. The laws have a row for each
+    group of runs and each variable.
+    """
 
     name: str
     cells: list[Cell]

@@ -45,7 +45,7 @@ class CoverageTally:
         self._by_point[point].add(reached)
 
     def tried(self, matrix: Matrix, runs: int) -> MatrixCoverage:
-        """Return the coverage so far.
+        """Return the coverage by the runs so far.
 
         `runs` counts all runs, including those of earlier commands, whose coverage is unknown.
         """

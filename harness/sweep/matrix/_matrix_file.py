@@ -80,7 +80,7 @@ class Matrix(StrictModel):
 
     @property
     def needs_processes(self) -> bool:
-        """True if any run needs real processes, in containers or without."""
+        """True if any run needs real processes, whether in containers or not."""
         return any(not BACKENDS[backend].plays_in_memory for backend in self.backend)
 
     @property

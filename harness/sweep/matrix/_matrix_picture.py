@@ -25,7 +25,7 @@ HEAD, SERIES_HEAD, PANEL_HEIGHT, FOOT = 74, 26, 218, 26
 
 @dataclass(frozen=True, slots=True)
 class ChartPanel:
-    """The contents of a chart: its figures, with the names of their lines."""
+    """The contents of a chart: its numeric results, with the names of their lines."""
 
     title: str
     lines: tuple[tuple[str, str], ...]
@@ -65,7 +65,7 @@ class PlacedPanel:
 
 @dataclass(frozen=True, slots=True)
 class PanelRow:
-    """A row of charts below its name. `name` is empty if there is only one row."""
+    """A row of charts with its name above them. `name` is empty if there is only one row."""
 
     name: str
     cells: list[Cell]
@@ -111,7 +111,7 @@ def _series(record: MatrixRecord) -> list[list[Cell]]:
 
 
 def _name(record: MatrixRecord, cells: Sequence[Cell]) -> str:
-    """Return the values in which this row differs from others, as text."""
+    """Return a name for a row: the values by which it differs from the other rows."""
     return ", ".join(series_name(record.matrix, cells[0].point)) if cells else ""
 
 
@@ -164,7 +164,7 @@ def _panel(placed: PlacedPanel, cells: Sequence[Cell]) -> Markup:
 
 
 def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axis, up: Axis) -> Markup:
-    """Draw a line, and its name beside its middle."""
+    """Draw a line, and write its name next to its middle."""
     known = [
         LinePoint(cell.loss, cell.estimates[name], f"{text.percent(cell.loss)} loss: {_say(name, cell)}")
         for cell in cells

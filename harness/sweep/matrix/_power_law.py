@@ -96,7 +96,9 @@ def _centred(values: Sequence[float]) -> list[float]:
 
 
 def _unexplained(values: Sequence[float], by: Sequence[float]) -> list[float]:
-    """Return the residuals of the regression of `values` on another variable, which may be constant."""
+    """Return the part of `values` that a regression on another variable, which may be constant, does not explain (the
+    residuals).
+    """
     if max(by) - min(by) < 1e-12:
         return _centred(values)
     slope, intercept = linear_regression(by, values)

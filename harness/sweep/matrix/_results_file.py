@@ -80,8 +80,8 @@ def _header(matrix: Matrix) -> dict[str, Any]:
 
 
 def _start_time(line: bytes, matrix: Matrix, directory: Path) -> str:
-    """Return the start time of the matrix in `directory`. Raises RunDirectoryError if the directory has a different
-    matrix.
+    """Return the start time of the matrix in `directory`. Raises RunDirectoryError if the directory belongs to a
+    different matrix.
     """
     try:
         header = parse_json(line)

@@ -25,7 +25,7 @@ _BYTES = 2
 
 
 class HandlerStep(NamedTuple):
-    """A handler run and its agent."""
+    """One run of a handler, with the agent that ran it."""
 
     t: float
     agent_id: int
@@ -33,7 +33,7 @@ class HandlerStep(NamedTuple):
 
 
 class FirstChange(BaseModel):
-    """The first handler run of tonight's run with this seed that the earlier night did not have.
+    """The first handler run in which tonight's run with this seed differs from the run of the earlier night.
 
     `handler` is null if it is not among the handler runs of the fingerprint, or if tonight's run ended before.
     """
@@ -46,13 +46,13 @@ class FirstChange(BaseModel):
 
 
 def fingerprint(traces: Mapping[int, Trace]) -> str:
-    """Return the fingerprint of a run in base64. Empty without traces."""
+    """Return the fingerprint of a run in base64. It is empty without traces."""
     digests = [_digest(step).to_bytes(_BYTES) for step in _steps(traces)[:MAX_STEPS]]
     return base64.b64encode(b"".join(digests)).decode("ascii")
 
 
 def first_changed(before: str, now: str) -> int | None:
-    """Return the position of the first step that differs, or None if the fingerprints are equal."""
+    """Return the position of the first handler run that differs. Return None if the fingerprints are equal."""
     if before == now:
         return None
     was, is_now = base64.b64decode(before), base64.b64decode(now)
@@ -75,7 +75,7 @@ def name_change(scenario: Scenario, seed: int, position: int) -> FirstChange:
 
 
 def _steps(traces: Mapping[int, Trace]) -> list[HandlerStep]:
-    """Return the handler runs with an effect of all agents, in the order of mission time."""
+    """Return those handler runs of all agents that had an effect, in the order of mission time."""
     steps = (HandlerStep(run.t, agent_id, run) for agent_id, trace in sorted(traces.items()) for run in trace.runs)
     return sorted((step for step in steps if step.run.sent or not only_receives(step.run)), key=lambda step: step.t)
 

@@ -63,7 +63,9 @@ def _cases(record: MatrixRecord) -> Iterator[JunitCase]:
 
 
 def write(finished: Finished, directory: Path, nights: StoredNights | None = None) -> None:
-    """Write all output files. `nights` are drawn as a trend. Raises MachineError if a file cannot be written."""
+    """Write all output files. `nights` are earlier results, drawn as a trend. Raises MachineError if a file cannot be
+    written.
+    """
     record = finished.record
     try:
         write_json_atomically(directory / "matrix.json", record.to_json())
@@ -99,8 +101,8 @@ def _place(point: MatrixPoint) -> dict[str, Any]:
 
 
 def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
-    """Yield a row of `runs.csv` for each run: its values and seed, and its figures and verdicts or the reason why they
-    are missing.
+    """Yield a row of `runs.csv` for each run: its values and seed, then its numeric results and verdicts, or the reason
+    why they are missing.
     """
     figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
     for run in runs:

@@ -38,7 +38,7 @@ MAX_NAMED = 50
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished or interrupted matrix: its results, and its runs sorted by their values and seeds."""
+    """A finished or interrupted matrix: its results, and its runs, which are sorted by their values and seeds."""
 
     record: MatrixRecord
     runs: list[Run]
@@ -132,7 +132,7 @@ def _run_missing(
 
 
 def compare_with(finished: Finished, baseline: BaselineNight) -> Finished:
-    """Return the results together with their changes since an earlier night."""
+    """Return the results of a matrix together with the changes since an earlier night."""
     if baseline.record is None:
         comparison = Comparison(baseline=str(baseline.path), changes=[], not_compared=baseline.not_compared)
         return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
@@ -159,7 +159,8 @@ def compare_with(finished: Finished, baseline: BaselineNight) -> Finished:
 
 
 def name_changes(finished: Finished, baseline: BaselineNight, jobs: int) -> Finished:
-    """Return the results together with the first changed handler run of each changed run, at most MAX_NAMED per cell.
+    """Return the results of a matrix. For each changed run, at most MAX_NAMED per cell, they name the first changed
+    handler run.
 
     The runs are played again. Ctrl-C ends this search; the remaining changes then have no name.
     """
@@ -191,7 +192,7 @@ def name_changes(finished: Finished, baseline: BaselineNight, jobs: int) -> Fini
 def name_culprits(
     finished: Finished, baseline: BaselineNight, budget_s: float, report_progress: Callable[[str], None]
 ) -> Finished:
-    """Return the results together with the commits that made figures worse."""
+    """Return the results of a matrix together with the commits that made numeric results worse."""
     if finished.record.against is None or baseline.record is None:
         return finished
     culprits = find_culprits(finished.record, baseline.record, budget_s, report_progress)
@@ -200,9 +201,7 @@ def name_culprits(
 
 
 def _effort(scenario: Scenario) -> float:
-    """Estimate the relative cost of a run. The cost grows with the number of messages, and large swarms take long to
-    become idle.
-    """
+    """Estimate the relative time that a run takes. It grows with the number of messages, and with the swarm size."""
     agents = len(scenario.roster)
     return agents**2 * (scenario.duration_s + min(scenario.settle.limit_s, 30 * agents))
 

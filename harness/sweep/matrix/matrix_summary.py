@@ -58,7 +58,7 @@ def describe_coverage(tried: MatrixCoverage) -> Iterator[str]:
 
 
 def verdict(record: MatrixRecord) -> str:
-    """Return the headline: numbers of runs, violations, failures and worse figures."""
+    """Return the headline: numbers of runs, violations, failures and worsened numeric results."""
     runs = sum(cell.runs for cell in record.cells)
     parts = [f"{text.value(runs)} runs"]
     if record.outcome == "interrupted":

@@ -50,7 +50,7 @@ def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
 
 
 def series(record: MatrixRecord) -> list[list[Cell]]:
-    """Return groups of summaries that differ only by their loss rate."""
+    """Return groups of summaries. The summaries of one group differ only by their loss rate."""
     groups: dict[tuple[object, ...], list[Cell]] = {}
     for cell in record.cells:
         groups.setdefault((cell.backend, cell.duration_s, cell.agents), []).append(cell)
@@ -58,7 +58,7 @@ def series(record: MatrixRecord) -> list[list[Cell]]:
 
 
 def axes(matrix: Matrix) -> dict[str, Callable[[MatrixPoint], str]]:
-    """Return the loss rate and all other values that vary, each with a function that formats it.
+    """Return the loss rate and all other values that vary in the matrix, by name.
 
     Each axis comes with a function that formats the value of a point.
     """
@@ -141,7 +141,7 @@ def violated(cell: Cell) -> int:
 
 
 def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
-    """Yield a sentence for each failure, bad verdict, unfinished run or worse figure of a summary."""
+    """Yield a sentence for each failure, bad verdict, unfinished run or worsened numeric result of a summary."""
     by_words = {BAD_IN_WORDS[key]: seeds for key, seeds in cell.violated.items()}
     for trouble, seeds in {**by_words, "more time needed": cell.unfinished}.items():
         if seeds:
@@ -211,7 +211,7 @@ def _say_culprit(culprit: Culprit) -> Iterable[str]:
 
 
 def _first_changes(changed: ChangedRuns) -> str:
-    """Return the handlers of the first changed handler runs, and the earliest of them."""
+    """Return the handlers of the first handler runs that changed, and the earliest of these runs."""
     known = [each for each in changed.first if each.handler is not None]
     if not known:
         return ""

@@ -26,7 +26,8 @@ class OtherVersionError(ScenarioError):
 
 @dataclass(frozen=True, slots=True)
 class BaselineNight:
-    """An earlier night for a comparison. `not_compared` is the reason why some combinations of values are left out.
+    """An earlier night, with which results are compared. `not_compared` is the reason why some combinations of values
+    are left out.
 
     `record` is None if another version of the harness wrote the file and this version cannot read it.
     """
@@ -123,7 +124,9 @@ LAST = 60
 
 @dataclass(frozen=True, slots=True)
 class StoredNights:
-    """The stored nights of one matrix, sorted by start time. `left_out` contains a sentence for each unusable file."""
+    """The stored nights of one matrix, sorted by start time. `left_out` contains a sentence for each file that cannot
+    be used.
+    """
 
     directory: Path
     records: list[MatrixRecord]
@@ -149,7 +152,9 @@ def opened(directory: Path) -> Path:
 
 
 def keep(record: MatrixRecord, directory: Path) -> None:
-    """Store a finished night. Storing it again changes nothing. Raises MachineError if the file cannot be written."""
+    """Store a finished night. Nothing changes if it is stored already. Raises MachineError if the file cannot be
+    written.
+    """
     if record.outcome != "completed":
         return
     path = directory / f"{re.sub('[^0-9TZ]', '', record.started_at)}.json"

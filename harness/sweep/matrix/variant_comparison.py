@@ -24,7 +24,7 @@ SIGNIFICANT_DIGITS = 4
 
 @dataclass(frozen=True)
 class ComparedValue:
-    """A value that is compared for each pair of runs. `of` returns None if a run does not determine it."""
+    """A kind of value that is compared for each pair of runs. `of` returns None if a run does not determine it."""
 
     label: str
     of: Callable[[Run], float | None]
@@ -70,7 +70,7 @@ COMPARED = (
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """One line of the page: the means of the original and the variant, and the mean difference of the pairs."""
+    """One line of the page: the mean of the original, the mean of the variant, and the mean difference of the pairs."""
 
     compared: ComparedValue
     original: float | None

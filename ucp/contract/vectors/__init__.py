@@ -57,7 +57,7 @@ def texts() -> dict[Path, str]:
 
 
 def write_all() -> None:
-    """Write all files with test vectors again."""
+    """Write all files with test vectors, and replace the present files."""
     for path, text in texts().items():
         path.parent.mkdir(exist_ok=True)
         path.write_text(text, encoding="ascii")

@@ -52,7 +52,7 @@ class RecordedMission:
     # Inputs
 
     def begin(self, **store: Any) -> None:
-        """Start the agent. `store` contains the data that it stored before its last end."""
+        """Start the agent. `store` contains the data that the agent stored before it last ended."""
         self._agent: VirtualAgent | None = None
         settings = Settings().to_json() | self._settings
         mission: dict[str, Any] = {
@@ -76,11 +76,11 @@ class RecordedMission:
         self._exchange({"mission": mission, "trace": True, **self._of_life(), **store})
 
     def _of_mission(self) -> dict[str, Any]:
-        """Return further keys of the mission file."""
+        """Return additional keys for the mission file. A subclass may define some."""
         return {}
 
     def _of_life(self) -> dict[str, Any]:
-        """Return further keys of the input line that starts the agent."""
+        """Return additional keys for the input line that starts the agent. A subclass may define some."""
         return {}
 
     def log(self, data_bytes: int = 256, *, after_s: float = 1.0, event_id: int = 5) -> None:
@@ -105,7 +105,7 @@ class RecordedMission:
         return encode(sender, sequence, message)
 
     def _message(self, datagram: bytes) -> Message | None:
-        """Return the message in a datagram of the agent, or None if it contains no message."""
+        """Return the message in a datagram of the agent. Return None if the datagram contains no message."""
         return decode(datagram).message
 
     def hear_datagram(self, datagram: bytes, *, after_s: float = 0.125) -> None:
@@ -167,17 +167,17 @@ class RecordedMission:
     # Answers of other agents to the last request
 
     def vote(self, *votes: tuple[int, bool]) -> None:
-        """Give the agent votes on its last proposed block. Each is (voter, approve)."""
+        """Give the agent votes on its last proposed block. Each vote is (voter, approve)."""
         for sender, approve in votes:
             self.hear(sender, BlockAddResponse(self._last(BlockAddRequest).block_hash, approve))
 
     def contain(self, *answers: tuple[int, bool]) -> None:
-        """Give the agent answers to its last query of reconcile phase 1. Each is (responder, contained)."""
+        """Give the agent answers to its last query of reconcile phase 1. Each answer is (responder, contained)."""
         for sender, contained in answers:
             self.hear(sender, ChainContainResponse(self._last(ChainContainQuery).chain_hash, contained))
 
     def name(self, *answers: tuple[int, Block | None], top_us: int = 0) -> None:
-        """Give the agent answers to its last query of reconcile phase 2. Each is (responder, next block).
+        """Give the agent answers to its last query of reconcile phase 2. Each answer is (responder, next block).
 
         None stands for "Is Top Of Chain", with the timestamp `top_us`.
         """

@@ -72,7 +72,7 @@ def follow() -> RecordedMission:
 
 
 def first_again(block: Block) -> Block:
-    """Return a block that differs slightly from this one. Agents distinguish blocks by their hashes."""
+    """Return a block that differs from this block only by its timestamp, and therefore has another hash."""
     return Block(block.agent_id, block.timestamp_us + 1, block.event_data)
 
 

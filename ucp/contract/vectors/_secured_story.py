@@ -60,7 +60,7 @@ class SecuredStory(RecordedMission):
         self._exchange({"datagram": next(given["datagram"] for given in inputs if "datagram" in given)})
 
     def echo(self, *peers: int) -> None:
-        """Let peers answer the agent's challenge, which is among its last datagrams."""
+        """Let these agents answer the challenge message that the agent has just sent."""
         (challenge,) = (sent for sent in self._sent() if sent[3] == CHALLENGE)
         for peer in peers:
             session = self._peers[peer]
@@ -91,8 +91,8 @@ class SecuredStory(RecordedMission):
         return self._peers[sender].seal(sequence, message, request, signature, 0)
 
     def _message(self, datagram: bytes) -> Message | None:
-        """Return the message in a datagram of the agent, and store its request. Return None for a list of excluded
-        vehicles.
+        """Return the message in a datagram of the agent, and store its identity for answers. Return None for a control
+        datagram, which contains no message.
         """
         if datagram[3] in CONTROL_NAMES:
             return None

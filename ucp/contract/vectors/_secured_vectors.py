@@ -42,7 +42,7 @@ def signature_of(block: Block) -> bytes:
 
 
 def cases() -> Iterator[tuple[str, bytes]]:
-    """Yield each datagram with its description. They reach agent 7 in this order."""
+    """Yield each datagram with its description. Agent 7 receives the datagrams in this order."""
     other = session(OTHER)
     good = other.seal(1, RequestForBlock(BLOCK_HASH), None, None, 0)
     yield "a plain one", encode(OTHER, 1, RequestForBlock(BLOCK_HASH))

@@ -87,7 +87,7 @@ def vectors() -> dict[str, Any]:
 
 
 def dropped(data: bytes) -> str | None:
-    """Return the reason why a new agent drops the datagram, or None if it handles the datagram."""
+    """Return the reason why a new agent drops the datagram. Return None if the agent handles it."""
     agent = Agent(AGENT_ID, ROSTER, b"")
     agent.receive_datagram(data, 0.0)
     return next(iter(agent.dropped), None)

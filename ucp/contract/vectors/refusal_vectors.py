@@ -16,7 +16,7 @@ UNKNOWN = "a feature of a later version"
 
 
 def vectors() -> dict[str, Any]:
-    """Return the test vectors. `plays` is true if an agent with the features `needs` must play the mission."""
+    """Return the test vectors. `plays` is true if an agent that has the features in `needs` must play the mission."""
     ordinary = RecordedMission().exchanges[0]["input"]["mission"]
     return {
         "about": "Missions and requests in doubt; see CONTRACT.md",

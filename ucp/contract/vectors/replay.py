@@ -57,7 +57,7 @@ class Player:
 
 
 def play(player: Player, transcript: Path) -> str | None:
-    """Play a recorded mission. Return the first difference, or the reason why the agent cannot play it, or None.
+    """Play a recorded mission. Return the first difference, or the reason why the agent cannot play the mission.
 
     None means that the agent gave the expected outputs. Raises NoAnswerError.
     """

@@ -66,7 +66,7 @@ NightName = Annotated[str, Field(max_length=40)]
 
 
 class Finding(BaseModel):
-    """A kind of bad verdict. `first` and `last` are the start times of the first and the last night in which runs
+    """A bad verdict of one kind. `first` and `last` are the start times of the first and the last night in which runs
     showed it.
     """
 
@@ -103,7 +103,9 @@ class _FindingsFile(BaseModel):
 
 @dataclass
 class Corpus:
-    """An open corpus directory, locked against other commands. `left_out` has a sentence about each unused file."""
+    """An open corpus directory (stored scenarios and findings), locked against other commands. `left_out` has a
+    sentence for each unused file.
+    """
 
     directory: Path
     base: Document
@@ -144,7 +146,7 @@ class Corpus:
         self._write(self.directory / "runs" / _name_of(candidate), text + "\n")
 
     def drop(self, candidate: CandidateRun) -> None:
-        """Delete a run whose states and inputs are all reached by other runs."""
+        """Delete a stored run. Other runs reach all of its states and inputs."""
         (self.directory / "runs" / _name_of(candidate)).unlink(missing_ok=True)
 
     def findings(self) -> list[Finding]:
@@ -159,7 +161,7 @@ class Corpus:
             return []
 
     def scenario_of(self, finding: Finding) -> Document | None:
-        """Return the scenario of a finding, or None if its file is missing or invalid."""
+        """Return the scenario of a finding. Return None if its file is missing or invalid."""
         path = self.directory / "findings" / finding.file
         return self._document(path) if path.exists() else None
 
@@ -221,7 +223,7 @@ class Corpus:
 
 
 def opened(directory: Path, scenario: Scenario, limits: MutationLimits) -> Corpus:
-    """Open a corpus directory, and create it if it does not exist.
+    """Open a directory of stored scenarios and findings (corpus). Create it if it does not exist.
 
     Raises RunDirectoryError if it is no corpus, is the corpus of another scenario, or is used by another command.
     """
@@ -251,7 +253,7 @@ def opened(directory: Path, scenario: Scenario, limits: MutationLimits) -> Corpu
 
 
 def check_fits(document: Any, base: Document, limits: MutationLimits) -> Document:
-    """Return the document if it can result from changes of the base scenario. Raises ScenarioError otherwise."""
+    """Return the document if changes of the base scenario can produce it. Raises ScenarioError if they cannot."""
     if not isinstance(document, dict):
         raise ScenarioError("it is no scenario")
     document = {"agents": base["agents"], **document}
@@ -270,8 +272,8 @@ def check_fits(document: Any, base: Document, limits: MutationLimits) -> Documen
 
 
 def _is_part(value: Any, whole: Any) -> bool:
-    """Return true if `value` equals `whole`, or is a mapping with a part of its entries. A scenario with fewer agents
-    has fewer entries.
+    """Return true if `value` equals `whole`, or is a mapping that contains only entries of `whole`. A scenario with
+    fewer agents has fewer entries.
     """
     if isinstance(value, dict) and isinstance(whole, dict):
         return all(_is_part(part, whole.get(key)) for key, part in value.items())

@@ -39,7 +39,7 @@ class FindingIdentity:
 
 
 def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple[FindingIdentity, ...]:
-    """Return the identity of the finding behind each bad verdict.
+    """Return the identity of the finding that each bad verdict shows.
 
     Settings that differ from the thesis are part of the shape.
     """
@@ -79,7 +79,8 @@ def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) 
 
 
 def _form(cycle: Cycle) -> list[str]:
-    """Return the timers that agents repeat in the endless cycle, each different sequence once.
+    """Return the sequences of timers that agents repeat in the endless cycle. Each different sequence occurs once in
+    the result.
 
     `prove` compares livelocks in the same way.
     """

@@ -1,4 +1,4 @@
-"""Search for new behaviour (hunt): change scenarios at random, play them, and keep those that reach something new.
+"""Search for new behaviour: change scenarios at random, play them, and keep those whose runs reach something new.
 
 The hunt proceeds in rounds. A round depends only on the documents that were kept before it and on the random draws. It
 does not depend on speed, so any number of processes gives the same result.
@@ -66,7 +66,9 @@ SEEDS = 1 << 16
 
 
 class CandidateRun(NamedTuple):
-    """A scenario document to play with a seed. It lacks the phase at the end that every run gets to become idle."""
+    """A scenario document to play with a seed. Each run of it gets an additional phase at its end, so that the swarm
+    can become idle.
+    """
 
     document: Document
     seed: int
@@ -78,8 +80,8 @@ class CandidateRun(NamedTuple):
 
 @dataclass
 class KeptRun:
-    """A stored scenario document. In `steps` handler runs, the document reached `new_states` new agent states, or
-    something of similar value.
+    """A stored scenario document. Its run has `steps` handler runs and reached `new_states` new agent states. A new
+    pattern of failed votes counts as several new states.
     """
 
     candidate: CandidateRun
@@ -92,20 +94,20 @@ class KeptRun:
 
     @property
     def worth(self) -> float:
-        """The expected benefit of changing this document."""
+        """The expected benefit of playing changes of this document."""
         return (1 + self.new_states) / (1 + self.picked) / (100 + self.steps)
 
     @property
     def nearness(self) -> float:
-        """The expected benefit of this document in the search for an endless cycle, or 0 without a new sequence of
-        failed votes.
+        """The expected benefit of this document in the search for an endless cycle. It is 0 if its run had no new
+        sequence of failed votes.
         """
         return self.failed**2 / (1 + self.picked) / (100 + self.steps)
 
 
 @dataclass(frozen=True)
 class NewCoverage:
-    """The parts of a run's coverage that are new, and the findings of the run."""
+    """The parts of a run's coverage that no earlier run reached, and the findings of the run."""
 
     reached: ReachedStates
     found: tuple[FindingIdentity, ...]
@@ -128,7 +130,7 @@ class NewCoverage:
 
 @dataclass
 class Hunt:
-    """The state of a search: its coverage, its findings and its stored documents."""
+    """The state of a search for new behaviour: its coverage, its findings and its stored documents."""
 
     limits: MutationLimits
     rng: Random
@@ -192,7 +194,9 @@ class Hunt:
                     yield candidate, self._learn(candidate, outcome)
 
     def _learn(self, candidate: CandidateRun, news: NewCoverage) -> bool:
-        """Add the results of a run. Return true if it reached something new."""
+        """Add the results of a run. Return true if the run reached a new agent state, input or branch, or a new pattern
+        of failed votes.
+        """
         self.unfinished += news.unfinished
         for identity in news.found:
             self.shown[identity] += 1
@@ -242,7 +246,8 @@ class Hunt:
         return CandidateRun(document, kept.candidate.seed if rng.random() < 0.8 else rng.randrange(SEEDS))
 
     def _pick(self, worth: Sequence[float]) -> KeptRun:
-        """Choose a stored document: in half of all cases a new one, otherwise one of high expected benefit.
+        """Choose a stored document. Half of the choices are among the newest documents, and the others prefer a high
+        expected benefit.
 
         `worth` holds cumulative sums.
         """
@@ -256,7 +261,9 @@ class Hunt:
 
 
 def _count_new(numbers: Iterable[int], exact: Collection[int], overflow: DigestSet) -> int:
-    """Return how many of the numbers are new. If `exact` is full, add the new ones to `overflow`."""
+    """Return how many of the numbers are in neither collection. If `exact` is full, add these new numbers to
+    `overflow`.
+    """
     new = [number for number in numbers if number not in exact and number not in overflow]
     if len(exact) >= MOST:
         for number in new:

@@ -62,7 +62,9 @@ def timers_ended(evidence: Evidence) -> list[TimerEnd]:
 
 
 def failed_votes(timer_ends: Iterable[TimerEnd]) -> TimerPatterns:
-    """Return the longest sequence of timers without an approved vote, or none if fewer than two votes failed."""
+    """Return the longest sequence of expired timers without an approved vote, divided by agent. Return none if fewer
+    than two votes failed in it.
+    """
     longest: Sequence[TimerEnd] = ()
     for approved, stretch in groupby(timer_ends, lambda each: (each.handler, each.branch) == APPROVED):
         if not approved:

@@ -64,7 +64,7 @@ def mutate(
 
 
 def _limited(document: Document, limits: MutationLimits) -> Document:
-    """Return the document within the limits, with a mission that ends soon after the last event."""
+    """Return the document, cut to the limits. Its mission ends soon after the last event."""
     events = [event for event in script(document) if event["at_s"] <= limits.last_s][: limits.blocks]
     last_s = max((event["at_s"] for event in events), default=0.0)
     document = with_events(document, events)
@@ -181,7 +181,7 @@ def _retarget_fate(document: Document, rng: Random) -> Document:
 
 
 def _with_target(fate: Document, which: Document) -> Document:
-    """Return a delivery rule with the effect of `fate` on other messages."""
+    """Return a delivery rule that has the effect of `fate`, but on randomly chosen messages."""
     return {**which, **{key: fate[key] for key in ("drop", "delay_s") if key in fate}}
 
 
@@ -194,7 +194,9 @@ def _with_fate(document: Document, fate: Document, rng: Random) -> Document:
 
 
 def _choose_messages(document: Document, rng: Random) -> Document:
-    """Choose a message at random, for one receiver or for all."""
+    """Choose at random the messages to which a delivery rule applies: type, sender, number or time, and one receiver or
+    all.
+    """
     which: Document = {
         "message": rng.choice(MESSAGES),
         "sender": rng.choice(document["agents"]),
@@ -297,7 +299,7 @@ def _change_duplication(document: Document, rng: Random) -> Document:
 
 
 def _change_clock(document: Document, rng: Random) -> Document:
-    """Set an agent's clock to a different time than the others, so that its blocks look older or younger."""
+    """Set an agent's clock to a time that differs from the other clocks, so that its blocks look older or younger."""
     clocks = dict(document.get("clocks", {}))
     agent = str(rng.choice(document["agents"]))
     clocks.pop(agent, None)
@@ -321,7 +323,9 @@ def _change_agents(document: Document, roster: Sequence[int], rng: Random) -> Do
 
 
 def _splice(document: Document, other: Document, rng: Random) -> Document:
-    """Combine the events of one document with the conditions of another."""
+    """Replace randomly chosen parts of a document by those of another one: delivery rules, timeline, lateness, network,
+    clocks, settings or events.
+    """
     if document["agents"] != other["agents"]:
         return document
     for key in ("fates", "timeline", "lateness", "network", "clocks", "settings"):

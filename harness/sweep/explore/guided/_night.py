@@ -1,4 +1,4 @@
-"""Spend a night on the search: play known findings again, and then continue from the stored runs until time is over.
+"""Spend a night on the search: replay known findings, then continue from the stored runs until the time is over.
 
 An interruption loses only the runs in progress, because new coverage and findings are written at once.
 """
@@ -69,7 +69,7 @@ class NightFinding:
 
     @property
     def replay(self) -> str | None:
-        """The command that plays the finding again, or None."""
+        """The command that plays the finding again. None if there is no such command."""
         return None if self.path is None else f"ucp-harness run {self.path} --backend sim --seed {self.finding.seed}"
 
     def to_json(self) -> dict[str, Any]:
@@ -204,7 +204,7 @@ class _NightRun:
         return night
 
     def _replay(self) -> None:
-        """Play known findings again, and count the seeds with which they appear."""
+        """Replay known findings, and count the seeds with which they appear."""
         for identity, finding in self._known.items():
             document = self._corpus.scenario_of(finding)
             if document is None:

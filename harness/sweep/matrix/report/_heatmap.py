@@ -1,4 +1,5 @@
-"""Draw heatmaps of figures over the values of a matrix, and the menu from which a reader chooses a figure.
+"""Draw heatmaps of numeric results over the values of a matrix, and the menu from which a reader chooses a numeric
+result.
 
 The shade grows with the figure. All shades have one hue, so they can be distinguished with any colour vision. Each cell
 also shows its number. Violations, failures and changes have a sign and a text.
@@ -51,7 +52,7 @@ class HeatmapFigure:
 
 
 def known_figures(cells: Iterable[Cell]) -> list[HeatmapFigure]:
-    """Return the figures that at least one run determined. Figures from before the final reconcile come first.
+    """Return the numeric results that at least one run determined. Those from before the final reconcile come first.
 
     "violated" is always included.
     """
@@ -81,7 +82,7 @@ STYLE = (
 
 @dataclass(frozen=True, slots=True)
 class TileMark:
-    """A note in a tile of the heatmap. `kind` is "bad" or "good", and selects the style."""
+    """A note in a tile of the heatmap. `kind` is "bad" or "good", and selects the style of the note."""
 
     sign: str
     text: str
@@ -90,7 +91,7 @@ class TileMark:
 
 @dataclass(frozen=True, slots=True)
 class HeatmapTile:
-    """A tile of the heatmap. `shade` is None for an unknown figure, and `href` is None without runs."""
+    """A tile of the heatmap. `shade` is None for an unknown value, and `href` is None without runs."""
 
     shade: int | None
     mean: str
@@ -102,9 +103,7 @@ class HeatmapTile:
 
 @dataclass(frozen=True, slots=True)
 class HeatmapGrid:
-    """The tiles for one backend and mission length, with a row for each number of agents and a column for each loss
-    rate.
-    """
+    """The tiles for one backend and mission length. Each row is for a number of agents, each column for a loss rate."""
 
     name: str
     losses: list[str]
@@ -145,7 +144,9 @@ def heatmap(record: MatrixRecord, figure: HeatmapFigure) -> Heatmap:
 
 
 def _scale(figure: HeatmapFigure, record: MatrixRecord) -> tuple[float, float]:
-    """Return the figures for the first and last shade: 0 and 1 for shares, otherwise the smallest and largest mean."""
+    """Return the values for the first and the last shade: 0 and 1 for shares, otherwise the smallest and the largest
+    mean.
+    """
     if figure.metric.unit != "number":
         return 0.0, 1.0
     means = [mean for cell in record.cells if (mean := figure.of(cell).mean) is not None]

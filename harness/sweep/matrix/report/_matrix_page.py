@@ -85,7 +85,7 @@ def to_html(finished: Finished, directory: Path, nights: StoredNights | None = N
 
 
 def _changed(record: MatrixRecord) -> Iterator[tuple[str, ChangedRuns, str]]:
-    """Yield each cell with changed runs: its name, the runs, and a command that compares one of them in detail."""
+    """Yield, for each cell with changed runs, its name, these runs, and a command that compares one in detail."""
     against = record.against
     for changed in against.changed_runs if against else ():
         before = against.baseline_commit if against else None
@@ -95,7 +95,9 @@ def _changed(record: MatrixRecord) -> Iterator[tuple[str, ChangedRuns, str]]:
 
 
 def _choosing(shown: list[_heatmap.HeatmapFigure]) -> str:
-    """Return CSS that shows only the parts for the chosen figure. On paper, all heatmaps are shown."""
+    """Return the CSS that hides, on a screen, the heatmaps of all numeric results except the chosen one. On paper, all
+    heatmaps are shown.
+    """
     others = [
         f"main:has(#show-{figure.metric.name}:checked) {{}} .figure:not(.of-{figure.metric.name})" for figure in shown
     ]
@@ -104,7 +106,7 @@ def _choosing(shown: list[_heatmap.HeatmapFigure]) -> str:
 
 
 def _kind(record: MatrixRecord) -> str:
-    """Return the kind of the result, which selects a style. The kind of an interrupted matrix is never "holds"."""
+    """Return the result of the matrix as the name of a page style. It is never "holds" for an interrupted matrix."""
     if record.outcome == "interrupted":
         return "violated" if record.failed or any(cell.violated for cell in record.cells) else "unknown"
     return {0: "holds", CANNOT_HERE: "unknown"}.get(record.exit_status, "violated")

@@ -1,4 +1,4 @@
-"""The table of cells and nights: in each field, whether that night had violations or changes in that cell."""
+"""The table of cells and nights. Each field shows whether that night had violations or changes in that cell."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

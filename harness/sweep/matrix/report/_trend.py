@@ -1,4 +1,4 @@
-"""Draw a figure over several nights, in a small chart for each loss rate, number of agents and backend.
+"""Draw a numeric result over several nights, in a small chart for each loss rate, number of agents and backend.
 
 Dots and lines are means, and bands are 95 % intervals. Each panel has its own scale, because only changes matter here.
 Each step to the right is one night.
@@ -26,7 +26,7 @@ LARGEST = 1e12
 
 
 def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures: int) -> Sequence[MatrixRecord]:
-    """Return the latest nights, at least two, with at most `MAX_DOTS` dots in all."""
+    """Return the latest nights: at most as many as have `MAX_DOTS` dots together, but at least two."""
     return nights[-max(2, MAX_DOTS // max(1, len(tonight.cells) * figures)) :]
 
 
