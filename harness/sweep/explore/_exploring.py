@@ -88,7 +88,7 @@ class ShrunkScenario:
 class Explored:
     """The result of the command `explore`.
 
-    `shrunk` is the smallest scenario found; it is None if no run violated anything. `interrupted` says whether Ctrl-C
+    `shrunk` is the smallest scenario found; it is None if no run violated anything. `interrupted` is true if Ctrl-C
     ended the search or the shrinking.
     """
 

@@ -86,7 +86,7 @@ def fate_by_count(lost: LostMessage) -> Document:
 
 
 def fate_by_time(lost: LostMessage, slack_s: float) -> Document:
-    """Return a delivery rule that loses all messages of this type from this sender at about this time.
+    """Return a delivery rule that loses all messages of this type from this sender to this receiver at about this time.
 
     It stays valid when other messages disappear from the run.
     """

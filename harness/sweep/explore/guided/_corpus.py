@@ -146,7 +146,7 @@ class Corpus:
         self._write(self.directory / "runs" / _name_of(candidate), text + "\n")
 
     def drop(self, candidate: CandidateRun) -> None:
-        """Delete a stored run. Other runs reach all of its states and inputs."""
+        """Delete the file of a stored run that the search no longer uses."""
         (self.directory / "runs" / _name_of(candidate)).unlink(missing_ok=True)
 
     def findings(self) -> list[Finding]:

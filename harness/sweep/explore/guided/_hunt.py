@@ -194,8 +194,8 @@ class Hunt:
                     yield candidate, self._learn(candidate, outcome)
 
     def _learn(self, candidate: CandidateRun, news: NewCoverage) -> bool:
-        """Add the results of a run. Return true if the run reached a new agent state, input or branch, or a new pattern
-        of failed votes.
+        """Add the results of a run. Return true if the run reached a new agent state, a new input in a state, a new
+        branch, or a new pattern of failed votes.
         """
         self.unfinished += news.unfinished
         for identity in news.found:
