@@ -185,9 +185,7 @@ def _losses(received: ReceivedStream) -> list[bool]:
 
 
 def _independence(losses: Sequence[bool]) -> float:
-    """Return the number of independent draws that give as much information as one draw of a correlated sequence: (1 -
-    c) / (1 + c).
-    """
+    """Return how many independent draws are worth one draw of a correlated sequence: (1 - c) / (1 + c)."""
     loss = fmean(losses)
     if not 0 < loss < 1:
         return 1.0

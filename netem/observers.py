@@ -153,7 +153,7 @@ class PacketArrival(NamedTuple):
 
 
 def _arrivals(report: Mapping[str, Any], own: range) -> list[PacketArrival]:
-    """Return the received packets whose numbers are in `own`, the numbers of one sender. Count them from 0."""
+    """Return the received packets whose numbers are in `own`, the numbers of one sender. Renumber them from 0."""
     each = zip(report["numbers"], report["at_s"], report["delays_s"], strict=True)
     return [PacketArrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
 
