@@ -186,7 +186,7 @@ class RadioLinks:
         return _MeanReach(levels, near, far, cut)
 
     def _path_loss(self, one: Place, other: Place) -> int:
-        """Return the path loss between two places by the log-distance model or over a flat ground, whichever is greater.
+        """Return the path loss between two places: by the log-distance model or over flat ground, the greater of both.
 
         Two rays: Rappaport, Wireless Communications, 2nd ed., eq. 4.52, far from the antennas.
         """
