@@ -19,8 +19,8 @@ from harness.checker.recurring_cycles import cycle_of
 
 
 def check_endless_cycle(name: str, evidence: Evidence) -> Judgement | None:
-    """Return the verdict `violated` if all agents are present and connected, but some repeat a cycle forever. Otherwise
-    return None.
+    """Return the verdict `violated` if the network connects all agents, but some agents repeat a cycle forever. Return
+    None in every other case.
 
     `harness.checker._liveness` has the evidence.
     """
@@ -35,7 +35,9 @@ MAX_REASONS = 3
 
 
 def explain_unknown(evidence: Evidence) -> str | None:
-    """Return the reason why the exported chains do not show the whole system in an idle state, or None if they do."""
+    """Return the reason why the exported chains do not show the whole system in an idle state. Return None if they show
+    it.
+    """
     if not evidence.exports:
         return "the run has no chain exports"
     if evidence.missing:
@@ -53,7 +55,9 @@ def _idle(ids: list[int]) -> str:
 
 
 def explain_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
-    """Return the reason why none of the agents in `differing` had a chance to agree, or None if at least one had it."""
+    """Return the reason why no agent in `differing` had a chance to agree. Return None if at least one agent had a
+    chance.
+    """
     if evidence.record is None:
         return "exports do not show whether the system was fully connected"
     since = evidence.connected_since_s
@@ -105,8 +109,8 @@ def describe_absent_agents(evidence: Evidence) -> str:
 
 
 def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]:
-    """Return the agents of `differing` that compared their chain with their neighbours' after the network was whole
-    again and after the other agents' last change.
+    """Return those agents of `differing` that had a chance to agree: they completed a reconcile that began after the
+    network became fully connected and after the last change of any other chain.
 
     During this reconcile all judged agents ran, none was paused, and no other agent was present.
     """
@@ -135,5 +139,5 @@ def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]
 
 
 def _any_was_paused(evidence: Evidence, from_s: float, until_s: float) -> bool:
-    """Return true if an agent was paused in this interval. A query then does not reach all agents."""
+    """Return true if an agent was paused in this interval. A query sent during a pause does not reach all agents."""
     return any(evidence.was_paused(agent_id, from_s, until_s) for agent_id in evidence.present)

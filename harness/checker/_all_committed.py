@@ -18,7 +18,8 @@ NAME = "all committed everywhere"
 def check(evidence: Evidence) -> Judgement:
     """Judge the exported chains. Blocks that only killed or switched-off agents held do not count (Section 3.3).
 
-    `not applicable` where an export is missing, an agent was not idle, or those that lack a block had no chance.
+    The verdict is `not applicable` if an export is missing, if an agent was not idle, or if the agents that lack a
+    block had no chance to get it.
     """
     if never_agrees := check_endless_cycle(NAME, evidence):
         return never_agrees
@@ -62,10 +63,10 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _split_completed(evidence: Evidence) -> tuple[int, list[str]]:
-    """Return two values: the number of completed blocks that no present agent holds, and the hashes of all other
-    completed blocks.
+    """Return the number of lost completed blocks, and the hashes of all other completed blocks.
 
-    The former were lost with killed agents (Section 3.3), or an agent that was switched off has them.
+    A block counts as lost if no present agent holds it, and its author was killed (Section 3.3), restarted or switched
+    off.
     """
     completed = evidence.completed_blocks()
     exports = evidence.present.values()

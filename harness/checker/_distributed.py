@@ -1,4 +1,4 @@
-"""Check characteristic 1: agents work without a coordinator, and run code only in reaction to events.
+"""Check characteristic 1: agents work without a coordinator, and an agent runs code only in reaction to an event.
 
 Every handler run has a local trigger, or a message that its sender really sent. Every vote ends with its own timer, so
 no vote waits for another agent. Only traces show this, and only if their names are known.
@@ -83,8 +83,8 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _is_certainly_correct(run: HandlerRun, ran: set[str], sent: dict[Any, Sendings]) -> bool:
-    """Return true if the run was triggered by the agent's own timer, an event, an earlier handler, or a message that
-    its sender did send.
+    """Return true if the trigger of a handler run is certainly valid: the agent's own timer, an event, an earlier
+    handler, or a message that its sender really sent.
     """
     trigger, handler = run.trigger, run.handler
     if isinstance(trigger, MessageTrigger):
@@ -114,8 +114,8 @@ def _has_known_names(run: HandlerRun) -> bool:
 
 
 def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:
-    """Return the error in the trigger of a handler run, or None if the trigger is valid. The text completes "the
-    handler ...".
+    """Return a phrase about the error in the trigger of a handler run, to complete "the handler ...". Return None if
+    the trigger is valid.
     """
     match run.trigger:
         case MessageTrigger(name, sender, sequence):

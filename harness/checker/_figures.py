@@ -1,4 +1,4 @@
-"""Compute the figures of a run, for example the number of different chains and of messages."""
+"""Compute the numeric results of a run, for example the number of different chains and the number of messages."""
 
 from collections import Counter
 
@@ -8,10 +8,10 @@ from harness.checker.uniform_chain import common_prefix
 
 
 def figures(evidence: Evidence) -> dict[str, float | int | None]:
-    """Return the figures of a run by name. None means that a figure is unknown.
+    """Return the numeric results of a run by name. None means that a result is unknown.
 
-    `copies` counts the chains that contain a completed block. `uniform_at_s` is the mission second since which all
-    chains are equal, or None if they differ.
+    `copies_min` and `copies_mean` are the minimum and the mean number of chains that contain a completed block.
+    `uniform_at_s` is the mission second since which all chains are equal, or None if they differ.
     """
     chains = [export.chain_of_block_hashes for export in evidence.exports.values()]
     completed = evidence.completed_blocks()
@@ -50,7 +50,9 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
 
 
 def _sum_over_agents(evidence: Evidence, counter: str) -> int | None:
-    """Return the sum of a counter over all agents, or None if neither run.json nor complete traces contain it."""
+    """Return the sum of a counter over all agents. Return None if neither run.json nor complete traces contain the
+    counter.
+    """
     agents = evidence.record.agents.values() if evidence.record else ()
     counts: list[int | None] = [getattr(agent, counter) for agent in agents]
     known = [count for count in counts if count is not None]
@@ -68,7 +70,7 @@ def _sum_over_agents(evidence: Evidence, counter: str) -> int | None:
 
 
 def compute_uniform_at_s(evidence: Evidence) -> float | None:
-    """Return the mission second of the last change of any chain, after which all chains are equal.
+    """Return the mission second since which all chains are equal. This is the time of the last change of any chain.
 
     Return None if the chains differ at the end, or if their changes are not on record.
     """

@@ -21,13 +21,13 @@ _Link = tuple[str, str, str | None]
 
 @dataclass
 class _VerifiedHashes:
-    """A cache of verified hashes. A block that many agents hold is hashed once."""
+    """A cache of verified hashes. Many agents hold the same block, but its hash is computed only once."""
 
     blocks: set[_Content] = field(default_factory=set)
     links: set[_Link] = field(default_factory=set)
 
     def is_block(self, block: ExportedBlock) -> bool:
-        """Return true if the content of the block gives its block hash."""
+        """Return true if the block hash is the hash of the block's content."""
         content = block.agent_id, block.timestamp_us, block.event_data, block.block_hash
         if content not in self.blocks:
             if Block(block.agent_id, block.timestamp_us, block.event_bytes).block_hash.hex() != block.block_hash:
@@ -46,11 +46,12 @@ class _VerifiedHashes:
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Compute the hashes in all exports again, and compare the blocks with those that each agent completed.
+    """Compute the hashes in all exports again, and compare the exported blocks with the blocks that each agent
+    completed.
 
-    In a secured mission signatures decide, so that the records of the agent that made a block may be missing. A signed
-    block that this agent did not complete is not genuine either, because an attacker has its key. The signed head of
-    an export covers order and number of its blocks.
+    In a secured mission the signatures decide, so the check does not need the records of a block's author. A signed
+    block that its author did not complete is still not genuine, because an attacker may have the author's key. The
+    signed head of an export covers the order and the number of its blocks.
 
     The result is `not applicable` without an export, if the blocks that an agent completed are unknown, or if no anchor
     vouches for the public keys of a secured mission.

@@ -7,9 +7,9 @@ NAME = "idle implies committed"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge the exported state of each agent, and its traced state after each handler run.
+    """Judge the exported state of each agent, and its state after each handler run in its trace.
 
-    `not applicable` where an agent was not idle at the end, or left no export.
+    The verdict is `not applicable` if an agent was not idle at the end, or left no export.
     """
     findings = [*_check_exports(evidence), *_check_traces(evidence)]
     if findings:

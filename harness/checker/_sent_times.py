@@ -1,7 +1,8 @@
-"""Compute the mission second at which an agent sent a message of its trace.
+"""Compute the mission second at which an agent sent a message that its trace contains.
 
-A trace has the time of the handler run. With the setting `answer_spread_s`, an answer is sent later, after a wait that
-CONTRACT.md defines. This module computes the wait on its own, because the agent under test computes it too.
+A trace contains the time of the handler run. With the setting `answer_spread_s`, the agent sends an answer later, after
+a wait that CONTRACT.md defines. This module computes the wait independently, because the agent under test computes it
+too.
 """
 
 from base64 import b64decode
@@ -17,8 +18,8 @@ ANSWERS = frozenset(
 
 
 def spread_of(trace: Trace) -> float:
-    """Return the longest random delay of the agent's answers (`answer_spread_s`) in mission seconds, or 0 if the trace
-    header has no valid value.
+    """Return the maximum random delay of the agent's answers (`answer_spread_s`) in mission seconds. Return 0 if the
+    trace header has no valid value.
     """
     spread_s = trace.header.settings.get("answer_spread_s", 0.0)
     return float(spread_s) if isinstance(spread_s, int | float) and spread_s > 0 else 0.0

@@ -1,6 +1,7 @@
-"""Replay a trace: apply the changes of each handler run, and compare the result with the state in the same line.
+"""Replay a trace: apply the changes of each handler run, and compare the result with the state in the same trace line.
 
-One pass over each trace collects the observations for all checks that need the blocks of an agent at each step.
+The module reads each trace once. It collects the observations for all checks that need the blocks of an agent at each
+step.
 """
 
 from collections.abc import Iterator
@@ -36,9 +37,10 @@ class TraceObservation:
 
 @dataclass(slots=True)
 class ReplayedIncarnation:
-    """The replay of an agent between two restarts: the blocks that it held at the end, and all observations.
+    """The replay of an agent between two restarts: the blocks that the agent held at the end, and all observations.
 
-    `chain` is oldest first, `deque` front first, `stack` top last; all are block hashes.
+    All three lists contain block hashes. `chain` starts with the oldest block, `deque` with the front block, and
+    `stack` ends with the top block.
     """
 
     trace: Trace
@@ -72,7 +74,7 @@ class ReplayedIncarnation:
 
 
 def replay(trace: Trace, inception: str | None) -> list[ReplayedIncarnation]:
-    """Return the replay of each incarnation of an agent, that is, of each part of its trace between restarts."""
+    """Return the replay of each incarnation of an agent. An incarnation is a part of its trace between two restarts."""
     bounds = [0, *trace.starts, len(trace.runs)]
     return [
         _replay_incarnation(ReplayedIncarnation(trace, number, trace.runs[start:end]), inception)
@@ -121,7 +123,7 @@ def _replay_incarnation(incarnation: ReplayedIncarnation, inception: str | None)
 
 
 class _HeldBlocks:
-    """The blocks that an agent holds. The replay updates them with each handler run."""
+    """The blocks that an agent holds at one moment of its trace. The replay updates them with each handler run."""
 
     def __init__(self, incarnation: ReplayedIncarnation, inception: str | None) -> None:
         self._incarnation = incarnation
@@ -167,7 +169,7 @@ class _HeldBlocks:
                 self._chain_hashes.append(next_chain_hash(self._chain_hashes[-1], _digest(block)))
 
     def _take(self, name: str, place: list[str], block: str) -> str | None:
-        """Remove the block from this structure. Return the reason if that is impossible, or None."""
+        """Remove the block from the chain, deque or stack. Return None, or the reason if the removal is impossible."""
         end = 0 if name == "deque" else -1
         in_turn = bool(place) and place[end] == block
         if in_turn:
@@ -215,7 +217,7 @@ class _HeldBlocks:
 
 
 def _digest(block_hash: str) -> bytes:
-    """Return the block hash as bytes. For an invalid hash, return zeros, which no block has as its hash."""
+    """Return the block hash as bytes. Return zeros for an invalid hash, because no block has zeros as its hash."""
     try:
         return bytes.fromhex(block_hash)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Combine all checks of a run into one verdict: the six characteristics, three further checks, and the figures."""
+"""Combine all checks of a run into one verdict: six characteristics, three further checks, and the numeric results."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -45,8 +45,9 @@ FURTHER_CHECKS: dict[str, Callable[[Evidence], Judgement]] = {
 class Result:
     """The complete verdict on a run.
 
-    `characteristics` holds the judgement of each characteristic by its number, "1" to "6". `beside` holds the
-    judgements `steps`, `records` and `liveness`. `figures` has the figures of run.json by name; None means not known.
+    `characteristics` holds the judgement of each characteristic by its number, "1" to "6". `beside` holds the three
+    further judgements `steps`, `records` and `liveness`. `figures` holds the numeric results by name, as in run.json;
+    None means unknown.
     """
 
     characteristics: dict[str, Judgement]
@@ -59,17 +60,21 @@ class Result:
 
     @property
     def judgements(self) -> dict[str, Judgement]:
-        """All judgements by number or key, in the order in which the report shows them."""
+        """All judgements in the order in which the report shows them. The key is the number of a characteristic, or the
+        name of a further check.
+        """
         return {**self.characteristics, **self.beside}
 
     @property
     def bad(self) -> tuple[str, ...]:
-        """The numbers or keys of the judgements with a bad verdict."""
+        """The numbers of the characteristics, and the names of the further checks, that have a bad verdict."""
         return tuple(key for key, judgement in self.judgements.items() if judgement.kind == "bad")
 
     @property
     def wrong(self) -> tuple[str, ...]:
-        """The numbers or keys of the bad judgements, except those of a swarm that may only need more time."""
+        """The numbers or names of the checks with a bad verdict, except `liveness` if the swarm may only need more
+        time.
+        """
         return tuple(key for key in self.bad if self.judgements[key].verdict != UNFINISHED)
 
     @property
@@ -80,7 +85,9 @@ class Result:
         return VIOLATED if self.wrong else INCOMPLETE if self.bad else 0
 
     def to_json(self) -> dict[str, Any]:
-        """Return the verdict as keys of the JSON schema `ucp-run/1`."""
+        """Return the verdict in the form that the JSON schema `ucp-run/1` requires: one key for each part of the
+        verdict.
+        """
         return {
             "characteristics": {
                 number: characteristic.to_json() for number, characteristic in self.characteristics.items()

@@ -1,5 +1,5 @@
-"""Check the part of characteristic 1 about waiting: an agent continues when its own timer expires, and never waits
-longer for other agents.
+"""Check one part of characteristic 1: an agent continues when its own timer expires, and does not wait longer for other
+agents.
 
 A vote and each step of a reconcile end with a timer. An agent that waits longer than its timers run would wait forever.
 """
@@ -47,7 +47,9 @@ ALL_TIMERS = (*VOTE_TIMERS, *RECONCILE_TIMERS)
 
 @dataclass(slots=True)
 class _UnfinishedOperation:
-    """A vote or reconcile of an agent that must continue within `longest` mission seconds after its last step."""
+    """A vote or reconcile of an agent. The agent must continue it within `longest` mission seconds after its
+    last step.
+    """
 
     what: str
     longest: float
@@ -105,8 +107,8 @@ def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Unfini
 
 
 def longest(trace: Trace, timers: tuple[str, ...]) -> float:
-    """Return the duration of the longest of these timers in mission seconds, plus a tolerance. The result is infinite
-    if a duration is unknown.
+    """Return the duration of the longest of these timers in mission seconds, plus a tolerance. Return infinity if a
+    duration is unknown.
     """
     settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
     if not all(isinstance(setting, int | float) for setting in settings):

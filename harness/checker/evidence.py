@@ -1,6 +1,6 @@
 """Collect the evidence for the checker: exported chains, traces, run.json, network records and packet captures.
 
-Checks read an `Evidence` and nothing else. It caches values that several checks derive from the files. All its parts
+Checks read only an `Evidence` object. It caches values that several checks derive from the files. Every part of it
 except the exports may be missing.
 """
 
@@ -61,7 +61,9 @@ _HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")
 
 
 class InjectedDatagram(BaseModel):
-    """A line of `rogue.jsonl`, the log of injected datagrams. It describes one datagram, or only counts several."""
+    """A line of `rogue.jsonl`, the log of injected datagrams. The line describes one datagram, or only counts several
+    datagrams.
+    """
 
     model_config = ConfigDict(extra="ignore")
 
@@ -73,7 +75,7 @@ class InjectedDatagram(BaseModel):
 
 
 class NetworkLogEntry(BaseModel):
-    """A line of `network.jsonl`: a change of the network, or a fault of agents."""
+    """A line of `network.jsonl`. It describes a change of the network, or a fault of agents."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -92,7 +94,9 @@ class NetworkLogEntry(BaseModel):
 
 @dataclass
 class RogueTraffic:
-    """The messages that a rogue node (a sender outside the swarm) injected, as far as traces show them."""
+    """The messages that a rogue node (a sender outside the swarm) injected, as far as the injection log
+    describes them.
+    """
 
     messages: set[tuple[Any, Any, Any]] = field(default_factory=set)
     """Sender, sequence number and type."""
@@ -102,7 +106,7 @@ class RogueTraffic:
     """Agents whose datagrams from another place the scenario delivers. The records of that place are missing."""
 
     def add(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
-        """Add injected datagrams, and return this object."""
+        """Add injected datagrams to this object, and return it."""
         for datagram in datagrams:
             self.messages.add((datagram.sender, datagram.sequence, datagram.message))
             self.counted |= datagram.count is not None
@@ -119,10 +123,10 @@ class RogueTraffic:
 
 @dataclass
 class Evidence:
-    """All recorded files of one run, as far as the checker uses them.
+    """All recorded files of one run that the checker uses.
 
-    `record` is the content of `run.json`. None for exports without a record. `before_final_reconcile` has the exports
-    before the final reconcile, if there was one.
+    `record` is the content of `run.json`, or None if there are only exports. `before_final_reconcile` has the exports
+    before the final reconcile. It is empty if there was no final reconcile.
     """
 
     exports: dict[int, Export]
@@ -162,7 +166,7 @@ class Evidence:
 
     @cached_property
     def secured(self) -> bool:
-        """True if any record shows that the mission was secured."""
+        """True if at least one record shows that the mission was secured with keys and signatures."""
         return (
             self.keys is not None
             or (self.scenario is not None and self.scenario.security is not None)
@@ -172,7 +176,8 @@ class Evidence:
 
     @cached_property
     def sent_without_trace(self) -> bool:
-        """True if agents with keys may have sent revocations, challenges or echoes, which have no line in traces.
+        """True if agents with keys may have sent revocations, challenges or echoes. Traces have no lines for these
+        datagrams.
 
         Agents send challenges and echoes only after a restart, or after a datagram that needs one.
         """
@@ -183,7 +188,7 @@ class Evidence:
 
     @cached_property
     def names(self) -> dict[str, str]:
-        """The short name of each block by its hash, such as 4.11 for the eleventh block of agent 4."""
+        """The short name of each block, such as 4.11 for the eleventh block of agent 4. The key is the block hash."""
         return name_blocks(self.exports)
 
     def name(self, block_hash: str) -> str:
@@ -201,8 +206,8 @@ class Evidence:
         return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
 
     def describe_unknown_name(self, *kinds: Kind, agent_id: int | None = None) -> str | None:
-        """Return a description of the first undefined name of these kinds in the agent's trace, or None. Without an
-        agent, search all traces.
+        """Return a description of the first undefined name of these kinds in the agent's trace. Return None if there is
+        none. Without an agent, search all traces.
         """
         for named, unknown in self.unknown.items():
             if agent_id in (None, named) and (words := first_unknown(unknown, kinds)):
@@ -211,7 +216,9 @@ class Evidence:
 
     @cached_property
     def incarnations(self) -> dict[int, list[ReplayedIncarnation]]:
-        """The replayed trace of each agent, divided at its restarts."""
+        """The replayed trace of each agent, as a list with one part for each incarnation (the time between two
+        restarts).
+        """
         inception = next((export.inception.chain_hash for export in self.exports.values()), None)
         if inception is None:
             states = (run.state for trace in self.traces.values() for run in trace.runs)
@@ -242,7 +249,7 @@ class Evidence:
 
     @property
     def roster(self) -> list[int] | None:
-        """The IDs of all agents of the mission, or None if neither run.json nor a trace names them."""
+        """The IDs of all agents of the mission. None if neither run.json nor a trace contains them."""
         if self.record is not None:
             return self.record.roster
         for trace in self.traces.values():
@@ -251,11 +258,11 @@ class Evidence:
 
     @property
     def missing(self) -> list[int]:
-        """The agents without an export. Killed agents do not count."""
+        """The agents that left no export. Killed agents are not included."""
         return [agent for agent in self.roster or [] if agent not in self.exports and not self.was_killed(agent)]
 
     def was_killed(self, agent_id: int) -> bool:
-        """Return true if the scenario killed the agent together with its data, and did not restart it."""
+        """Return true if the scenario killed the agent together with its data and did not restart the agent."""
         agent = self.recorded(agent_id)
         return agent is not None and agent.outcome == "killed"
 
@@ -267,7 +274,7 @@ class Evidence:
         return agent is not None and agent.restarts > 0
 
     def recorded(self, agent_id: int) -> AgentRecord | None:
-        """Return the entry of the agent in run.json, or None if there is none."""
+        """Return the entry of the agent in run.json. Return None if there is no entry."""
         return self.record.agents.get(str(agent_id)) if self.record else None
 
     def was_paused(self, agent_id: int, from_s: float, until_s: float) -> bool:
@@ -292,25 +299,27 @@ class Evidence:
 
     @cached_property
     def switched_off(self) -> dict[int, float]:
-        """The agents that were switched off before the end of the run, with the mission second of each."""
+        """The mission second at which each agent was switched off. Agents that ran until the end are not included."""
         return self.record.switched_off if self.record else {}
 
     @property
     def present(self) -> dict[int, Export]:
-        """The exports of the agents that were not switched off, or all exports if all agents were switched off."""
+        """The exports of the agents that ran until the end. If all agents were switched off, the exports of
+        all agents.
+        """
         there = {agent_id: export for agent_id, export in self.exports.items() if agent_id not in self.switched_off}
         return there or self.exports
 
     @property
     def presence_s(self) -> tuple[float, float]:
-        """The start and end, in mission seconds, of the time in which exactly the agents in `present` ran."""
+        """The interval, in mission seconds, in which exactly the agents in `present` ran: its start and its end."""
         off_s = self.switched_off.values()
         if set(self.exports) <= set(self.switched_off):
             return 0.0, min(off_s, default=math.inf)
         return max(off_s, default=0.0), math.inf
 
     def end_of(self, agent_id: int) -> float | None:
-        """Return the mission second at which the agent ended, or None if no record contains it."""
+        """Return the mission second at which the agent ended. Return None if no record contains this time."""
         return self.record.end_of(agent_id) if self.record else None
 
     @property
@@ -321,13 +330,13 @@ class Evidence:
 
     @property
     def ended_at_s(self) -> float | None:
-        """The mission second at which the run ended, or None if no record contains it."""
+        """The mission second at which the run ended. None if no record contains this time."""
         return self.record.mission_s if self.record else None
 
     @property
     def connected_since_s(self) -> float | None:
-        """The mission second since which the network is fully connected, or None if it is not connected or no record
-        shows it.
+        """The mission second since which the network is fully connected. None if it is not fully connected at the end,
+        or if no record shows it.
         """
         since: float | None = None
         for state in self.record.network if self.record else ():
@@ -339,12 +348,14 @@ class Evidence:
 
     @property
     def network_at_end(self) -> str | None:
-        """A description of the network at the end of the run, or None if no record contains it."""
+        """A description of the network at the end of the run. None if no record contains one."""
         return self.record.network[-1].detail if self.record and self.record.network else None
 
     @cached_property
     def requested_links(self) -> set[LinkConditions] | None:
-        """All network conditions that the scenario requested for any link, or None if no record contains them."""
+        """All network conditions (loss, delay and others) that the scenario requested for any link. None if no record
+        contains them.
+        """
         if self.conditions is None:
             return None
         links: set[LinkConditions] = set()
@@ -374,7 +385,7 @@ class Evidence:
         return {agent for agent in unknown if agent not in self.exports or self.was_restarted(agent)}
 
     def completed_blocks(self) -> dict[str, int]:
-        """The agent that completed each block on record, by block hash."""
+        """The agent that completed each recorded block. The key is the block hash."""
         return self._completed_blocks
 
     @cached_property
@@ -420,9 +431,7 @@ def gather(archive: RunArchive) -> Evidence:
 
 
 def check_variant(archive: RunArchive) -> None:
-    """Raise VariantError if the run used a different variant of the protocol than this process, or if only one of them
-    uses a variant.
-    """
+    """Raise VariantError if the run and this process use different variants of the protocol."""
     if not archive.recorded:
         return
     made_with, variant = archive.record.versions.get("variant"), variant_in_use()
@@ -438,7 +447,7 @@ def check_variant(archive: RunArchive) -> None:
 
 
 def _link_losses(archive: RunArchive) -> list[tuple[float, dict[Link, float]]]:
-    """Return the loss rate of each link over time, or an empty list if the computation would take too long."""
+    """Return the loss rate of each link over time. Return an empty list if the computation would take too long."""
     changes = len(archive.conditions(NetworkLogEntry) or ())
     if changes * len(archive.roster) ** 2 > MAX_LINK_CHANGES:
         return []
@@ -446,7 +455,7 @@ def _link_losses(archive: RunArchive) -> list[tuple[float, dict[Link, float]]]:
 
 
 def _captures(archive: RunArchive) -> Captures | None:
-    """Return the packet captures of a run, or None if it has none."""
+    """Return the packet captures of a run. Return None if the run has no captures."""
     if archive.directory is None or not (archive.directory / DIRECTORY).is_dir():
         return None
     try:

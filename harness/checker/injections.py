@@ -1,12 +1,12 @@
-"""Count how the agents handled injected messages, from the injection log and the traces.
+"""Count how the agents handled injected messages. The sources are the injection log and the traces.
 
-A forged message has a sequence number that no agent uses, so each handler run with this number belongs to the rogue
-node. A copy is equal to its original. Of the handler runs of one agent for this message, the last ones therefore count
-for the copies, at most as many as were sent before.
+A forged message has a sequence number that no agent uses. Each handler run with this number therefore belongs to the
+rogue node. A copy of a message is equal to its original. Of the handler runs of one agent for this message, the last
+ones therefore count for the copies. Their number is at most the number of copies that were sent before.
 
-A secured agent handles a datagram once, and no altered datagram. Corrupted messages therefore count as not handled. A
-copy that is sent at once is not distinguished from the original. A later copy was handled by the agents that the
-original had not reached.
+A secured agent handles each datagram only once, and handles no altered datagram. Corrupted messages therefore count as
+not handled. A copy that is sent immediately cannot be distinguished from the original. A delayed copy counts as handled
+by the agents that the original had not reached.
 """
 
 from collections import Counter, defaultdict
@@ -34,7 +34,9 @@ Count = Annotated[int, Field(ge=0, le=10**9)]
 
 
 class _RogueLine(BaseModel):
-    """A line of `rogue.jsonl`, the log of injected datagrams. It describes one datagram, or only counts several."""
+    """A line of `rogue.jsonl`, the log of injected datagrams. The line describes one datagram, or only counts several
+    datagrams.
+    """
 
     model_config = ConfigDict(extra="ignore")
 
@@ -66,7 +68,7 @@ class _InjectionTally:
 
 
 def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
-    """Return the effect of each injection that the scenario planned, in order."""
+    """Return the effect of each injection that the scenario planned. The order is that of the scenario."""
     injections = injections_of(scenario)
     if not injections:
         return []
@@ -133,7 +135,10 @@ def _count_line(
 
 
 def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
-    """Return the handler runs that these injected messages triggered, grouped by message."""
+    """Return the handler runs that injected messages may have triggered, grouped by message.
+
+    A copy has the same key as its original, so the handler runs for the original are included.
+    """
     triggered: dict[_Key, list[HandlerRun]] = defaultdict(list)
     for run in trace.runs:
         trigger = run.trigger
@@ -147,8 +152,8 @@ def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[H
 def _pair_with_copies(
     copies: Sequence[tuple[float, int]] | None, key: _Key, runs: list[HandlerRun]
 ) -> Iterator[tuple[int, int, HandlerRun]]:
-    """Yield each handler run with the number of the injection and the index of the copy that triggered it. Copies and
-    runs are matched from the end.
+    """Yield each handler run that an injected message triggered, with the number of the injection and the index of the
+    copy. The last handler runs are assigned to the last copies.
     """
     forged = injection_of(key[1])
     if copies is None and forged is not None:
@@ -161,7 +166,7 @@ def _pair_with_copies(
 
 
 def _to_record(at_s: float, what: str, detail: str, tally: _InjectionTally, has_unknown_names: bool) -> RogueInjection:
-    """Return the record of an injection's effect. `has_unknown_names` is true if traces contain undefined message
+    """Return the record of the effect of one injection. `has_unknown_names` is true if traces contain undefined message
     names.
     """
     messages = [

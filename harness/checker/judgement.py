@@ -14,7 +14,9 @@ MAX_EVIDENCE = 50
 
 @dataclass(frozen=True)
 class Finding:
-    """One piece of evidence for a verdict: an agent, an observation, and a block if the observation concerns one."""
+    """One piece of evidence for a verdict: an agent, an observation, and the block that the observation concerns, if
+    any.
+    """
 
     agent_id: int
     detail: str
@@ -35,7 +37,9 @@ class Judgement:
 
     @property
     def kind(self) -> Kind:
-        """The class of the verdict: `good`, `bad` or `unknown`. A bad verdict leads to exit status 1."""
+        """The class of the verdict: `good`, `bad` or `unknown`. The command ends with a nonzero exit status after a bad
+        verdict.
+        """
         return kind_of(self.verdict)
 
     def to_json(self) -> dict[str, Any]:
@@ -49,8 +53,8 @@ class Judgement:
 
 
 def violated(name: str, what: str, findings: list[Finding]) -> Judgement:
-    """Return a judgement with a bad verdict. The reason of the judgement counts the findings and adds `what`, as in "1
-    time an idle agent ...".
+    """Return a judgement with the verdict `violated`. Its reason is the number of findings, followed by `what`, as in
+    "1 time: an idle agent ...".
     """
     return Judgement(name, "violated", f"{times(len(findings))}: {what}", findings[:MAX_EVIDENCE])
 

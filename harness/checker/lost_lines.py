@@ -1,15 +1,16 @@
 """Find the places at which a trace contradicts itself because lines are lost or in the wrong order.
 
-A file from the field may have lost lines without a trace. A right agent then seems to do something impossible, so a
-judge must know these places. Four facts prove them:
+A file from the field may have lost lines without any mark at their place. A correct agent then seems to do something
+impossible, so a judge must know these places. Four kinds of contradiction prove them:
 
 - The sequence numbers of sent messages jump. The lost line comes after the last message before the jump.
 - The time goes back.
-- A handler has the trigger of another handler that did not run since the last input.
-- The state before a handler run differs from the state after the line before. It follows from the recorded state and
-  the changes of the run.
+- A handler run names as its trigger a handler that did not run since the last input.
+- The state before a handler run differs from the state at the end of the previous line. The state before the run
+  follows from the recorded state after it and from its changes.
 
-An agent that does one of these things often writes its trace in its own way. Then this fact proves nothing.
+If one kind of contradiction occurs often, the agent probably writes its trace in its own way. This kind then proves
+nothing.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,10 +26,9 @@ places the agent writes its trace in its own way."""
 
 
 def lost_lines(trace: Trace) -> dict[int, str]:
-    """Return the positions of handler runs whose errors a lost line may explain. Each has a reason such as "lines are
-    missing ...".
+    """Return the handler runs whose errors a lost line may explain, each with a reason such as "lines are missing ...".
 
-    A position is the number of runs before it, as in `Trace.gaps`.
+    The key is the position of the handler run: the number of runs before it, as in `Trace.gaps`.
     """
     found: dict[int, str] = {}
     kinds = _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces()
@@ -44,7 +44,9 @@ def lost_lines(trace: Trace) -> dict[int, str]:
 
 
 class _ContradictionPlaces:
-    """The places with one kind of contradiction. `possible` is the number of lines at which it could occur."""
+    """The places in a trace with one kind of contradiction. `possible` is the number of lines at which it
+    could occur.
+    """
 
     def __init__(self) -> None:
         self.found: dict[int, str] = {}
@@ -113,8 +115,8 @@ def _other_states(
 
 
 def _differing(before: StateSummary, run: HandlerRun) -> Iterator[str]:
-    """Yield the names of the state fields that differ between the end of one line and the start of the next handler
-    run.
+    """Yield a phrase for each part of the state that changed between the end of one trace line and the start of the
+    next handler run.
     """
     added = dict.fromkeys(("chain", "deque", "stack"), 0)
     for operation, _ in run.changes:

@@ -1,14 +1,16 @@
-"""Find the agents of which a whole incarnation has no trace, by their own traces and the records of others.
+"""Find the agents that lack the trace of a whole incarnation. The evidence is in their own traces and in the traces of
+other agents.
 
-A vehicle that restarted may come home without the trace of one incarnation. The rest of its trace then looks complete,
-and the agent seems not to have sent messages and not to have completed blocks of that time. Three facts prove it:
+An incarnation is the time between two restarts. A vehicle that restarted may return without the trace of one
+incarnation. The other parts of its trace then look complete, and the agent seems not to have sent messages and not to
+have completed blocks in that time. Three facts prove that an incarnation is missing:
 
-- An agent that boots continues an earlier incarnation. The blocks that its disk had completed are on no earlier line.
-- Another agent received a message of it that no line has, or that no line has with this content. Every incarnation
-  numbers its messages from 0, so the number alone proves nothing.
-- A block of the agent has a time at which no incarnation on record ran.
+- The trace begins with a boot, or the agent boots from a disk with completed blocks that are on no earlier line.
+- Another agent received a message of this agent that no line has, or that no line has with this content. Every
+  incarnation numbers its messages from 0, so the number alone proves nothing.
+- A block of the agent has a timestamp outside all recorded incarnations.
 
-The third fact is of a single block, so `was_running` answers it for one time.
+The third fact concerns a single block, so `was_running` checks it for one timestamp.
 """
 
 from bisect import bisect_left
@@ -25,7 +27,9 @@ from ucp.trigger import BootTrigger, MessageTrigger
 
 
 def lacking_traces(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
-    """Yield each agent whose trace seems complete, but lacks lines or an incarnation, with the reason."""
+    """Yield each agent whose trace seems complete but lacks lines or an incarnation. Each agent comes with
+    the reason.
+    """
     for agent_id, trace in traces.items():
         if not trace.problem and (why := _boots_from_unknown(trace)):
             yield agent_id, why
@@ -33,7 +37,9 @@ def lacking_traces(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
 
 
 def _boots_from_unknown(trace: Trace) -> str | None:
-    """Return the reason if an incarnation continues one that is not on record."""
+    """Return the reason why an incarnation is missing, if the agent booted from the disk of an incarnation that is not
+    recorded. Return None otherwise.
+    """
     completed: set[str] = set()
     for start, end in pairwise([0, *trace.starts, len(trace.runs)]):
         runs = trace.runs[start:end]
@@ -46,7 +52,9 @@ def _boots_from_unknown(trace: Trace) -> str | None:
 
 
 def _unsent(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
-    """Yield senders of a message that another agent received, but that their own trace does not have."""
+    """Yield each agent whose trace lacks a message that another agent received from it. Each agent comes with the
+    reason.
+    """
     sent: dict[int, dict[tuple[str, int], list[RecordedBytes | None]]] = {}
     for agent_id, trace in traces.items():
         sent[agent_id] = defaultdict(list)
@@ -72,7 +80,7 @@ def _unsent(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
 
 
 def was_running(trace: Trace, timestamp_us: int) -> bool:
-    """Return whether an incarnation on record ran when the agent's clock showed this time."""
+    """Return true if this timestamp lies within a recorded incarnation of the agent, by the agent's clock."""
     at_s = mission_s(timestamp_us, trace.header)
     if at_s is None:
         return False
@@ -84,7 +92,7 @@ def was_running(trace: Trace, timestamp_us: int) -> bool:
 
 
 def may_be_of_missing_incarnation(evidence: Evidence, block: ExportedBlock) -> bool:
-    """Return whether the author of a block may have completed the block in an incarnation that is not on record.
+    """Return true if the author may have completed the block in an incarnation that is not recorded.
 
     Only the record of a run lists all incarnations. Without it, the trace of an agent shows the times of its
     incarnations, and an export lists the blocks of the last incarnation only.

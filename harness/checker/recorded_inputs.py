@@ -53,7 +53,7 @@ def event_of(record: RecordedBytes | None) -> LoggableEvent:
 
 
 def sealed_of(record: RecordedBytes | None) -> bytes | None:
-    """Return the encrypted data that an agent recorded, or None if there is none or it is not valid base64."""
+    """Return the encrypted data that an agent recorded. Return None if there is none, or if it is not valid base64."""
     try:
         return None if record is None else base64.b64decode(record.text, validate=True)
     except ValueError:
@@ -78,7 +78,7 @@ def stored_blocks(record: RecordedBytes | None) -> Iterator[Block]:
 
 
 class BlockIndex:
-    """An index of all recorded blocks by hash. The blocks come from exports and from messages."""
+    """An index of all recorded blocks by their hash. The blocks come from exports and from messages."""
 
     def __init__(self, exported: Iterable[ExportedBlock]) -> None:
         self._exported = {block.block_hash: block for block in exported}

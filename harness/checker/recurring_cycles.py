@@ -1,8 +1,9 @@
-"""Find the cycle that agents repeat forever, from a proof in virtual time or from the traces.
+"""Find the cycle that agents repeat forever. Evidence is a proof in virtual time, or the traces.
 
-A trace shows a cycle if it ends in the same sequence of handler runs several times in a row, each time with the same
-chain and the same numbers of blocks in deque and stack. It shows a standstill if an agent is not idle, and ran no
-handler for longer than its longest timer. The chains of agents that still have work change, so they show neither.
+A trace shows a cycle if it ends with several repetitions of the same sequence of handler runs, each time with the same
+chain and the same numbers of blocks in deque and stack. It shows a standstill if an agent is not idle and ran no
+handler for longer than its longest timer. If agents still make progress, their chains change, so their traces show
+neither a cycle nor a standstill.
 """
 
 from collections import defaultdict
@@ -37,7 +38,7 @@ SHORTEST_PAUSE_S = 0.05
 
 
 def cycle_of(evidence: Evidence) -> Cycle | None:
-    """Return the cycle that agents repeat at the end of the run, or None if the records show none."""
+    """Return the cycle that agents repeat at the end of the run. Return None if the records show no cycle."""
     busy = evidence.busy
     if not busy:
         return None
@@ -57,7 +58,9 @@ def cycle_of(evidence: Evidence) -> Cycle | None:
 
 
 def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
-    """Return the mission second of the last handler run of the agents in the cycle, not counting received messages."""
+    """Return the mission second of the last handler run of the agents that stand still. Received messages without an
+    effect do not count.
+    """
     traces = [evidence.traces.get(agent_id) for agent_id in standstill.agents]
     ran_at = [runs[-1].t for trace in traces if trace is not None and (runs := _own_runs(trace))]
     return max(ran_at) if len(ran_at) == len(traces) else standstill.since_s
@@ -65,8 +68,8 @@ def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _CyclePart:
-    """The part of one agent in an endless cycle: the handler runs of one period, its start, length and number of
-    repetitions.
+    """One agent's part of an endless cycle: the handler runs of one period, the start of the cycle, the length of a
+    period, and the number of repetitions.
     """
 
     runs: list[HandlerRun]
@@ -121,14 +124,19 @@ def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | N
 
 
 def _own_runs(trace: Trace) -> list[HandlerRun]:
-    """Return the handler runs since the last restart that changed data, or that no message triggered."""
+    """Return the last handler runs of an agent since its last restart.
+
+    Runs that a message triggered and that changed no blocks are left out.
+    """
     start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
     runs = (run for run in trace.runs[start:] if run.changes or not isinstance(run.trigger, MessageTrigger))
     return [run for run in runs if run.branch != ALREADY]
 
 
 def _round(runs: Sequence[HandlerRun], times: int) -> _CyclePart | None:
-    """Return the shortest sequence that the runs repeat at least `times` times at their end, or None."""
+    """Return the shortest sequence of handler runs that is repeated at least `times` times at the end of `runs`. Return
+    None if there is none.
+    """
     keys = [_key(run) for run in reversed(runs)]
     for length, matching in enumerate(_matches(keys)):
         if length and length + matching >= times * length:
@@ -145,8 +153,8 @@ def _key(run: HandlerRun) -> tuple[object, ...]:
 
 
 def _matches(keys: Sequence[object]) -> list[int]:
-    """Return the Z-function of a sequence: for each position, the length of the common prefix of the sequence and its
-    rest from there.
+    """Return the Z-function of a sequence. For each position, it is the length of the longest common prefix of the
+    whole sequence and its part from this position on.
     """
     matching = [0] * len(keys)
     left = right = 0
@@ -161,8 +169,8 @@ def _matches(keys: Sequence[object]) -> list[int]:
 
 
 def _waits(evidence: Evidence, rounds: dict[int, _CyclePart], period_s: float) -> Iterator[CycleWait]:
-    """Yield, for each agent, the peers whose answers did not count in the last period and the peers that rejected its
-    blocks.
+    """Yield, for each agent, the peers that gave it no counted answer in the last period, and the peers that rejected
+    its blocks.
     """
     for agent_id, each in rounds.items():
         heard, refused_by = set[int](), set[int]()
@@ -224,7 +232,7 @@ def _each_other(peers: Mapping[int, tuple[int, ...]]) -> bool:
 
 
 def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ...], list[int]]]:
-    """Yield each set of peers together with all agents for which it is the same."""
+    """Yield each distinct set of peers together with the agents to which it belongs."""
     alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for agent_id, whom in peers.items():
         alike[whom].append(agent_id)
@@ -237,7 +245,9 @@ def named(ids: Collection[int]) -> str:
 
 
 def findings(cycle: Cycle) -> list[Finding]:
-    """Return the handler runs of one period for each agent, as evidence. Agents with equal runs share one finding."""
+    """Return the handler runs of one period of each agent as findings. Agents with equal handler runs share one
+    finding.
+    """
     alike: dict[str, list[int]] = defaultdict(list)
     for agent_id in cycle.agents:
         alike[_round_in_words(cycle, agent_id)].append(agent_id)

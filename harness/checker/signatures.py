@@ -26,14 +26,18 @@ MAX_U64 = 2**64 - 1
 
 @dataclass(frozen=True)
 class TrustedKeys:
-    """Public keys of a mission. `anchor` names the source that vouches for them. None if no source does."""
+    """Public keys of a mission. `anchor` names the source that vouches for the keys. It is None if no source vouches
+    for them.
+    """
 
     public: "PublicKeys"
     anchor: str | None
 
 
 def unanchored(exports: Iterable[Export], keys: TrustedKeys | None) -> str | None:
-    """Return the reason why valid signatures do not prove the exports of a secured mission. None if they do."""
+    """Return the reason why valid signatures do not prove the exports of a secured mission. Return None if they prove
+    them.
+    """
     if keys is None:
         return "unsigned: no public keys are known that verify the signatures; name the key directory with --keys"
     if keys.anchor is None:
@@ -51,21 +55,22 @@ def unanchored(exports: Iterable[Export], keys: TrustedKeys | None) -> str | Non
 
 
 def is_older(export: Export, other: Export) -> bool:
-    """Return whether the heads of two exports of a vehicle show that `export` is not the later one."""
+    """Return true if the signed heads show that `export` is not newer than `other`, an export of the same vehicle."""
     if export.head is None or other.head is None:
         return False
     return (export.head.boot, export.head.number) <= (other.head.boot, other.head.number)
 
 
 def are_signed(exports: Iterable[Export]) -> bool:
-    """Return whether any export or block has a signature."""
+    """Return true if at least one export or block has a signature."""
     return any(
         export.head is not None or any(block.signature is not None for block in export.blocks()) for export in exports
     )
 
 
 def vouch(exports: Iterable[Export], keys: TrustedKeys | None) -> tuple[list[str], str | None]:
-    """Return a sentence on each wrong signature in some exports, and the reason why the other signatures prove nothing.
+    """Return a sentence for each export with a wrong signature, and the reason why valid signatures prove nothing, or
+    None.
 
     The exports may be unsigned if no keys are given. They then count as exports of a mission without keys.
     """
@@ -96,7 +101,7 @@ class SignatureChecks:
         self._checked: dict[_Content, str | None] = {}
 
     def find_error(self, block: ExportedBlock) -> str | None:
-        """Return a phrase with the reason why the signature of a block is not valid, or None if it is valid."""
+        """Return a phrase with the reason why the signature of a block is not valid. Return None if it is valid."""
         claim = block.agent_id, block.timestamp_us, block.event_data, block.block_hash, block.signature
         if claim not in self._checked:
             self._checked[claim] = self._verify(block)
@@ -116,10 +121,10 @@ class SignatureChecks:
         return None
 
     def find_head_error(self, export: Export) -> str | None:
-        """Return a phrase with the reason why the signed head of an export is not valid, or None if the head is valid
-        or missing.
+        """Return a phrase with the reason why the signed head of an export is not valid. Return None if the head is
+        valid or missing.
 
-        The head may be missing, because agents of earlier versions export none.
+        The head may be missing, because agents of earlier versions export no head.
         """
         head, public_key = export.head, self._keys.vehicles.get(export.agent_id)
         if head is None:
@@ -136,7 +141,7 @@ class SignatureChecks:
 
 
 def _head_of(export: Export, head: ExportedHead) -> "ExportHead | None":
-    """Return the head for the content of an export. None if no agent could have signed it."""
+    """Return the signed head that fits the content of an export. Return None if no agent could have signed it."""
     from ucp.secure.export_head import ExportHead, completed_digest, held_digest
 
     if export.exported_at_us > MAX_U64:
@@ -161,7 +166,7 @@ def _head_of(export: Export, head: ExportedHead) -> "ExportHead | None":
 
 
 def _differences(export: Export, head: ExportedHead) -> Iterator[str]:
-    """Yield the differences between an export and the values in its head."""
+    """Yield the differences between the content of an export and the values in its signed head."""
     signed = _head_of(export, head)
     if len(export.chain) != head.height:
         yield f"its chain has {len(export.chain)} blocks, and the head has {head.height}"

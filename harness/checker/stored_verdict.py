@@ -1,7 +1,7 @@
 """Compare the verdict in run.json with a new verdict on the files of the run.
 
-The same code gives the same verdict on the same files. A difference then means that a file was edited after the run.
-Other code may judge differently, because the checker was changed.
+The same version of the checker gives the same verdict on the same files. A difference then means that a file was edited
+after the run. A different version of the checker may also give a different verdict.
 """
 
 from collections.abc import Iterator
@@ -12,8 +12,8 @@ from harness.scenario.verdict_names import ALL_CHECKS, CHARACTERISTICS
 
 
 def differences(record: RunRecord, result: Result, survived: Survival) -> Iterator[str]:
-    """Yield a sentence for each stored verdict or figure that differs from the new one. A run without a stored verdict
-    yields nothing.
+    """Yield a sentence for each stored verdict or numeric result that differs from the new one. Yield nothing for a run
+    without a stored verdict.
     """
     if not record.characteristics:
         return

@@ -18,8 +18,8 @@ MAX_SENTENCES = 5
 
 
 def survival(evidence: Evidence) -> Survival:
-    """Return the blocks that each loss of vehicles destroyed, and the smallest further loss of vehicles that would
-    destroy a block.
+    """Return the blocks that each loss of vehicles destroyed, and the smallest number of further vehicles whose loss
+    would destroy a block.
     """
     at_end = _holders(evidence.exports)
     completed = None if evidence.agents_with_unknown_completed() else evidence.completed_blocks()
@@ -34,7 +34,7 @@ def survival(evidence: Evidence) -> Survival:
 
 
 def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
-    """Return, for each block hash, the vehicles that hold the block anywhere."""
+    """Return the vehicles that hold each block in their chain, deque or reconcile stack. The key is the block hash."""
     holders: dict[str, list[int]] = {}
     for agent_id, export in sorted(exports.items()):
         for block_hash in dict.fromkeys(block.block_hash for block in export.blocks()):
@@ -43,8 +43,8 @@ def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def _least_held(evidence: Evidence, exports: Mapping[int, Export]) -> LeastHeld | None:
-    """Return the block that the fewest vehicles hold (the oldest one if there are several), or None if there is no
-    block.
+    """Return the block that the fewest vehicles hold. Of several such blocks, return the oldest. Return None if there
+    is no block.
     """
     holders = _holders(exports)
     if not holders:
@@ -112,7 +112,9 @@ def _losses(evidence: Evidence, lost: list[FaultRecord], at_end: Mapping[str, li
 
 
 def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) -> list[set[str]]:
-    """Return the blocks that an agent held just before each time. The set is empty after the agent's own loss."""
+    """Return the blocks that an agent held just before each of these times. The set is empty after the agent's own
+    loss.
+    """
     waiting, blocks_held = deque(instants), []
     held, at_s = HeldBlocks(), -math.inf
 

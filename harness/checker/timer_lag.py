@@ -1,4 +1,4 @@
-"""Measure how late the vote timers of agents expired, so that a warning can name a machine that is too slow."""
+"""Measure how late the vote timers of agents expired. A warning can then report that the machine is too slow."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ TOLERATED = 0.05
 
 @dataclass(frozen=True)
 class TimerLag:
-    """The lateness of vote timers: one in twenty timers of `asked_s` mission seconds was more than `late_s` mission
-    seconds late.
+    """The lateness of vote timers. Of the timers with a duration of `asked_s` mission seconds, one in twenty was more
+    than `late_s` mission seconds late.
     """
 
     late_s: float
@@ -28,9 +28,10 @@ class TimerLag:
 
 
 def timer_lag(traces: Iterable[Trace], lag: MeasuredLag | None = None) -> TimerLag | None:
-    """Return the lateness of all votes that ran without interruption, or None if there were too few.
+    """Return the lateness of the timers of all votes that ran without interruption. Return None if there were too few
+    votes.
 
-    With a measured `lag`, lateness that it does not explain is not the machine's, and does not count.
+    If `lag` is given, only the part of the lateness counts that the measured delays of the machine explain.
     """
     late: list[float] = []
     asked_s = 0.0
@@ -50,7 +51,7 @@ def _of_machine(trace: Trace, ended_s: float, late_s: float, lag: MeasuredLag | 
 
 
 def _votes(trace: Trace) -> Iterator[tuple[float, float]]:
-    """Yield the end and the duration of each vote, without the votes that a reconcile interrupted."""
+    """Yield the end and the duration of each vote. Votes that a reconcile interrupted are left out."""
     for life in trace.incarnations():
         began: float | None = None
         for _, run in life:

@@ -1,4 +1,6 @@
-"""Check characteristic 6: if all agents had a chance to reconcile in a connected system, all have the same chain."""
+"""Check characteristic 6: all agents of a connected system have the same chain, once all of them had a chance to
+reconcile.
+"""
 
 from collections import Counter
 
@@ -18,7 +20,8 @@ NAME = "one uniform chain"
 def check(evidence: Evidence) -> Judgement:
     """Judge whether the exported chains of all agents are equal.
 
-    `not applicable` where an export is missing, an agent was not idle, or those that differ had no chance.
+    The verdict is `not applicable` if an export is missing, if an agent was not idle, or if the agents with different
+    chains had no chance to agree.
     """
     if never_agrees := check_endless_cycle(NAME, evidence):
         return never_agrees
@@ -52,7 +55,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def common_prefix(chains: list[tuple[str, ...]]) -> int:
-    """Return the number of blocks at the start of the chains that are the same in all chains."""
+    """Return the number of blocks with which all chains begin alike."""
     length = 0
     for level in zip(*chains, strict=False):
         if len(set(level)) > 1:

@@ -1,4 +1,4 @@
-"""The progress of a state space exploration, its final figures, and its limits of memory and time."""
+"""The progress of a state space exploration, its final numeric results, and its limits of memory and time."""
 
 import resource
 import sys
@@ -20,7 +20,7 @@ class ExplorationProgress:
     """The progress of an exploration: the numbers of known states, explored states and transitions, and the search
     depth.
 
-    `asked` is the present question to the whole graph, after all states are explored.
+    After all states are explored, `asked` is the question about the whole graph that is examined now.
     """
 
     states: int
@@ -33,11 +33,12 @@ class ExplorationProgress:
 
 @dataclass(frozen=True)
 class ExplorationFigures:
-    """The size of an exploration. All figures except `steps` and the times are the same for any number of processor
+    """The size of an exploration. Except `steps` and the times, all numbers are the same for any number of processor
     cores.
 
-    `local_states` and `zones` count those that occur in states. `steps` is the number of steps that real agents
-    computed in all processes. `seconds` is wall time, and `processor_s` is the processor time of all processes.
+    `local_states` and `zones` count the local states and zones that occur in explored states. `steps` is the number of
+    steps that real agents computed in all processes. `seconds` is wall time, and `processor_s` is the processor time of
+    all processes.
     """
 
     states: int
@@ -73,17 +74,18 @@ class ExplorationBudget:
         return time.monotonic() - self._began
 
     def ended(self, elsewhere_bytes: float = 0.0) -> Ended | None:
-        """Return the name of the limit that is reached, or None. The other processes use `elsewhere_bytes` bytes of
-        memory.
+        """Return the name of the limit that is reached, "memory" or "time". Return None if no limit is reached.
+
+        `elsewhere_bytes` is the memory that the other processes use.
         """
         if memory_bytes() + elsewhere_bytes > self._most_bytes:
             return "memory"
         return "time" if self.seconds > self._most_s else None
 
     def check(self, elsewhere_bytes: float = 0.0) -> bool:
-        """Check the limits at most once per LOOK_EVERY_S seconds. Return true if they were checked.
+        """Check the limits, but at most once per LOOK_EVERY_S seconds. Return true if the limits were checked.
 
-        Raises GivenUpError if a limit is reached.
+        Raises LimitReachedError if a limit is reached.
         """
         seconds = self.seconds
         if seconds < self._next_look_s:
@@ -95,8 +97,8 @@ class ExplorationBudget:
 
 
 def memory_bytes() -> int:
-    """Return the memory that this process uses, in bytes (proc_pid_statm(5)). If Linux does not report it, return the
-    peak.
+    """Return the memory that this process uses, in bytes (proc_pid_statm(5)). Without Linux, return the peak of its
+    memory.
     """
     try:
         return int(_STATM.read_text().split()[1]) * resource.getpagesize()

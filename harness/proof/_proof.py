@@ -1,4 +1,6 @@
-"""Prove properties within bounds: explore all states, examine the state graph, and write violations as scenarios."""
+"""Prove properties within bounds: explore all states, examine the graph of these states, and write violations as
+scenarios.
+"""
 
 import time
 from collections.abc import Callable
@@ -74,8 +76,8 @@ PLAYED = {
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of a proof: memory of all processes in bytes, time in seconds, and the number of worker processes
-    (`cores`).
+    """The limits of a proof: `most_bytes` of memory for all processes, `most_s` seconds, and `cores` worker
+    processes.
     """
 
     most_bytes: float = 4e9
@@ -95,11 +97,11 @@ class Limits:
 class Proof:
     """The result of a proof within bounds, with a violation if the prover found one.
 
-    `complete` says whether all states within the bounds were explored. `flaw` is a violation, and `example` a scenario
-    that shows it. `exit_status` is 0 if every claim holds, 1 if one does not, and 4 if a limit was reached first.
-    `liveness` is None if it was not examined: some states are unknown, or the network is `any`. `whole_ended` is how
-    the examination of the whole graph ended. `way` lists the steps of an agent to a flaw in the network `any`, where
-    no run is known to show it.
+    `complete` is true if all states within the bounds were explored. `flaw` is a violation, and `example` is a scenario
+    that shows it. `exit_status` is 0 if every claim holds, 1 if a claim does not hold, and 4 if a limit was reached
+    first. `liveness` is None if it was not examined, because some states are unknown or the network is `any`.
+    `whole_ended` states how the examination of the whole graph ended. `way` lists the steps of an agent that lead to a
+    violation in the network `any`, where no run is known to show it.
     """
 
     bounds: Bounds
@@ -123,7 +125,7 @@ class Proof:
 
     @property
     def claims(self) -> dict[str, str]:
-        """The properties that the proof checks in every state. Each key has a sentence."""
+        """The properties that the proof checks in every state. Each key has a sentence that states the property."""
         claims = CLAIMS if self.bounds.steps else {kind: claim for kind, claim in CLAIMS.items() if kind != "steps"}
         if self.bounds.captured is None:
             return claims
@@ -141,9 +143,10 @@ class Proof:
 
     @property
     def findings(self) -> dict[str, str]:
-        """The violations as sentences by key. Proofs of different agent cores use the same key for the same violation.
+        """The violations by key, each as a sentence. Proofs of different agent cores use the same key for the same
+        violation.
 
-        A crash is known by its exception, a wrong step by its handler, and a livelock by its form.
+        A crash is identified by its exception, a wrong step by its handler, and a livelock by its form.
         """
         found = {f"shown {key}": sentence for key, sentence in SHOWN.items() if key in self.shown}
         if self.flaw is not None:
@@ -213,14 +216,14 @@ def prove(
     *,
     watch: Callable[[ExplorationProgress], None] = lambda progress: None,
 ) -> Proof:
-    """Explore every state that agents can reach within `bounds`, check each one, and return the result.
+    """Explore every state that agents can reach within `bounds`, check each state, and return the result.
 
-    - `limits`: when to give up.
+    - `limits`: memory, time and worker processes of the proof. The proof stops when a limit is reached.
     - `out`: the new file of the scenario that shows a violation. Without it, a new file under `runs/`.
-    - `watch`: called with the progress every now and then.
+    - `watch`: a function that is called repeatedly with the progress.
 
     Raises HarnessError if the file cannot be written, if an agent does something that state reduction does not allow,
-    or if its steps depend on something that is no part of a state.
+    or if an agent's steps depend on something that is not part of a state.
     """
     if bounds.reduced and bounds.why_not_reduced() is not None:
         bounds = replace(bounds, reduced=False)
@@ -259,14 +262,15 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Ex
 
 
 def _with_instants(bounds: Bounds) -> Bounds:
-    """Return the same bounds, with up to one lost and one duplicated message per step. Each path within the new bounds
-    is a possible run.
+    """Return the same bounds with a network that can lose and duplicate messages.
+
+    Each path within the new bounds is a possible run, in contrast to the network `any`.
     """
     return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
 
 
 def _claimed(bounds: Bounds, out: Path | None) -> tuple[str, Path]:
-    """Return the name and the file of the scenario to write."""
+    """Return the name and the file path of the scenario that the proof writes."""
     name = f"proof {bounds.agents} agents {bounds.blocks} blocks"
     return name, choose_path(out or default_path(name).with_suffix(".yaml"), name)
 

@@ -39,14 +39,14 @@ class Bounds:
     - `timers_any`: timers may expire in any order, whatever their durations.
     - `coincidences`: the maximum number of moments that are equal by chance. None means any number.
     - `settings`: protocol settings of all agents, by name.
-    - `quirks`: mistakes of all agents, by name (see `ucp.quirks`).
+    - `quirks`: deliberate mistakes of all agents, by name (see `ucp.quirks`).
     - `reduced`: treat states that behave alike as one state. `prove` does so only if `why_not_reduced` gives no reason.
-    - `steps`: compare each step of the agents with the step of a correct agent.
+    - `steps`: compare each step of the agents with the step of the reference implementation.
     - `stagger`: by timer, the seconds by which each agent's timer is longer than the timer of the agent before it.
     - `captured`: the ID of an agent whose keys an attacker has. From some moment on, the attacker sends in its name.
-    - `lies`: the maximum number of messages that the attacker sends, unless the network is `any`. Each is received by
-      any of the agents.
-    - `clocks_any`: any of two blocks may be the older one, drawn at each comparison.
+    - `lies`: the maximum number of messages that the attacker sends, unless the network is `any`. Any of the agents can
+      receive each message.
+    - `clocks_any`: either of two blocks may be the older one, with a free choice at each comparison.
     - `losses`: the maximum number of lost messages that would have had an effect. None means any number.
     - `crossing`: messages of several agents may cross. If false, all consequences of an action end before the next
       action.
@@ -134,7 +134,9 @@ class Bounds:
             raise BoundsError("--clocks any excludes --quirk and --captured: leave them out")
 
     def why_not_reduced(self) -> str | None:
-        """Return the reason why the prover must not treat two states as one, or None for the released core."""
+        """Return the reason why the prover must not merge states that behave alike. Return None for the released core,
+        where it may merge them.
+        """
         if edited := edited_files():
             return f"it assumes the released core, and {', '.join(edited)} was edited"
         if (variant := variant_in_use()) is not None:
@@ -145,25 +147,25 @@ class Bounds:
 
     @property
     def nameless(self) -> bool:
-        """True if states are stored without agent IDs, so that each agent counts itself as the first one.
+        """True if states are stored without agent IDs, so that each agent counts itself as agent 1.
 
-        False with a captured agent, and in the network `any`, where messages depend on the sender's ID.
+        False with a captured agent and in the network `any`, because messages then depend on the sender's ID.
         """
         return self.reduced and self.captured is None and self.network != "any"
 
     @property
     def alike(self) -> bool:
-        """True if states that differ only by an exchange of agents count as one state."""
+        """True if two states count as one state when they differ only by an exchange of agents."""
         return self.nameless and not self.stagger
 
     @property
     def blocks_alike(self) -> bool:
-        """True if states that differ only by an exchange of blocks count as one state."""
+        """True if two states count as one state when they differ only by an exchange of blocks."""
         return self.nameless and self.clocks_any
 
     @property
     def settles(self) -> bool:
-        """True if all answers to a query arrive, or are lost, at the same moment as the query."""
+        """True if all answers to a query arrive, or are lost, in the same moment in which the query is sent."""
         return self.reduced and self.captured is None
 
     def agent_settings(self, agent_id: int = 1) -> Settings:

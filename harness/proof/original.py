@@ -1,9 +1,9 @@
 """Run the same proof for the unmodified agent core, to find which violations a modified core adds.
 
-`prove` reports each violation, and the published protocol has some of its own. After a change of the core, only the new
-violations matter. The original is the `ucp` of a commit or of another checkout. A process of its own explores it with
-the prover that runs now, so both proofs ask the same questions. The process receives its bounds on standard input and
-prints the result as JSON:
+`prove` reports each violation, and the published protocol has some violations of its own. After a change of the core,
+only the new violations matter. The original is the `ucp` of a commit or of a second checkout. A separate process
+explores it with the present prover, so both proofs ask the same questions. The process receives its bounds on standard
+input and prints the result as JSON:
 
     python -m harness.proof.original
 """
@@ -38,7 +38,9 @@ class OriginalError(HarnessError):
 
 @dataclass(frozen=True)
 class OriginalProof:
-    """The proof of the original agent core. `findings` contains a sentence by key, and `lines` the printed result."""
+    """The proof of the original agent core. `findings` contains a sentence for each violation by key, and `lines` the
+    printed result.
+    """
 
     name: str
     findings: dict[str, str]
@@ -48,19 +50,19 @@ class OriginalProof:
 
 @dataclass(frozen=True)
 class ProofComparison:
-    """A proof of the agent core in use, next to a proof of the original core."""
+    """A proof of the agent core in use, compared with a proof of the original core."""
 
     proof: Proof
     original: OriginalProof
 
     @property
     def new(self) -> dict[str, str]:
-        """The violations that only the agent core in use has, and not the original core."""
+        """The violations of the agent core in use that the original core does not have."""
         return {key: text for key, text in self.proof.findings.items() if key not in self.original.findings}
 
     @property
     def shared(self) -> dict[str, str]:
-        """The violations that both agent cores have: the one in use and the original."""
+        """The violations that the agent core in use and the original core have in common."""
         return {key: text for key, text in self.proof.findings.items() if key in self.original.findings}
 
     @property
@@ -95,10 +97,10 @@ class ProofComparison:
 
 @contextmanager
 def code_of(original: str) -> Iterator[Path]:
-    """Yield a directory with the code of the agent core that `original` names.
+    """Yield a directory with the code of the agent core to which `original` refers.
 
-    It is "installed" (the core of this installation, for a proof with a variant), a directory with `ucp/` in it, or a
-    commit of this clone.
+    `original` is "installed" (the core of this installation, for a proof with a variant), a directory that contains
+    `ucp/`, or a commit of this clone.
 
     Raises OriginalError, or RepositoryError for an unknown commit.
     """
@@ -120,8 +122,8 @@ def code_of(original: str) -> Iterator[Path]:
 
 
 def prove_original(name: str, code: Path, bounds: Bounds, limits: Limits) -> OriginalProof:
-    """Explore the agent core in the directory `code` within the same bounds and limits. Raises OriginalError if that
-    fails.
+    """Run the proof for the agent core in the directory `code`, with the same bounds and limits. Raises OriginalError
+    if that fails.
     """
     with TemporaryDirectory(prefix="ucp-original-") as temporary:
         place = Path(temporary)

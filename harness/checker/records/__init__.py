@@ -1,4 +1,4 @@
-"""Compare different records of the same facts. A contradiction between two of them is a finding.
+"""Compare different records of the same facts. A contradiction between two records is a finding.
 
 Each comparison is a file in this folder: a function from `Evidence` to the `Contradiction`s that it finds. An unaltered
 run has no contradiction. The records contain each kill, restart, reboot, pause, rogue node and full disk.
@@ -90,7 +90,7 @@ def cross_examine(evidence: Evidence) -> RecordComparisons:
 
 
 def _agents_without_known_end(evidence: Evidence) -> Iterator[int]:
-    """Yield the agents of an interrupted run for which run.json lacks the number of handler runs."""
+    """Yield each agent of an interrupted run whose number of handler runs is missing in run.json."""
     if evidence.record is None or evidence.record.outcome != "running":
         return
     for agent_id in evidence.traces:
@@ -100,8 +100,8 @@ def _agents_without_known_end(evidence: Evidence) -> Iterator[int]:
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Return the verdict on the records: `contradict` after any contradiction, `not applicable` if a trace is missing
-    or incomplete, else `agree`.
+    """Return the verdict on the records. It is `contradict` after any contradiction, `not applicable` if a trace is
+    missing or incomplete, and `agree` otherwise.
     """
     examination = evidence.cached(cross_examine)
     findings = [contradiction.finding for contradiction in examination.contradictions]

@@ -1,6 +1,7 @@
 """Compare packet captures and the kernel's packet counters with the traces of agents.
 
-An agent writes a message to its trace before it sends the message. An agent that is killed in between does not send it.
+An agent writes a message to its trace before it sends the message. If the agent is killed in between, it does not send
+the message.
 """
 
 from collections import Counter, defaultdict
@@ -50,7 +51,9 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams]]:
-    """Return two tables by vehicle: the datagrams that left the vehicle, and the datagrams that reached it."""
+    """Return two tables with a row for each vehicle: the datagrams that left the vehicle, and the datagrams that
+    reached it.
+    """
     left: dict[int, Datagrams] = defaultdict(Counter)
     reached: dict[int, Datagrams] = defaultdict(Counter)
     by_number = {capture.number: capture for capture in captures.used}
@@ -68,10 +71,10 @@ def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams
 
 
 def _not_sent(evidence: Evidence, agent_id: int) -> int:
-    """Return the number of traced messages that the agent may have failed to send, because of an error or because it
+    """Return the maximum number of traced messages that the agent did not send, because of an error or because it
     ended.
 
-    A killed agent does not send the messages of its last input. An agent that ends sends no answer that still waits.
+    A killed agent does not send the messages of its last input. An agent that ends does not send its delayed answers.
     """
     recorded = evidence.recorded(agent_id)
     incarnations = evidence.incarnations[agent_id]
@@ -92,7 +95,7 @@ def _not_sent(evidence: Evidence, agent_id: int) -> int:
 def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield each agent for which the kernel counted fewer packets than the traces show as sent or handled.
 
-    It does not count datagrams on a shared channel, which bypass its engine.
+    On a shared channel, datagrams bypass the engine that counts them, so nothing is compared there.
     """
     record = evidence.record
     if evidence.has_channel:

@@ -1,7 +1,7 @@
 """Compare the log of a shared radio channel with run.json and with the traces.
 
-A message reaches an agent only over the channel, until a final reconcile ends the channel. Of a restarted sender, two
-messages can have the same number, so its messages are not compared.
+Until a final reconcile ends the channel, each message reaches an agent over the channel only. Two messages of a
+restarted sender can have the same sequence number, so the messages of this sender are not compared.
 """
 
 from collections import Counter
@@ -53,7 +53,9 @@ def _fates(lines: list[ChannelLine]) -> dict[tuple[int, int], ChannelLine]:
 
 
 def _counted(lines: list[ChannelLine]) -> Counter[tuple[str, int]]:
-    """Return the numbers that run.json must contain: all frames, and the lost and dropped messages of each vehicle."""
+    """Return the counts that run.json must contain: the number of all frames, and the numbers of lost and dropped
+    messages of each vehicle.
+    """
     counted: Counter[tuple[str, int]] = Counter()
     for line in lines:
         if line.dropped is not None:

@@ -1,6 +1,7 @@
 """Compare the network changes and faults in run.json with those in network.jsonl.
 
-Of the changes by flight, run.json has only those that change which vehicles are connected.
+Moving vehicles also change the network. Of these changes, run.json contains only those that change which vehicles are
+connected.
 """
 
 from collections import Counter
@@ -16,7 +17,9 @@ Change = tuple[float, str, str | None, bool | None, tuple[int, ...], str | None,
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each network change or fault that only one of the two files contains, and each time that goes back."""
+    """Yield each network change or fault that only one of the two files contains. Also yield each time that is earlier
+    than the time before it.
+    """
     record, log = evidence.record, evidence.conditions
     if record is None or log is None or record.mission_s is None:
         return

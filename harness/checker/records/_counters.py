@@ -48,7 +48,7 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _ran_nothing_since(recorded: AgentRecord, incarnation: ReplayedIncarnation) -> bool:
-    """Return true if the agent ran no handler after it last reported its counters."""
+    """Return true if the agent ran no handler after its last report of its counters."""
     counted = recorded.handler_runs[-1] if recorded.handler_runs else None
     return counted is None or counted.counted == len(incarnation.runs)
 
@@ -68,7 +68,7 @@ def _incarnations(
 def _handler_runs(
     agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
-    """Yield a contradiction if the trace has fewer or more lines than the number of handler runs that the agent
+    """Yield a contradiction if the number of lines in the trace differs from the number of handler runs that the agent
     counted.
     """
     expected = 1 + recorded.restarts + recorded.reboots
@@ -93,7 +93,7 @@ def _handler_runs(
 
 
 def _lines_by(incarnation: ReplayedIncarnation, counted: HandlerRuns) -> tuple[int, int]:
-    """Return the smallest and the largest number of trace lines that fit the time at which the agent reported its
+    """Return the smallest and the largest possible number of trace lines at the time when the agent reported its
     counters.
     """
     if in_virtual_time(incarnation.trace):
@@ -108,7 +108,9 @@ def _lines_by(incarnation: ReplayedIncarnation, counted: HandlerRuns) -> tuple[i
 def _counted(
     evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
-    """Compare the counters with the sums over all incarnations of the agent, that is, over all its restarts."""
+    """Compare the counters in run.json with the sums over all incarnations of the agent (the times between its
+    restarts).
+    """
     sent = sum(incarnation.sent for incarnation in incarnations)
     if recorded.messages_sent is not None and recorded.messages_sent != sent:
         detail = (
@@ -215,8 +217,8 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
 def _over_brown_outs(
     evidence: Evidence, agent_id: int, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
-    """Yield completed blocks that an agent lost when it restarted from its disk. One line before the power loss may be
-    missing in the trace.
+    """Yield a contradiction for each restart after which the agent has other completed blocks on its disk than before.
+    One line before the power loss may be missing in the trace.
     """
     for before, after in pairwise(incarnations):
         if not after.runs or not isinstance(after.runs[0].trigger, BootTrigger):
@@ -229,7 +231,7 @@ def _over_brown_outs(
 
 
 def _out_of_order(exported: list[str], traced: list[str]) -> bool:
-    """Return true if the common blocks of the two lists have different order, or occur twice."""
+    """Return true if the blocks that occur in both lists have a different order, or occur in one list more often."""
     both = {*exported} & {*traced}
     return [block for block in exported if block in both] != [block for block in traced if block in both]
 

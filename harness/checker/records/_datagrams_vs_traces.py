@@ -3,10 +3,10 @@
 A trace has a line for each datagram that its agent handled or dropped. The agent also reads its own broadcasts, which
 it ignores. Any further datagram that it read is missing in its trace. A datagram that was read at the end of an
 incarnation may be missing, because the agent ended before it handled the datagram. An agent may also use other sockets,
-for example between its processes. Datagrams that are no broadcasts therefore do not count.
+for example between its processes. Datagrams that are not broadcasts therefore do not count.
 
-An agent that reads nothing has a complete trace. The kernel also counts the broadcasts that arrived at each vehicle. A
-broadcast that was neither read nor discarded by the kernel is left in the socket.
+The trace of an agent that reads no datagrams also looks complete. The kernel therefore also counts the broadcasts that
+arrived at each vehicle. A broadcast that neither the agent read nor the kernel discarded is left in the socket.
 """
 
 from bisect import bisect_left, bisect_right
@@ -25,7 +25,7 @@ UNREAD_WALL_S = 1.0
 
 
 def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield agents that read datagrams from their socket, but recorded them neither as handled nor as dropped."""
+    """Yield each agent that read datagrams from its socket but recorded them neither as handled nor as dropped."""
     record = evidence.record
     if record is None or set(record.roster) - set(evidence.traces):
         return
@@ -49,7 +49,7 @@ def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def find_unread(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield agents that left datagrams unread in their sockets although they were not paused."""
+    """Yield each agent that left datagrams unread in its socket although it was not paused."""
     record = evidence.record
     if record is None or set(record.roster) - set(evidence.traces):
         return
@@ -75,7 +75,9 @@ def _sentence(counted: DatagramsRead, unrecorded: int, handled: int, dropped: in
 
 
 def _at_the_end(evidence: Evidence, agent_id: int, trace: Trace, wall_s: float) -> int:
-    """Return the largest number of datagrams that may have been on their way to the agent each time it stopped."""
+    """Return the maximum number of datagrams that were on their way to the agent when it stopped, as a sum over all its
+    stops.
+    """
     before_s = _mission_s(trace, wall_s)
     ends = _killed_at(evidence, agent_id)
     if (last_s := evidence.end_of(agent_id)) is not None:
@@ -95,5 +97,5 @@ def _killed_at(evidence: Evidence, agent_id: int) -> list[float]:
 
 
 def _sent_at(evidence: Evidence) -> list[float]:
-    """Return the mission seconds of all sent messages of all agents, in ascending order."""
+    """Return the mission second of each message that any agent sent, in ascending order."""
     return sorted(run.t for trace in evidence.traces.values() for run in trace.runs for _ in run.sent)

@@ -10,7 +10,9 @@ NEEDS_CONNECTIVITY = frozenset("56")
 
 
 def in_doubt(number: str, judgement: Judgement, examination: RecordComparisons) -> Judgement:
-    """Return the judgement on the characteristic with this number, corrected by the comparisons of all records."""
+    """Return the judgement on the characteristic with this number. The result of the record comparisons may change its
+    verdict.
+    """
     touching = examination.touching(number)
     if touching:
         contradict = f"{times(len(touching))}: the records behind this verdict contradict each other"

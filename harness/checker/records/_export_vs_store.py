@@ -1,8 +1,8 @@
 """Compare the state that an agent stored on its disk with the state that it exported.
 
 An agent writes each change to its store before any other agent can observe the change. At its end, the store therefore
-has the blocks of the export. Stores of other formats than `ucp-store/1` belong to agents of other authors and are
-left alone. So is the store of an agent whose disk was full, because it ends early.
+contains the blocks of the export. Stores in a format other than `ucp-store/1` belong to agents of other authors and are
+not compared. The store of an agent with a full disk is not compared either, because it ends early.
 """
 
 from collections.abc import Iterator

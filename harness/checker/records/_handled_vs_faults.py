@@ -1,12 +1,13 @@
 """Compare the handler runs in traces with the faults that stopped agents and the partitions that cut links.
 
-An agent that is killed, reboots, is switched off or is paused runs no handler. An agent handles no message that its
-sender sent while the link lost all messages. The time of sending decides, because messages under way arrive.
+An agent runs no handler while it is killed, rebooting, switched off or paused. If a link loses all messages when the
+sender sends a message, the receiver does not handle this message. The time of sending decides, because messages that
+are already under way arrive.
 
 The harness records a stop after it took effect, and a start before the agent runs again. `CLOCK_SLACK_WALL_S` therefore
-covers the difference of two readings of one machine's clock only. Links are different: between the time of a trace
-line and its datagram, a busy machine may change the conditions. A link therefore counts as cut only if it was cut for
-the slack of processes before and after the time of sending.
+covers only the difference between two readings of the machine's clock. Links are different: a busy machine may change
+the network conditions between the time of a trace line and its datagram. A link therefore counts as cut only if it was
+cut for the slack of processes before and after the time of sending.
 """
 
 from bisect import bisect_right
@@ -32,7 +33,9 @@ Stop = tuple[float, float, str]
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each handler run of an agent while it was stopped, and each handled message of a link while it was cut."""
+    """Yield each handler run of an agent at a time when it was stopped, and each handled message that was sent over a
+    link while the link was cut.
+    """
     if evidence.record is None:
         return
     cuts = _cuts(evidence)
@@ -86,7 +89,7 @@ def _while_stopped(run: HandlerRun, stops: list[Stop]) -> str | None:
 
 
 class _CutIntervals:
-    """The intervals in which each link loses all messages."""
+    """The intervals, for each link, in which the link loses all messages."""
 
     def __init__(self, link_losses: list[tuple[float, dict[Link, float]]], slack_s: float) -> None:
         self.slack_s = slack_s
@@ -107,10 +110,10 @@ class _CutIntervals:
 
 
 def _cuts(evidence: Evidence) -> _CutIntervals | None:
-    """Return the intervals in which links were cut, or None if no link was cut or a cut link may pass messages.
+    """Return the intervals in which links were cut. Return None if no link was cut, or if a cut link may pass messages.
 
-    Scripted fates deliver messages regardless of the loss, netem may pass a second copy of a lost message, and on a
-    shared channel a message waits before it is sent.
+    Three conditions let messages pass: scripted fates deliver them regardless of the loss, netem may pass a second copy
+    of a lost message, and on a shared channel a message waits before it is sent.
     """
     if evidence.has_fates or evidence.has_channel or any(link.duplicate > 0 for link in evidence.requested_links or ()):
         return None

@@ -1,7 +1,8 @@
-"""Compare the headers of all traces with each other, and the Algorithm number of each trace line with the handler's
-name.
+"""Compare the headers of all traces with each other, and check that the Algorithm number of each trace line belongs to
+the handler's name.
 
-The scenario may stagger timers. The comparison therefore subtracts the stagger of each agent from its timers.
+A scenario may give the agents timers of different durations (`stagger`). The comparison therefore subtracts the stagger
+of each agent from its timers.
 """
 
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ MAX_VALUE = 40
 
 
 def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each header that differs from the others in roster, settings, clock or inception block."""
+    """Yield each trace header with a different roster, settings, clock or inception block than the other headers."""
     first: dict[str, tuple[object, str]] = {}
     if evidence.record is not None:
         first["roster"] = sorted(evidence.record.roster), "run.json"
@@ -38,7 +39,9 @@ def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _in_common(evidence: Evidence, agent_id: int) -> dict[str, object]:
-    """Return the settings of the agent that must be equal for all agents. Timer offsets differ between agents."""
+    """Return the settings of the agent that must be equal for all agents. The agent's own addition to each timer
+    duration is subtracted.
+    """
     settings: dict[str, Any] = {**evidence.traces[agent_id].header.settings}
     record = evidence.record
     if record is None or not record.stagger or agent_id not in record.roster:

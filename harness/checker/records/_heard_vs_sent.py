@@ -19,7 +19,9 @@ CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each handled message that differs from the sent message, arrived too early, or was handled twice."""
+    """Yield each handled message whose content differs from the sent message, that arrived too early, or that was
+    handled twice.
+    """
     slack = max(map(slack_s, evidence.traces.values()), default=0.0)
     sendings = evidence.sendings
     once = not _may_duplicate(evidence)
@@ -85,7 +87,9 @@ def _is_unchanged(datagram: RecordedBytes, sent: Sending) -> bool:
 
 
 def _another_block(run: HandlerRun, trigger: MessageTrigger, sent: Sending) -> str | None:
-    """Return the block that the agent added to its chain although the message carried a different one, or None."""
+    """Return the block that the agent added to its chain, if the message carried a different block. Return None
+    otherwise.
+    """
     if trigger.message not in CARRY_A_BLOCK:
         return None
     carried = {message.block for _, message in sent}

@@ -3,14 +3,15 @@
 Each receiver of a message loses it independently, with a known probability. The number of lost messages is therefore a
 sum of independent draws. By Hoeffding's bound (1963, Theorem 1) the probability that the share of n draws is a or more,
 at a mean of q < a, is at most exp(-n KL(a, q)), where KL is the relative entropy of two draws. The same holds below the
-mean. Only a share whose probability is below `MAX_CHANCE` contradicts the records, so that chance never accuses a run.
+mean. A share contradicts the records only if its probability is below `MAX_CHANCE`, so that chance practically never
+causes a contradiction.
 
-Only messages count that a right agent handles if they arrive:
+Only messages count that a correct agent handles if they arrive:
 
-- Of processes and containers, any message. Their agents may still handle fewer messages than arrive, because they were
-  stopped or a socket was full. So handled messages count only if they are too many. An engine that counts packets shows
-  whether too few or too many were lost.
-- In virtual time, three types of messages to an agent that runs and does not reconcile. Virtual time withholds other
+- With processes and containers: all messages. Their agents may handle fewer messages than arrive, because they were
+  stopped or a socket was full. Handled messages therefore contradict the loss rate only if there are too many. An
+  engine that counts packets shows whether too few or too many were lost.
+- In virtual time: three types of messages, to an agent that runs and does not reconcile. Virtual time withholds other
   messages if they have no effect.
 """
 
@@ -42,7 +43,7 @@ MAX_CHANCE = 1e-12
 
 @dataclass
 class _ExpectedDeliveries:
-    """The messages to one receiver: their number, and the sums of the smallest and largest probability of loss."""
+    """The messages to one receiver: their number, and the sums of their smallest and largest loss probabilities."""
 
     messages: int = 0
     least: float = 0.0
@@ -54,7 +55,7 @@ class _ExpectedDeliveries:
         return self.least / self.messages, self.most / self.messages
 
     def pass_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest possible mean probability that such a message arrives."""
+        """Return the smallest and the largest possible mean probability that one of these messages arrives."""
         return 1 - self.most / self.messages, 1 - self.least / self.messages
 
     def add(self, losses: tuple[float, float]) -> None:
@@ -76,7 +77,9 @@ class _LossHistory:
                 self._losses[link].append(loss)
 
     def range_at(self, link: Link, sent_s: float) -> tuple[float, float]:
-        """Return the smallest and the largest loss rate of the link around this time."""
+        """Return the smallest and the largest loss rate of the link between shortly before and shortly after
+        this time.
+        """
         times, losses = self._times[link], self._losses[link]
         if len(losses) == 1:
             return losses[0], losses[0]
@@ -134,9 +137,10 @@ def _is_impossible_at(seen: _ExpectedDeliveries, sides: tuple[bool, ...]) -> boo
 
 
 def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) -> dict[int, _ExpectedDeliveries]:
-    """Return, for each receiver, the messages that a correct agent handles if they arrive.
+    """Return, for each receiver, the number of messages that a correct agent handles if they arrive, with their loss
+    probabilities.
 
-    `over_cuts` replaces the least and the greatest loss of a message whose link is cut.
+    If `over_cuts` is given, it contains the smallest and the largest loss probability of a message whose link is cut.
     """
     slack = max([SAME_TIME_S, *map(slack_s, evidence.traces.values())])
     history = _LossHistory(evidence.link_losses, slack)
@@ -165,7 +169,7 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
 
 
 class _ReadyTimes:
-    """The times at which an agent in virtual time would handle certain messages if they arrived."""
+    """The times at which an agent in virtual time would handle a message of certain types if it arrived."""
 
     def __init__(self, evidence: Evidence, agent_id: int) -> None:
         self._latest_s = LATENCY.mean_s + LATENCY.jitter_s
@@ -185,7 +189,7 @@ class _ReadyTimes:
         self._end_s = evidence.end_of(agent_id) or 0.0
 
     def handles(self, message: str, sent_s: float) -> bool:
-        """Return true if the agent would handle the message at each time at which it may arrive."""
+        """Return true if the agent would handle the message at every possible time of its arrival."""
         arrives_s = sent_s + self._latest_s
         if message not in NEVER_WITHHELD or arrives_s >= self._end_s:
             return False
@@ -196,7 +200,8 @@ class _ReadyTimes:
 def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterator[Contradiction]:
     """Yield each receiver for which the kernel lost more or fewer packets than the loss rates can explain.
 
-    It counts packets that a partition cut apart from lost ones, but packets to a killed vehicle as any others.
+    The kernel counts packets that a partition cut separately from lost packets. It counts packets to a killed vehicle
+    like any others.
     """
     record = evidence.record
     if record is None or record.engine != COUNTS_DATAGRAMS or record.counters is None:
@@ -225,7 +230,7 @@ def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterato
 def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer: bool) -> bool:
     """Return true if this count, or a more extreme one, is practically impossible in `number` random draws.
 
-    `means` are the least and the greatest mean of the draws.
+    `means` contains the smallest and the largest possible mean of the draws.
     """
     share = min(1.0, count / number)
     mean = min(1.0, max(0.0, means[0] if fewer else means[1]))

@@ -1,8 +1,8 @@
 """Compare the scenario with the changes, agents and duration that run.json records.
 
-The scenario determines all network changes, faults and injections before the run. A record that lacks one of them, or
-has another one, describes a different run. Three changes are not in the scenario: those of flight, the end of scripted
-fates, and the clear network of the final reconcile.
+The scenario determines all network changes, faults and injections before the run. If a record lacks one of them, or has
+a further one, it describes a different run. The scenario does not contain three kinds of changes: those by the movement
+of vehicles, the end of scripted fates, and the network without loss during the final reconcile.
 """
 
 from collections.abc import Iterator

@@ -26,7 +26,7 @@ ROUNDED_END_S = 0.1
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each export, handler run and event with a time that the end of the run or the agent's clock contradicts."""
+    """Yield each export, handler run and event whose time contradicts the end of the run or the agent's clock."""
     as_logged = not _has_recorded_events(evidence)
     for agent_id, trace in evidence.traces.items():
         end_s = evidence.end_of(agent_id)
@@ -41,7 +41,9 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _around_the_end(trace: Trace, end_s: float) -> tuple[float, float]:
-    """Return the earliest possible time of the export, and the latest possible time of an export or handler run."""
+    """Return the earliest possible time of the export, and the latest possible time of the export and of
+    handler runs.
+    """
     speedup = trace.header.clock.get("speedup")
     if in_virtual_time(trace) or not isinstance(speedup, int | float):
         return end_s - SAME_TIME_S, end_s + SAME_TIME_S

@@ -12,8 +12,8 @@ from ucp.clock import MICROSECONDS
 class Contradiction:
     """A contradiction between two records.
 
-    `touches` is the number of the characteristic that depends on these records, or None. `short` is true if the trace
-    of the agent lacks lines.
+    `touches` is the number of the characteristic that depends on these records. None means that no characteristic
+    depends on them. `short` is true if the contradiction shows that the agent's trace lacks lines.
     """
 
     finding: Finding
@@ -22,7 +22,7 @@ class Contradiction:
 
 
 def of_agent(agent_id: int, detail: str, touches: str | None = None, *, short: bool = False) -> Contradiction:
-    """Return a contradiction about an agent that concerns no particular block."""
+    """Return a contradiction that concerns an agent, but no particular block."""
     return Contradiction(Finding(agent_id, detail), touches, short)
 
 
@@ -46,8 +46,8 @@ def slack_s(trace: Trace) -> float:
 
 
 def mission_s(timestamp_us: int, header: TraceHeader) -> float | None:
-    """Return the mission second at which the agent's clock showed this time, or None if the header does not describe
-    the clock.
+    """Return the mission second at which the agent's clock showed this timestamp. Return None if the header does not
+    describe the clock.
     """
     clock = header.clock
     told = [clock.get("epoch_us"), clock.get("offset_s", 0), clock.get("drift", 0)]

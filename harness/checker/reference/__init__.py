@@ -1,8 +1,8 @@
 """The independent implementation of the protocol with which the steps of an agent are compared.
 
-`algorithms` is a transcription of Algorithms 1-20. Its author worked from the thesis and from the readings of the
-thesis, and did not see `ucp`. It shares only the message codec and the hashes with `ucp`. An edit of `ucp` therefore
-changes the agents and not the judge.
+`algorithms` is a transcription of Algorithms 1-20. Its author worked from the thesis and from
+`docs/reference/readings.md`, the interpretations of its ambiguous passages, and did not see `ucp`. It shares only the
+message codec and the hashes with `ucp`. An edit of `ucp` therefore changes the agents and not the judge.
 """
 
 from collections.abc import Container
@@ -11,7 +11,7 @@ from ucp.messages import CARRY_A_BLOCK, Message
 
 
 def why_not_handled(agent_id: int, roster: Container[int], sender: int, message: Message) -> str | None:
-    """Return the reason why an agent drops a valid message, or None if the agent handles it."""
+    """Return the reason why an agent drops this valid message. Return None if the agent handles it."""
     if sender == agent_id:
         return "own sender"
     if sender not in roster:

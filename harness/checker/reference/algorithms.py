@@ -1,8 +1,8 @@
 """The reference implementation: a literal transcription of Algorithms 1-20 (Chapter 3 of the thesis).
 
-Recorded runs of other implementations are judged by this module, so it favours the order and the words of the
-pseudo-code over short code. Its author worked from the thesis and the readings of the thesis, and did not see `ucp`.
-"Reading 4" in a docstring means number 4 of docs/reference/readings.md.
+This module judges recorded runs of other implementations, so it favours the order and the words of the pseudo-code over
+short code. Its author worked from the thesis and the interpretations of its ambiguous passages ("readings"), and did
+not see `ucp`. "Reading 4" in a docstring means number 4 of docs/reference/readings.md.
 
 Each algorithm is one function. It reads and changes a `ReferenceState` and returns the name of the branch that it took.
 An input is a message, an expired timer, a logged event or a command. A handler is atomic: it runs to its end, then the
@@ -143,10 +143,10 @@ def receive_vote_add_block(state: ReferenceState, sender: int, message: BlockAdd
 def vote_timer_expiration(state: ReferenceState) -> str:
     """Algorithm 5, Vote Timer Expiration (Section 3.6.2): commit the proposed block, vote again or reconcile.
 
-    Reading 4 votes again if the chain changed during an approved vote. Reading 5 has the order of the two tests, and
-    does not approve a tied vote. Reading 10 does nothing during a reconcile. The block leaves the deque before it is
-    committed, as the agent contract has the order of recorded changes; the thesis removes it last. The setting
-    `asks_after_commit` extends the thesis.
+    By reading 4, the agent votes again if its chain changed during an approved vote. Reading 5 defines the order of the
+    two tests; a tied vote is not approved. By reading 10, the handler does nothing during a reconcile. The block leaves
+    the deque before it is committed, because the agent contract requires this order of recorded changes. The thesis
+    removes the block last. The setting `asks_after_commit` extends the thesis.
     """
     if state.reconcile_in_progress:
         return "reconcile in progress"
@@ -171,7 +171,7 @@ def vote_timer_expiration(state: ReferenceState) -> str:
 def receive_commit_block(state: ReferenceState, sender: int, message: CommitBlock) -> str:
     """Algorithm 6, Receive Commit Block (Section 3.6.2): commit another agent's block (reading 6).
 
-    Characteristic 3 refuses a block that the agent holds already.
+    Because of characteristic 3, the agent ignores a block that it already holds.
     """
     if state.reconcile_in_progress:
         return "reconcile in progress"
@@ -200,7 +200,9 @@ def reconcile_begin(state: ReferenceState) -> str:
 
 @_algorithm(8, local_event="Reconcile Phase 1", tally="reconcile_vote_count")
 def reconcile_phase_1(state: ReferenceState) -> str:
-    """Algorithm 8, Reconcile Phase 1 (Section 3.6.3): ask which neighbours' chains contain the own top block."""
+    """Algorithm 8, Reconcile Phase 1 (Section 3.6.3): ask the neighbours whether their chains contain the agent's own
+    top block.
+    """
     state.reconcile_vote_count = {"yes": 0, "no": 0}
     state.reconcile_responders = set()
     state.send(ChainContainQuery(state.chain.top_chain_hash))
@@ -338,8 +340,8 @@ def reconcile_phase_2_timer_expiration(state: ReferenceState) -> str:
 def reconcile_phase_3(state: ReferenceState) -> str:
     """Algorithm 16, Reconcile Phase 3 (Section 3.6.3): get the chosen block.
 
-    Reading 11 continues with phase 2 after a block from the own stack. Characteristic 3 gives up a block that the
-    agent holds elsewhere.
+    By reading 11, the agent continues with phase 2 after it takes a block from its own stack. Because of characteristic
+    3, it gives up a block that it holds elsewhere.
     """
     block_hash = state.majority_response_block_hash
     assert block_hash is not None, "Algorithm 15 chooses a block before it triggers phase 3"
@@ -374,7 +376,7 @@ def receive_request_block_for_hash(state: ReferenceState, sender: int, message: 
 def receive_response_block_for_hash(state: ReferenceState, sender: int, message: BlockResponse) -> str:
     """Algorithm 18, Receive Response Block for Hash (Section 3.6.3): commit the requested block (reading 12).
 
-    The pause has no effect, because handlers are atomic (reading 12).
+    The pause of the phase 3 timer has no effect, because handlers are atomic (reading 12).
     """
     if not state.phase_three_timer.active:
         return "not in phase 3"
@@ -401,8 +403,8 @@ def reconcile_phase_3_timer_expiration(state: ReferenceState) -> str:
 def reconcile_finalize(state: ReferenceState) -> str:
     """Algorithm 20, Reconcile Finalize (Section 3.6.3): commit the remaining blocks of the reconcile stack again.
 
-    Reading 14 pauses between two commits; the flag `reconcile_in_progress` stays set meanwhile. The setting
-    `asks_after_commit` extends the thesis.
+    By reading 14, the agent pauses between two commits, and the flag `reconcile_in_progress` stays set during the
+    pause. The setting `asks_after_commit` extends the thesis.
     """
     if state.settings.asks_after_commit and not state.reconcile_in_progress:
         state.send(ChainHashSuccessorQuery(state.chain.top_chain_hash))
@@ -421,7 +423,7 @@ def reconcile_finalize(state: ReferenceState) -> str:
 
 def tally_of(state: ReferenceState, handler: Handler) -> Tally | None:
     """Return a copy of the votes or candidates that a handler counts, or the candidate that it chose. Hashes are
-    hexadecimal.
+    hexadecimal text.
     """
     dictionary = state.reconcile_response_dictionary
     if handler.tally == "majority_response_block_hash":

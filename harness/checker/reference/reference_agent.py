@@ -1,8 +1,7 @@
-"""The reference implementation as an agent without I/O. The reference agent has the same interface as
-`ucp.agent.Agent`.
+"""The reference implementation as an agent without I/O. It has the same interface as `ucp.agent.Agent`.
 
-`prove` puts it into the state of an agent and gives both the same input. `conformance` runs it beside the agent under
-test.
+`prove` puts the reference agent into the state of a real agent and gives the same input to both. `conformance` runs the
+reference agent next to the agent under test.
 """
 
 import math
@@ -97,7 +96,7 @@ class ReferenceAgent:
         return [encode(self.agent_id, sequence, message) for sequence, message in self.messages_to_send()]
 
     def trace(self) -> list[HandlerRun]:
-        """Return the handler runs since the last call of this method."""
+        """Return the handler runs since the previous call of this method."""
         trace, self._trace = self._trace, []
         return trace
 

@@ -34,7 +34,9 @@ class Settings:
 
     @classmethod
     def of(cls, settings: object) -> "Settings":
-        """Return the settings of an agent as they are named here. Any object with these attributes can be passed."""
+        """Return the settings of an agent as an object of this class. `settings` can be any object with the same
+        attributes.
+        """
         return cls(**{setting.name: getattr(settings, setting.name) for setting in fields(cls)})
 
 
@@ -97,7 +99,9 @@ class Chain:
         return self._blocks.get(block_hash)
 
     def successor(self, chain_hash: bytes) -> Block | None:
-        """Return the block that follows `chain_hash`, or None if the chain does not contain such a block."""
+        """Return the block that follows `chain_hash`. Return None if the chain does not contain this chain hash, or if
+        no block follows it.
+        """
         return self._successors.get(chain_hash)
 
     @property
@@ -129,8 +133,8 @@ class Chain:
 class Handler:
     """An event handler of the protocol, with its Algorithm number.
 
-    `algorithm` is its number in the thesis. `run` is the function of the algorithm. `tally` names the attribute of the
-    state in which the handler counts or into which it chooses.
+    `algorithm` is the number of the handler in the thesis. `run` is the function of the algorithm. `tally` names the
+    attribute of the state that contains the handler's vote counts, or the block that it chooses.
     """
 
     name: str
@@ -200,7 +204,7 @@ class ReferenceState:
         return block_hash in self.chain or block_hash in self._off_chain
 
     def note_held(self) -> None:
-        """Update the set of held blocks after the deque or the reconcile stack was replaced."""
+        """Update the set of held blocks. Call this method after a replacement of the deque or the reconcile stack."""
         self._off_chain = {block.block_hash for block in (*self.blocks_to_be_committed, *self.reconcile_stack)}
 
     def event_data(self, timestamp_us: int) -> bytes:
@@ -258,7 +262,8 @@ class ReferenceState:
     def restore(
         self, completed: Iterable[bytes], chain: Iterable[Block], deque: Iterable[Block], stack: Iterable[Block]
     ) -> None:
-        """Load the stored state of an agent that lost power, and start it as if a reconcile were in progress.
+        """Load the state that the agent stored before it lost power, and start the agent as if a reconcile were in
+        progress.
 
         `completed` holds block hashes. Recording "complete" bypasses `changed`, since the agent may no longer hold
         these blocks.

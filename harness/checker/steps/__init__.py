@@ -1,9 +1,9 @@
 """Compare each handler run of each agent with Algorithms 1 to 20.
 
-The judge feeds the record of each agent, step by step, into the independent reference (`harness.checker.reference`). It
-compares branch, changes, messages, timers, tallies and state. It needs only the record, so it judges agents in any
-language, and an edit of `ucp` does not change it. After a difference the judge continues from the agent's own state, so
-one mistake gives one finding.
+The judge gives the recorded inputs of each agent, step by step, to the independent reference
+(`harness.checker.reference`). It compares branch, changes, messages, timers, vote counts and state. It needs only the
+record, so it judges agents in any language, and an edit of `ucp` does not change it. After a difference the judge
+continues from the agent's own state, so one mistake gives one finding.
 """
 
 from collections import Counter
@@ -29,8 +29,8 @@ NAME = "every step"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Return the verdict on all steps: `deviates` after any difference, `not applicable` if a step could not be judged,
-    else `as specified`.
+    """Return the verdict on all steps. It is `deviates` after any difference from the reference, `not applicable` if a
+    step could not be judged, and `as specified` otherwise.
     """
     if evidence.steps is not None:
         return evidence.steps
@@ -89,9 +89,7 @@ def _why(unjudged: dict[int, str]) -> str:
 
 
 def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: BlockIndex) -> list[StepComparer]:
-    """Return an object for each incarnation of the agent (the time between two restarts) that compares it with the
-    reference.
-    """
+    """Return a `StepComparer` for each incarnation of the agent (the time between two restarts)."""
 
     def was_paused(since: float, until: float) -> bool:
         return evidence.was_paused(header.agent_id, since, until)
@@ -117,7 +115,9 @@ def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[Ste
 
 
 def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | CommandEntry) -> StepDeviation | None:
-    """Return a deviation if the agent dropped a datagram that it had to handle, otherwise None."""
+    """Return a deviation if the agent dropped a datagram that the protocol requires it to handle. Return None
+    otherwise.
+    """
     if not isinstance(aside, DroppedDatagram) or header.secured:
         return None  # a secured agent drops datagrams before it decrypts them
     try:
@@ -131,7 +131,9 @@ def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | C
 
 
 def deviates(evidence: Evidence, deviations: list[StepDeviation], steps: int, lost: list[str]) -> Judgement:
-    """Return the judgement for these deviations. `lost` contains reasons why some steps could not be judged."""
+    """Return the judgement for the deviations of all agents. `lost` contains the reasons why some steps could not be
+    judged.
+    """
     deviations.sort(key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
     first_unknown: dict[tuple[int, str | None], StepDeviation] = {}
     for deviation in deviations:
@@ -151,10 +153,10 @@ def deviates(evidence: Evidence, deviations: list[StepDeviation], steps: int, lo
 
 
 def _known(deviation: StepDeviation) -> str | None:
-    """Return the handler of the deviation if it is one of the 20 handlers of the protocol, otherwise None."""
+    """Return the handler of the deviation if it is one of the 20 handlers of the protocol. Return None otherwise."""
     return deviation.handler if deviation.handler in HANDLERS else None
 
 
 def _title(handler: str | None) -> str:
-    """Return a title of a handler, such as "Algorithm 5, vote_timer_expiration"."""
+    """Return the title of a handler, such as "Algorithm 5, vote_timer_expiration"."""
     return f"Algorithm {HANDLERS[handler].algorithm}, {handler}" if handler else "an unknown handler"

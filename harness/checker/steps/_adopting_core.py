@@ -1,9 +1,9 @@
-"""An agent core that can take over the state that another agent recorded, so that a comparison continues after a
+"""An agent core that can take over the state that another agent recorded. A comparison can then continue after a
 deviation.
 
 After a deviation the judge continues from the agent's own state. `AdoptingCore` adds this ability to any core that has
-the attributes of the reference's `ReferenceState`: to the reference, by which agents are judged, and to the core in
-use, for a debugger and for `bisect` (`harness.checker.steps.core_in_use`).
+the attributes of the reference's `ReferenceState`. There are two such cores: the reference, which judges the agents,
+and the core in use, for a debugger and for `bisect` (`harness.checker.steps.core_in_use`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,7 +26,7 @@ from ucp.trace import HandlerRun, SentMessage
 
 
 class StateBeforeStep(NamedTuple):
-    """The parts of the state before a step that the step's recorded changes do not restore."""
+    """The parts of the state before a step that cannot be restored from the step's recorded changes."""
 
     stack: list[Block]
     current_block: bytes | None
@@ -41,8 +41,8 @@ else:
 
 
 class AdoptingCore(_Core):
-    """An agent core whose last step can be undone with `undo`, and replaced with `adopt` by the recorded step of
-    another agent.
+    """An agent core that can undo its last step (`undo`) and take over the recorded step of another agent instead
+    (`adopt`).
     """
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Any) -> None:
@@ -55,8 +55,8 @@ class AdoptingCore(_Core):
         """Every block that the core has held, by hash."""
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Return the event data of a completed block. If the mission encrypts event data, return the recorded encrypted
-        data.
+        """Return the event data of a completed block. If the mission encrypts event data, return the encrypted data
+        that the agent recorded.
         """
         events = bytes(self.current_block)
         sealed = self.told_sealed
@@ -83,8 +83,8 @@ class AdoptingCore(_Core):
         self.step_is_over()
 
     def before(self, run: HandlerRun) -> StateBeforeStep | None:
-        """Return the data that `undo` needs in addition to the step's recorded changes, or None if `undo` needs no
-        further data.
+        """Return the data that `undo` needs in addition to the recorded changes of the step. Return None if it needs no
+        such data.
         """
         logs, phase_three_ends = run.handler == "build_data_block", self.phase_three_timer.deadline
         if not (logs or self.reconcile_stack or phase_three_ends is not None):
@@ -124,8 +124,9 @@ class AdoptingCore(_Core):
         return [SentMessage.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
-        """Set the block to request in phase 3 to the one in the agent's recorded run. The agent started this phase by
-        itself after a deviation.
+        """Set the block to request in phase 3 to the block in the agent's recorded run.
+
+        This is necessary after a deviation, because the agent alone chose to start phase 3.
         """
         if run.handler == "reconcile_phase_3":
             hashes = [block_hash for operation, block_hash in run.changes if operation == "chain+"]
@@ -134,9 +135,9 @@ class AdoptingCore(_Core):
                 self.majority_response_block_hash = bytes.fromhex(hashes[0])
 
     def undo(self, before: StateBeforeStep | None) -> None:
-        """Undo the last step's changes of blocks and timers. Afterwards `adopt` replaces the counted votes.
+        """Undo the last step's changes of blocks and timers. The votes stay as they are, because `adopt` replaces them.
 
-        `before` is None if the changes of the step are sufficient.
+        `before` is None if the recorded changes are sufficient to undo the step.
         """
         for operation, block_hash in reversed(self.changes):
             match operation:
@@ -221,7 +222,7 @@ class AdoptingCore(_Core):
             self.chain.top_chain_hash = chain_hash
 
     def _adopt_sent(self, sent: Iterable[SentMessage]) -> None:
-        """Start the timers that belong to the queries and requests that the agent sent."""
+        """Start the timers that belong to the queries and requests in these sent messages."""
         for announced in sent:
             self.sequence = announced.seq + 1
             try:
@@ -232,8 +233,8 @@ class AdoptingCore(_Core):
                 timer.start(self.now, self._duration(timer))
 
     def _asked(self, message: Message) -> Timer | None:
-        """Prepare to count the answers to `message`. Return the timer that limits the wait, or None if the message asks
-        for no answer.
+        """Prepare to count the answers to `message`, and return the timer that limits the wait. Return None if the
+        message asks for no answer.
         """
         match message:
             case BlockAddRequest():

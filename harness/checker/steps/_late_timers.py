@@ -1,8 +1,9 @@
 """Find timers of an agent that expired later than the measured delays of the machine can explain.
 
-A right agent runs a timer late only if the machine wakes it late, or if its process is busy or waits for a processor.
-The harness measures both during a run (`lag.jsonl`). The lag is an upper bound, so a single timer shows only a large
-error. A wrong duration makes all timers of a kind late. The mean over the run then shows a smaller error.
+A correct agent runs a timer late only if the machine wakes it late, or if its process is busy or waits for a processor.
+The harness measures both delays during a run (`lag.jsonl`). The measured lag is an upper bound, so a single timer shows
+only a large error. A wrong duration makes all timers of one type late. Their mean lateness over the run then shows a
+smaller error.
 """
 
 from collections import defaultdict
@@ -26,8 +27,8 @@ ENOUGH = 8
 
 @dataclass
 class JudgedTimers:
-    """The number of judged timers of all agents, and the number of those for which no delay of the machine was
-    measured.
+    """The number of judged timer expiries of all agents, and the number of expiries for which the delay of the machine
+    was not measured.
     """
 
     expiries: int = 0
@@ -35,7 +36,7 @@ class JudgedTimers:
 
     @property
     def remark(self) -> str:
-        """A remark about timers that could not be judged, or an empty text if all timers were judged."""
+        """A remark about timers that could not be judged. It is empty if all timers were judged."""
         if not self.unmeasured:
             return ""
         which = "timers" if self.unmeasured == self.expiries else f"{self.unmeasured} of {self.expiries} timers"
@@ -65,7 +66,9 @@ class JudgedTimers:
 def _of_kind(
     agent_id: int, timer: str, expiries: list[tuple[RecordedTimerExpiry, float]], speedup: float
 ) -> Iterator[StepDeviation]:
-    """Yield each timer that expired too late. If only the mean of all timers is too late, yield the last one."""
+    """Yield each expiry of this timer that was too late. If only the mean lateness of all expiries is too high, yield
+    the last expiry.
+    """
     late = [(expiry, lag_s) for expiry, lag_s in expiries if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
     for expiry, lag_s in late:
         what = (

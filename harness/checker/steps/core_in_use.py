@@ -1,7 +1,8 @@
 """Make the installed agent core `ucp.agent` comparable with the records of an agent.
 
-Agents are judged by the reference. The core in use also follows a record where its own behaviour matters: in a
-debugger, which stops in the handlers of `ucp`, and in `bisect`, which compares the cores of commits.
+The verdict on agents comes from the reference. The core in use also follows a record in two cases in which its own
+behaviour matters: in a debugger, which stops in the handlers of `ucp`, and in `bisect`, which compares the cores of
+commits.
 """
 
 from harness.checker.steps._adopting_core import AdoptingCore

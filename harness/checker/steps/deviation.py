@@ -21,7 +21,8 @@ SHOWN = 3
 class StepDeviation:
     """A difference between a step of an agent and the same step of the reference implementation.
 
-    `run` and `expected` are the recorded and the expected handler run. If no run can be compared, `what` has the text.
+    `run` and `expected` are the recorded and the expected handler run. If no handler runs can be compared, `what`
+    describes the difference.
     """
 
     agent_id: int
@@ -47,7 +48,7 @@ class StepDeviation:
 
 
 def differences(run: HandlerRun, expected: HandlerRun, name: NameOf) -> Iterator[tuple[str, str]]:
-    """Yield the actual and the expected behaviour for each part of the step that differs."""
+    """Yield the actual and the expected behaviour for each part of the step in which they differ."""
     if run.branch != expected.branch:
         yield f"took the branch '{run.branch[:60]}'", f"taken '{expected.branch}'"
     as_changed = run.changes == expected.changes
@@ -98,7 +99,7 @@ def _message(message: SentMessage, others: Sequence[SentMessage], name: NameOf) 
 
 
 def _content(message: SentMessage, other: SentMessage) -> str:
-    """Return the content in which a message differs from another message of the same type about the same block."""
+    """Return the content of `message` that differs from `other`, a message of the same type about the same block."""
     try:
         content = decoded(message.datagram).message
     except MalformedDatagramError as malformed:

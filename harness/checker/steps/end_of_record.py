@@ -1,8 +1,10 @@
-"""Describe the end of a record that the agent did not end itself. A dying agent leaves no line of its last handler.
+"""Describe the end of a record that stops without a regular end of the agent. An agent that dies leaves no line for its
+last handler.
 
-With the record of a run, the reason is known. A crash in a handler is a deviation, because no Algorithm ends in an
-error. From the field, only other records show that the mission went on after the last line. They do not show whether
-the agent died in a handler or lost its power, so the sentence names the next input and both possibilities.
+If `run.json` exists, it contains the reason. A crash in a handler is a deviation, because no Algorithm ends in an
+error. For records from the field, only the records of other agents show that the mission continued after the last line.
+They do not show whether the agent died in a handler or lost its power, so the sentence names the next input and both
+possibilities.
 """
 
 import math
@@ -25,8 +27,8 @@ _OF_MESSAGE = {message.NAME: handler for message, handler in ON_MESSAGE.items()}
 class MessageArrival(NamedTuple):
     """A message to the agent: mission seconds, type, sender and sequence number.
 
-    `arrived` is true if a capture shows it at the vehicle of the agent. Otherwise its sender sent it at this time, and
-    it may be lost.
+    If `arrived` is true, a capture shows that the message reached the agent's vehicle at this time. Otherwise the
+    sender sent it at this time, and it may have been lost.
     """
 
     t: float
@@ -37,7 +39,7 @@ class MessageArrival(NamedTuple):
 
 
 def crash(trace: Trace, recorded: AgentRecord | None) -> StepDeviation | None:
-    """Return a deviation if the record of the run states that the agent crashed in a handler, otherwise None."""
+    """Return a deviation if run.json states that the agent crashed in a handler. Return None otherwise."""
     if recorded is None or recorded.outcome != "crashed":
         return None
     named = _NAMED.search(recorded.detail or "")
@@ -50,14 +52,14 @@ def crash(trace: Trace, recorded: AgentRecord | None) -> StepDeviation | None:
 
 
 def failure(recorded: AgentRecord | None) -> str | None:
-    """Return the reason why the trace of an agent ends early, if the record of the run has one."""
+    """Return the reason why the trace of an agent ends early. Return None if run.json has no such reason."""
     if recorded is None or recorded.outcome not in FAILED:
         return None
     return f"its record ends early: it {recorded.detail or recorded.outcome}"
 
 
 def last_line(trace: Trace) -> tuple[int, float]:
-    """Return line number and mission second of the last handler run. Line 1 is the header."""
+    """Return the line number and the mission second of the last handler run. The header is line 1."""
     line, t = 1, 0.0
     for incarnation in trace.incarnations():
         line, t = max(((number, run.t) for number, run in incarnation), default=(line, t))
@@ -67,11 +69,10 @@ def last_line(trace: Trace) -> tuple[int, float]:
 def unfinished(
     follower: StepComparer, trace: Trace, others_until_s: float, arrivals: Iterator[MessageArrival] | None
 ) -> str | None:
-    """Return a sentence if a trace ends early: it has no export, and the mission went on after the end of the trace.
-    Otherwise return None.
+    """Return a sentence if a trace without an export ends before the mission ended. Return None otherwise.
 
-    `others_until_s` is a mission second until which others certainly went on. `arrivals` are the messages to the agent.
-    None if messages prove nothing.
+    `others_until_s` is a mission second until which other agents certainly continued. `arrivals` are the messages to
+    the agent, or None if messages prove nothing.
     """
     line, t = last_line(trace)
     if others_until_s <= t:
@@ -101,7 +102,7 @@ def unfinished(
 
 
 def sent_to(agent_id: int, traces: Mapping[int, Trace]) -> Iterator[MessageArrival]:
-    """Yield the messages that other agents sent, by their traces."""
+    """Yield the messages that the traces of other agents contain as sent."""
     for sender, trace in traces.items():
         if sender != agent_id:
             for run in trace.runs:

@@ -1,7 +1,7 @@
 """Give each recorded input of an agent to the reference implementation, and compare the results.
 
-The follower holds a reference agent in the state of the judged agent. After a difference it adopts the recorded state
-of the judged agent, so that one mistake does not cause further differences.
+A `StepComparer` holds a reference agent in the state of the judged agent. After a difference it adopts the recorded
+state of the judged agent, so that one mistake does not cause further differences.
 """
 
 import math
@@ -51,11 +51,15 @@ Paused = Callable[[float, float], bool]
 
 
 class NotHandledError(Exception):
-    """An error: the protocol does not run this handler now. The message completes a sentence that begins with "it"."""
+    """An error: the protocol does not run this handler at this moment. The message completes a sentence that begins
+    with "it".
+    """
 
 
 class RecordedTimerExpiry(NamedTuple):
-    """The expiry of a timer. Its handler ran at mission second `t`, which was `late_s` mission seconds late."""
+    """The expiry of a timer. Its handler ran at mission second `t`, `late_s` mission seconds after the expiry
+    was due.
+    """
 
     line: int
     t: float
@@ -65,8 +69,8 @@ class RecordedTimerExpiry(NamedTuple):
 
 
 class OptionalTraceFields(NamedTuple):
-    """The optional fields that occur in a trace: the handlers with recorded vote counts, and whether timers are
-    recorded.
+    """The optional fields that occur in a trace: the handlers with recorded vote counts, and whether the trace records
+    timers.
     """
 
     tallying: frozenset[str]
@@ -79,7 +83,7 @@ class OptionalTraceFields(NamedTuple):
 
 
 class AnotherHandlerError(NotHandledError):
-    """An error: the input belongs to the handler `handler`, but the agent ran another one."""
+    """An error: the input belongs to the handler `handler`, but the agent ran a different handler."""
 
     def __init__(self, run: HandlerRun, handler: Handler) -> None:
         ran = HANDLERS[run.handler].algorithm if run.handler in HANDLERS else run.algorithm
@@ -182,8 +186,8 @@ class StepComparer:
         self._adopt(line, run, before)
 
     def begin_at(self, chain: Iterable[Block], current_block: bytes, sequence: int) -> None:
-        """Set the reference to an idle agent with this chain, this block under construction, and this next sequence
-        number.
+        """Set the reference to the state of an idle agent with this chain, this block under construction, and this next
+        sequence number.
         """
         self._core.be_idle_with(chain, current_block, sequence)
         self._began = True
@@ -208,7 +212,9 @@ class StepComparer:
     # Lines that may be lost
 
     def has_effect(self, sender: int, message: Message, at_s: float) -> bool:
-        """Handle a message that is missing in the trace. Return true if the agent changed, counted or sent anything."""
+        """Handle a message that is missing in the trace. Return true if it had an effect: a change, a counted answer, a
+        message, a timer or a local event.
+        """
         core = self._core
         core.now = self._header.local(at_s)
         core.running = handler = self._on_message[type(message)]
@@ -216,14 +222,14 @@ class StepComparer:
         return bool(core.changes or core.outbox or core.started or core.triggered) or branch in COUNTING
 
     def play_lost_message(self, sender: int, message: Message, at_s: float) -> bool:
-        """Handle a message that has no line in the trace. Return true if its line could be lost, because it changed no
-        block.
+        """Handle a message that has no line in the trace. Return true if such a line could be lost unnoticed, because
+        the message changed no block.
         """
         return self._play_lost(self._on_message[type(message)], at_s, sender, message)
 
     def play_lost_expiry(self, timer_name: str, at_s: float) -> bool:
-        """Let a timer expire whose expiry has no line in the trace. Return true if the timer was due and the line could
-        be lost.
+        """Run the handler of a timer whose expiry has no line in the trace. Return true if the timer was due, and if
+        such a line could be lost unnoticed.
         """
         timer = self._timers[timer_name]
         if timer.deadline is None or timer.deadline > self._header.local(at_s) + self._header.early_s:
@@ -232,7 +238,9 @@ class StepComparer:
         return self._play_lost(self._implementation.on_timer[timer_name], at_s)
 
     def play_lost_local_event(self, at_s: float) -> bool:
-        """Run the handler of the next local event. Return true if there was one and its line could be lost."""
+        """Run the handler of the next local event. Return true if there was such an event, and if its line could be
+        lost unnoticed.
+        """
         if not self._core.triggered:
             return False
         event, _ = self._core.triggered.popleft()
@@ -269,14 +277,16 @@ class StepComparer:
         return deepcopy(self, memo)
 
     def foresee(self, line: int, run: HandlerRun) -> list[StepDeviation]:
-        """Return the differences in triggered handlers that the next handler run shows, without running a handler."""
+        """Return the differences in triggered handlers that are visible in the next handler run. No handler runs for
+        this.
+        """
         foreseeing = self.copy()
         if foreseeing.lost is None:
             foreseeing._triggered(line, run, _triggered_by(run))
         return foreseeing.deviations
 
     def end(self, at_s: float | None) -> None:
-        """Report the handlers that the agent should still have run before the run ended at `at_s`."""
+        """Report the handlers that the agent had to run before the run ended at `at_s`, but did not run."""
         if self.lost is not None:
             return
         self._not_run()
@@ -287,7 +297,7 @@ class StepComparer:
     # Runs that should have come before
 
     def _triggered(self, line: int, run: HandlerRun, by: str | None) -> None:
-        """Report triggered handlers that did not run, and handlers that ran without a trigger."""
+        """Report triggered handlers that did not run, and handlers that ran although no handler triggered them."""
         self._state = None
         triggered = self._core.triggered
         if self._adopted:
@@ -326,7 +336,7 @@ class StepComparer:
         triggered.clear()
 
     def _overdue(self, line: int, at_s: float, now: float) -> None:
-        """Report timers that expired long ago and whose handlers did not run."""
+        """Report timers that expired long ago, but whose handlers did not run."""
         self._state = None
         late = now - self._header.late_s
         for timer in self._core.timers:
@@ -350,9 +360,9 @@ class StepComparer:
         ]
 
     def _callback_is_lost(self, line: int, run: HandlerRun, due: Iterable[Timer]) -> bool:
-        """Report timers that the agent stopped after their expiry without running their handlers.
+        """Report timers that the agent stopped or restarted after their expiry without running their handlers.
 
-        The lost callback is the cause of the differences that follow. Returns whether there is one.
+        The missing handler is the cause of the differences that follow. Return true if such a timer was found.
         """
         is_lost = False
         for timer in due:
@@ -364,7 +374,9 @@ class StepComparer:
         return is_lost
 
     def _after_a_pause(self, deadline: float) -> str:
-        """Return the handler that paused the phase 3 timer after its start. The text ends a sentence."""
+        """Return the end of a sentence that names the handler which paused the phase 3 timer after its start. It is
+        empty without a pause.
+        """
         line, paused_at = self._paused
         if paused_at < deadline - self._header.settings.phase3_timeout_s:
             return ""
@@ -381,8 +393,8 @@ class StepComparer:
     # Inputs
 
     def _input(self, line: int, run: HandlerRun, now: float) -> tuple[Handler, tuple[Any, ...]]:
-        """Return the handler for an input other than a message, with its arguments. Raises NotHandledError if none
-        fits.
+        """Return the handler for an input that is not a message, with its arguments. Raises NotHandledError if no
+        handler fits.
         """
         trigger, on_local_event = run.trigger, self._implementation.on_local_event
         handler: Handler
@@ -413,7 +425,9 @@ class StepComparer:
         return handler
 
     def _message(self, run: HandlerRun, trigger: MessageTrigger) -> tuple[Handler, int, Message]:
-        """Return the handler for a message, the sender and the decoded message. Raises NotHandledError if none fits."""
+        """Return the handler for a message, its sender, and the decoded message. Raises NotHandledError if no handler
+        fits.
+        """
         try:
             sender, sequence, message = decoded(run.input)
         except MalformedDatagramError as malformed:
@@ -554,5 +568,5 @@ def _differ_only_in_idle(run: HandlerRun, expected: HandlerRun) -> bool:
 
 
 def _triggered_by(run: HandlerRun) -> str | None:
-    """Return the handler that triggered this run by a local event, or None if the run has another trigger."""
+    """Return the handler that triggered this run by a local event. Return None if the run has a different trigger."""
     return run.trigger.handler if isinstance(run.trigger, LocalTrigger) else None

@@ -1,4 +1,4 @@
-"""An implementation of the 20 handlers that can be compared with records: an agent core with its tables of handlers."""
+"""An implementation of the 20 handlers that can be compared with records: an agent core and its tables of handlers."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -10,11 +10,11 @@ from harness.checker.steps.trace_header import CheckedHeader
 
 
 class ReferenceCore(AdoptingCore, ReferenceState):
-    """The reference implementation, extended so that it can take over the recorded state of an agent."""
+    """The reference implementation, extended so that it can continue from the state that an agent recorded."""
 
 
 class CoreImplementation(NamedTuple):
-    """An agent core with its handlers by message type, by timer, by local event and by name."""
+    """An agent core and its handlers, indexed by message type, by timer, by local event and by name."""
 
     core: Callable[[CheckedHeader], AdoptingCore]
     on_message: Mapping[Any, Any]

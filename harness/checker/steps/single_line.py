@@ -1,11 +1,11 @@
 """Decide whether damage to one line of a trace explains a difference from the reference.
 
-A file from the field may lack a line, or have a damaged line that still reads as a line. Then the difference proves no
-mistake of the agent. Three kinds of damage are tried:
+A file from the field may lack a line, or contain a damaged line that is still readable. The difference then proves no
+mistake of the agent. The module tries three kinds of damage:
 
 - One character of the line is wrong.
-- The line and the next one are in the wrong order.
-- The line before is missing: a handler run that changed no block, so no state shows it.
+- The line and the next line are in the wrong order.
+- The line before is missing. It was a handler run that changed no block, so no recorded state shows it.
 
 An explanation counts only if the reference then agrees with the lines that follow.
 """
@@ -38,13 +38,13 @@ Line = tuple[int, HandlerRun]
 
 
 class OtherRecords(Protocol):
-    """The records of a flight that belong to other agents than the judged one."""
+    """The records of a flight that belong to agents other than the judged agent."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
-        """Return the datagrams of a sender with a sequence number."""
+        """Return the recorded datagrams with this sender and this sequence number."""
 
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
-        """Return false if the records prove that no such message reached the agent until this time."""
+        """Return false if the records prove that the agent received no such message before this time."""
 
 
 LINES_AFTER = 8
@@ -56,9 +56,10 @@ MAX_LOCAL = 4
 def damage_that_explains(
     before: StepComparer, deviation: StepDeviation, line: Line, following: Sequence[Line], others: OtherRecords
 ) -> str | None:
-    """Return the damage to a trace that explains the difference, such as "a line is missing", or None.
+    """Return a phrase for the damage to a trace that explains the difference, such as "a line is missing". Return None
+    if no damage explains it.
 
-    `before` is a follower in the state before the line. It stays unchanged.
+    `before` compares steps and is in the state before the line. It stays unchanged.
     """
     following = following[:LINES_AFTER]
     if _is_one_character_off(before, deviation, line, following, others):
@@ -134,9 +135,9 @@ def _as_it_may_have_been(
 
 
 def _was_received(before: StepComparer, expected: HandlerRun, run: HandlerRun, others: OtherRecords) -> bool:
-    """Return whether another agent received a message of this line that the reference does not send.
+    """Return true if another record contains a sent message of this line that the reference does not send.
 
-    Then the line is not damaged there.
+    The line is then not damaged at this message.
     """
     sent_by_both = [sent.datagram for sent in expected.sent]
     for sent in run.sent:
@@ -153,9 +154,11 @@ def _differ_in_one_character(text: str, other: str) -> bool:
 
 
 def _has_impossible_top(before: StepComparer, deviation: StepDeviation, line: Line, following: Sequence[Line]) -> bool:
-    """Return whether the state differs in the top chain hash only, and the next lines agree with the expected one.
+    """Return true if only the top chain hash differs from the expected state, and the next lines agree with the
+    expected hash.
 
-    A cut joins the beginning of a line with the end of another, so such a line may also be the last before lost ones.
+    A line whose end was lost can join the end of a later line. Such a line can therefore also be the last line before
+    lost lines.
     """
     number, run = line
     expected = deviation.expected
@@ -181,8 +184,8 @@ def _is_malformed(run: HandlerRun) -> bool:
 
 
 def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
-    """Compare the events of the completed block with the logged events. Return the damage that explains a difference,
-    or None.
+    """Return the damage to a trace line that explains why a completed block has other events than the logged ones.
+    Return None if no damage explains it.
     """
     completed = next((block_hash for operation, block_hash in run.changes if operation == "complete"), None)
     if run.handler != LOGS or completed is None:
@@ -203,7 +206,7 @@ def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
 
 
 def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
-    """Yield copies of the reference in the states that one lost trace line may have led to."""
+    """Yield copies of the reference, each in a state that one lost trace line may have led to."""
     trial = before.copy()
     for _ in range(MAX_LOCAL):
         if not trial.play_lost_local_event(run.t):

@@ -30,8 +30,8 @@ class UnknownSettingError(ImpossibleHeaderError):
 
 @dataclass(frozen=True)
 class CheckedHeader:
-    """The mission of a trace. A timer may expire up to `early_s` mission seconds early and `late_s` mission seconds
-    late.
+    """The mission that a trace header describes. A timer may expire up to `early_s` mission seconds early and `late_s`
+    mission seconds late.
     """
 
     agent_id: int
@@ -52,7 +52,7 @@ class CheckedHeader:
 
 
 def checked(header: TraceHeader) -> CheckedHeader:
-    """Return the mission that the header describes. Raises ImpossibleHeaderError if its values are invalid."""
+    """Return the mission that the trace header describes. Raises ImpossibleHeaderError if its values are invalid."""
     try:
         initial_data = base64.b64decode(header.initial_data or "", validate=True)
         settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})

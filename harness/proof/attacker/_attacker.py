@@ -2,7 +2,7 @@
 receivers.
 
 The attacker receives all messages. It therefore knows each block that an agent has committed, and the hash of each
-proposed block. It can make blocks in the name of its vehicle. They differ only in their timestamps.
+proposed block. It can create blocks in the name of the captured vehicle. These blocks differ only in their timestamps.
 """
 
 from collections.abc import Iterable, Iterator
@@ -34,8 +34,8 @@ class _KnowledgeFromAgent(NamedTuple):
 
 
 class ForgedTimestamps:
-    """Timestamps before, between and after those of `blocks` honest blocks. With these timestamps, up to `lies` forged
-    blocks can have any age.
+    """Timestamps before, between and after the timestamps of `blocks` honest blocks. They let up to `lies` forged
+    blocks have any age.
     """
 
     def __init__(self, blocks: int, lies: int) -> None:
@@ -46,8 +46,9 @@ class ForgedTimestamps:
 
 
 class Attacker:
-    """The messages that an attacker can send in the name of the captured vehicle. Each message is a number in
-    `local`.
+    """The messages that an attacker can send in the name of the captured vehicle.
+
+    Each message is stored in `local`, the store of agent states, and is identified by its number.
     """
 
     def __init__(self, bounds: Bounds, local: LocalStates) -> None:
@@ -64,7 +65,7 @@ class Attacker:
         self._forgeries: dict[tuple[int, ForgeryMaterial], tuple[int, ...]] = {}
 
     def lies(self, locals_: tuple[int, ...]) -> Iterator[tuple[AgentAction, ...]]:
-        """Yield the actions of the attacker that have an effect: each message with each set of receivers that it
+        """Yield the attacker's actions that have an effect: each message, combined with each set of receivers that it
         affects.
         """
         messages = dict.fromkeys(
@@ -86,8 +87,8 @@ class Attacker:
         return step.local != local or bool(step.sent or step.started)
 
     def material(self, locals_: tuple[int, ...]) -> Iterator[tuple[int, ForgeryMaterial]]:
-        """Yield each living agent's index, with the blocks and hashes from which the attacker can form messages to
-        it.
+        """Yield, for each living agent, its index and the blocks and hashes from which the attacker can form messages
+        to it.
         """
         looks = {place: self._look(local) for place, local in enumerate(locals_) if local != DEAD}
         blocks = self._own.union(*(look.committed for look in looks.values()))
@@ -118,9 +119,9 @@ class AttackerKnowledge:
 
     The attacker can send each message to each agent any number of times.
 
-    The blocks with these `ordinals`, in the order of their timestamps, are in the name of its vehicle. The attacker has
-    them from the beginning. It repeats proposals of other agents. It need not repeat their queries, because each agent
-    can receive the originals.
+    The blocks with the given `ordinals`, in the order of their timestamps, are in the name of the captured vehicle. The
+    attacker has these blocks from the beginning. It repeats proposals of other agents. It need not repeat their
+    queries, because each agent can receive the originals.
     """
 
     def __init__(self, bounds: Bounds, ordinals: Iterable[int]) -> None:
@@ -132,7 +133,7 @@ class AttackerKnowledge:
         self._times_us = ForgedTimestamps(bounds.blocks, 0).said
 
     def hears(self, sender: int, message: Message) -> None:
-        """Add the blocks and hashes in a message that an agent sent to the attacker's knowledge."""
+        """Add the blocks and hashes in an agent's message to the knowledge of the attacker."""
         if isinstance(message, BlockAddRequest):
             self._named.add(message.block_hash)
             self._proposals.setdefault(sender, set()).add(PendingQuestions((message.block_hash, message.chain_hash)))
@@ -151,7 +152,7 @@ class AttackerKnowledge:
 
 
 def looked_at(state: AgentState) -> _KnowledgeFromAgent:
-    """Return the knowledge that the attacker gains from an agent in this state."""
+    """Return the blocks, hashes and queries that the attacker learns from an agent in this state."""
     committed = frozenset((*state.chain, *state.reconcile_stack))
     return _KnowledgeFromAgent(
         asked(state), committed, frozenset(block.block_hash for block in state.blocks_to_be_committed)

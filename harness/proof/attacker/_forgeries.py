@@ -1,8 +1,8 @@
-"""List the messages that an attacker can send to an agent: one for each kind of effect on the agent.
+"""List the messages that an attacker can send to an agent: one message for each kind of effect on the agent.
 
-Handlers check only whether they hold a hash of the message, which of two timestamps is older, and yes or no.
-docs/explanation/proof.md explains why these messages are enough. A test compares their effects with those of random
-messages.
+A handler checks only three things of a message: whether the agent holds a hash, which of two timestamps is older, and
+whether the answer is yes or no. docs/explanation/proof.md explains why these messages are enough. A test compares their
+effects with those of random messages.
 """
 
 from collections.abc import Iterable, Iterator
@@ -26,10 +26,10 @@ from ucp.state import AgentState
 
 
 class PendingQuestions(NamedTuple):
-    """The queries and requests of an agent that still wait for answers.
+    """The queries and requests of an agent to which it still waits for answers.
 
-    `vote` is the block and the chain hash of its proposal. The other fields are the chain hash or block hash of its
-    query in phases 1, 2 and 3.
+    `vote` is the block and the chain hash of the agent's proposal. The other fields are the chain hash or block hash of
+    its query in phases 1, 2 and 3.
     """
 
     vote: tuple[bytes, bytes] | None = None
@@ -39,7 +39,9 @@ class PendingQuestions(NamedTuple):
 
 
 class ForgeryMaterial(NamedTuple):
-    """The contents of an attacker's messages: blocks, block hashes, queries of other agents, and timestamps."""
+    """The contents from which an attacker forms messages: blocks, block hashes, queries of other agents, and
+    timestamps.
+    """
 
     blocks: frozenset[Block]
     named: frozenset[bytes]
@@ -48,7 +50,7 @@ class ForgeryMaterial(NamedTuple):
 
 
 def asked(state: AgentState) -> PendingQuestions:
-    """Return the queries and requests of an agent that still wait for answers."""
+    """Return the queries and requests of an agent to which it still waits for answers."""
     candidate, top = state.candidate_block, state.chain.top_chain_hash
     voting = state.voting_timer.active and candidate is not None
     return PendingQuestions(
@@ -60,8 +62,9 @@ def asked(state: AgentState) -> PendingQuestions:
 
 
 def forgeries(state: AgentState, captor: int, material: ForgeryMaterial) -> Iterator[Message]:
-    """Yield the messages in the name of vehicle `captor` that can affect the agent, or affect other agents through its
-    answer.
+    """Yield the messages in the name of vehicle `captor` that have an effect.
+
+    A message can affect the agent that receives it, or other agents through its answer.
     """
     yield from _answers(state, captor, material)
     if not state.reconcile_in_progress:
@@ -71,7 +74,7 @@ def forgeries(state: AgentState, captor: int, material: ForgeryMaterial) -> Iter
 
 
 def _answers(state: AgentState, captor: int, material: ForgeryMaterial) -> Iterator[Message]:
-    """Yield forged answers to the agent's own queries. An agent counts each sender of answers once."""
+    """Yield forged answers to the agent's own queries. An agent counts only one answer of each sender."""
     waits = asked(state)
     if waits.vote is not None and captor not in state.voters:
         block_hash, chain_hash = waits.vote
@@ -99,7 +102,7 @@ def _commits(state: AgentState, blocks: Iterable[Block]) -> Iterator[Message]:
 
 
 def _questions(state: AgentState, others: Iterable[PendingQuestions]) -> Iterator[Message]:
-    """Yield forged queries whose answer from this agent is an answer that another agent waits for."""
+    """Yield forged queries to this agent. Another agent waits for exactly the answer to such a query."""
     chain = state.chain
     for waits in sorted(others, key=repr):
         if waits.vote is not None:

@@ -1,6 +1,7 @@
-"""Create agents that check signatures, and datagrams that an attacker signs with the keys of a captured vehicle.
+"""Create agents that check signatures. Also create the datagrams that an attacker signs with the keys of a captured
+vehicle.
 
-`ucp.secure` decides which datagrams an agent accepts. This module makes no assumption about it.
+`ucp.secure` decides which datagrams an agent accepts. This module makes no assumption about its decisions.
 """
 
 import math
@@ -22,7 +23,7 @@ ATTACKERS_BOOT = b"later than that".ljust(16, b"\0")
 
 
 class SecurityGate:
-    """The keys of a secured mission. The attacker has those of vehicle `captured`. Raises MachineError without a
+    """The keys of a secured mission. The attacker has the keys of vehicle `captured`. Raises MachineError without a
     cryptography library.
     """
 
@@ -37,7 +38,7 @@ class SecurityGate:
         """Sender -> session in which the attacker sends in the sender's name."""
 
     def agent(self, agent_id: int, *arguments: Any, revoked: bool = False, **options: Any) -> Agent:
-        """Return an agent that checks signatures. If `revoked` is true, it knows that the captured vehicle is
+        """Return an agent that checks signatures. If `revoked` is true, the agent knows that the captured vehicle is
         excluded.
         """
         from ucp.secure.secured_agent import SecuredAgent
@@ -53,9 +54,9 @@ class SecurityGate:
     def sealed(self, message: Message, now: float, *, sender: int | None = None, genuine: bool = False) -> bytes:
         """Return a new encrypted datagram with this message, in the name of the captured vehicle or of `sender`.
 
-        A `genuine` block has its maker's signature, which the attacker received with the block. Any other block is
-        signed with the captured key. An answer names a request that no agent has received, so no agent knows a newer
-        one.
+        If `genuine` is true, the block in the message has the signature of its author, which the attacker received with
+        the block. Otherwise it is signed with the captured key. An answer names a request that no agent has received,
+        so no agent knows a newer request.
         """
         from ucp.secure.block_signature import sign_block
         from ucp.secure.sealed_datagrams import AnsweredRequest
@@ -77,10 +78,10 @@ class SecurityGate:
         return session.seal(self._sequence, message, request, signature, 0)
 
     def forged(self, message: Message, receiver: int, now: float) -> Iterator[bytes]:
-        """Yield forged datagrams with this message: one in the name of another vehicle, and one with a block in the
+        """Yield forged datagrams with this message: one in the name of a third vehicle, and one with a block in the
         receiver's name.
 
-        The attacker has the keys of neither.
+        The attacker has neither the keys of the third vehicle nor those of the receiver.
         """
         another = next((member for member in self._roster if member not in (receiver, self._captured)), None)
         if another is not None:

@@ -14,7 +14,9 @@ Document = dict[str, Any]
 
 
 class AttackEntries:
-    """The timeline entries for one path through the states. `made` contains the attacker's own blocks by hash."""
+    """The timeline entries for the attacker's messages on one path through the states. `made` contains the attacker's
+    own blocks by hash.
+    """
 
     def __init__(self, local: LocalStates, captured: int, made: Mapping[bytes, Block]) -> None:
         self._local = local
@@ -35,7 +37,7 @@ class AttackEntries:
         self._completed_s.append(at_s)
 
     def sees(self, local: int) -> None:
-        """Record the chain hashes of an agent in this state, so that timeline entries can refer to these hashes."""
+        """Record the chain hashes of an agent in this state, so that timeline entries can name the chains."""
         chain = self._local.state(local).chain
         below: tuple[bytes, ...] = ()
         self._chains[chain.inception.chain_hash] = below
@@ -43,9 +45,11 @@ class AttackEntries:
             below = self._chains[chain_hash] = (*below, block.block_hash)
 
     def lie(self, receiver: int, number: int, at_s: float) -> list[Document]:
-        """Add a message of the attacker, and return its entry in a list. The method `word` completes the entry later.
+        """Add a message of the attacker, and return its timeline entry in a list. The method `word` completes the entry
+        later.
 
-        If the last message was the same at the same time, its entry gets the receiver, and the list is empty.
+        If the previous message has the same content and time, its entry gets the receiver instead, and the list is
+        empty.
         """
         message = self._local.messages[number]
         if self._lies and (self._lies[-1][0]["at_s"], self._lies[-1][1]) == (at_s, message):
@@ -56,7 +60,7 @@ class AttackEntries:
         return [entry]
 
     def word(self) -> None:
-        """Complete all entries, after the whole path is known."""
+        """Complete all timeline entries. Call this method when the whole path is known."""
         for entry, message in self._lies:
             entry["lie"] |= self._said(message)
 
@@ -79,7 +83,7 @@ class AttackEntries:
         return said
 
     def _below(self, commit: CommitBlock) -> bytes:
-        """Return the hash of the chain to which a Commit Block message wants to add its block."""
+        """Return the hash of the chain on top of which a Commit Block message adds its block."""
         return next(
             (below for below in self._chains if next_chain_hash(below, commit.block.block_hash) == commit.chain_hash),
             NOBODYS,

@@ -1,4 +1,4 @@
-"""Compute the share of all existing states and inputs of an agent that runs have reached."""
+"""Compute the share of an agent's existing states and inputs that runs have reached."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from harness.proof.model._shape import HeldBlockOrder, Shape, shape_of
 
 @dataclass
 class ExistingStates:
-    """The agent states and (state, input) pairs that exist within `bounds`. The sets are complete if `ended` is
+    """The agent states and (state, input) pairs that exist within `bounds`. Both sets are complete if `ended` is
     "complete".
     """
 
@@ -28,8 +28,8 @@ class ExistingStates:
 
 
 def existing(bounds: Bounds, *, most_bytes: float = 4e9, most_s: float = float("inf")) -> ExistingStates:
-    """Return all agent states and (state, input) pairs within the bounds, or those found before a limit of memory or
-    time.
+    """Return all agent states and (state, input) pairs within the bounds. If a limit of memory or time is reached,
+    return those found so far.
     """
     there = ExistingStates(bounds, set(), set())
     if bounds.network == "any":
@@ -65,7 +65,7 @@ SCHEMA = "ucp-coverage/1"
 
 @dataclass(frozen=True)
 class CoverageShare:
-    """The number of existing states, inputs or branches that runs reached, and the number reached outside the
+    """The number of existing states, inputs or branches that runs reached, and the number that they reached outside the
     bounds.
     """
 
@@ -95,12 +95,14 @@ class CoverageShare:
 
 
 def not_taken(reached: ReachedStates) -> list[Branch]:
-    """Return the branches in the agent contract that no run has taken."""
+    """Return the branches (cases of a handler) in the agent contract that no run has taken."""
     return [branch for branch in BRANCHES if not reached.branches[branch]]
 
 
 def to_json(reached: ReachedStates, there: ExistingStates | None) -> dict[str, Any]:
-    """Return the coverage as a JSON document. With `there`, it also contains the shares of all existing states."""
+    """Return the coverage as a JSON document. If `there` is given, the document also contains the shares of all
+    existing states.
+    """
     missing = not_taken(reached)
     document = {
         "schema": SCHEMA,

@@ -1,7 +1,7 @@
-"""Collect the states, inputs and branches of agents that runs reach, while their traces are judged.
+"""Collect the states, inputs and branches of agents that runs reach, while the step judge examines their traces.
 
-The reference core of the step judge (`harness.checker.steps`) follows the steps of each agent. Foreign agents and
-recorded runs therefore count like our agents and simulated runs.
+The step judge (`harness.checker.steps`) follows the steps of each agent with its reference core. Programs of other
+authors and recorded runs therefore count like our agents and simulated runs.
 """
 
 from collections import Counter
@@ -36,7 +36,9 @@ KEPT = 20_000
 
 @dataclass
 class ReachedStates:
-    """The agent states that runs reached, and the (state, input) pairs whose input had an effect or an answer."""
+    """The agent states that runs reached, and the reached (state, input) pairs in which the input had an effect or an
+    answer.
+    """
 
     states: set[int] = field(default_factory=set)
     pairs: set[int] = field(default_factory=set)
@@ -59,7 +61,7 @@ class ReachedStates:
 
 
 class CoverageWatcher:
-    """Records the reached states, pairs and branches after each judged step of an agent. Callers may replace
+    """A recorder of the reached states, pairs and branches after each judged step of an agent. Callers may replace
     `reached`.
     """
 
@@ -109,8 +111,9 @@ class CoverageWatcher:
 
 
 def _given(run: HandlerRun | None, held: HeldBlockOrder) -> tuple[Any, ...] | None:
-    """Return the abstract form of an input for an agent that held these blocks, or None if no bounds contain such an
-    input.
+    """Return the abstract form of an input to an agent that held the blocks in `held`.
+
+    Return None for inputs that do not exist within any bounds.
     """
     if run is None:
         return None

@@ -1,9 +1,9 @@
 """Write a path through the state graph as a scenario.
 
-Scripted events, fates and lateness make the simulation take the same path. A message takes LATENCY_S. If the order of
-arrivals on the path requires it, or if the next instant follows soon, a fate gives the message another delay. A message
-that is lost on the path has the fate `drop`. A timer expires on time, unless messages of the instant before arrive
-later.
+Scripted events, message fates and timer delays make the simulation take the same path. A message takes LATENCY_S. If
+the path requires a different order of arrivals, or if the next instant follows soon, a fate gives the message a
+different delay. A message that is lost on the path has the fate `drop`. A timer expires on time, unless messages of the
+previous instant arrive later.
 """
 
 from collections import Counter, defaultdict
@@ -40,8 +40,8 @@ Document = dict[str, Any]
 
 @dataclass(eq=False)
 class _BroadcastOnPath:
-    """A broadcast message that an agent sends on a path through the state graph. `count` numbers the messages of one
-    name from this sender.
+    """A broadcast message that an agent sends on a path through the state graph. `count` numbers this sender's messages
+    of the same type.
     """
 
     sender: int
@@ -54,8 +54,8 @@ class _BroadcastOnPath:
 
 @dataclass
 class _AgentOnPath:
-    """An agent on a path through the state graph. `timers` maps each running timer to its number among all started
-    timers and to its expiry.
+    """An agent on a path through the state graph. `timers` gives for each running timer its number among all started
+    timers, and its expiry.
     """
 
     agent_id: int
@@ -73,7 +73,7 @@ class CompletionInterval(NamedTuple):
 
 
 class PathScript:
-    """Follows a path through the state graph step by step, and collects the entries of a scenario."""
+    """A writer that follows a path through the state graph step by step, and collects the entries of a scenario."""
 
     def __init__(self, graph: StateGraph, path: Sequence[int]) -> None:
         self._graph = graph
@@ -144,7 +144,7 @@ class PathScript:
             agents = [agents[old] for old in move.places]
 
     def _move(self, before: int, after: int) -> SwarmTransition:
-        """Return a transition from one state to the next, without message losses if there is one."""
+        """Return a transition from one state to the next. Prefer a transition without lost messages."""
         state, wanted = self._graph.states[before], self._graph.states[after]
         for lossy in (False, True) if self._swarm.bounds.network == "lossy" else (False,):
             for actions in self._swarm.actions(state):
@@ -155,7 +155,7 @@ class PathScript:
     # Times
 
     def _runs(self) -> list[TimerRun]:
-        """Return all runs of timers on the path."""
+        """Return the interval in which each timer on the path runs."""
         running: dict[tuple[int, int], tuple[int, float]] = {}
         runs = []
         for instant, move in enumerate(self._moves):
@@ -255,7 +255,7 @@ class PathScript:
         return flights
 
     def _in_wave_order(self, wave: MessageRound, flights: Sequence[_BroadcastOnPath]) -> list[_BroadcastOnPath]:
-        """Return the broadcasts in the order in which the round of messages lists them."""
+        """Return the broadcasts in the order in which this round of messages lists them."""
         left, ordered = list(flights), []
         for place, message in wave.air:
             sender = self._agents[place].agent_id
@@ -265,7 +265,7 @@ class PathScript:
         return ordered
 
     def _hear(self, wave: MessageRound, air: Sequence[_BroadcastOnPath], acted_s: float) -> list[_BroadcastOnPath]:
-        """Let each agent receive its messages of one round, and return their answers."""
+        """Deliver the messages of one round to each agent, and return the answers."""
         answers: dict[int, list[_BroadcastOnPath]] = {}
         received: set[int] = set()
         for place, heard in enumerate(wave.heard):
@@ -308,7 +308,7 @@ class PathScript:
         self._fates.append({"message": flight.name, "sender": flight.sender, **whom, "count": flight.count, **what})
 
     def _delay_open_timers(self) -> None:
-        """Delay each timer that still runs at the end of the path, so that it expires after this end."""
+        """Delay each timer that still runs at the end of the path, so that it does not expire before this end."""
         for agent in self._agents:
             for number, ends_s in agent.timers.values():
                 if ends_s <= self._end_s:

@@ -1,9 +1,9 @@
 """Compute the mission second of each step of a path, and the timestamps of its blocks.
 
-Each instant is a variable, and each duration is a bound on the difference of two variables. The longest paths over
-these bounds are a solution (Bellman and Ford), if a solution exists.
+The time of each instant is a variable, and each timer duration is a constraint on the difference of two variables. If a
+solution exists, the longest paths in the graph of these constraints are a solution (Bellman and Ford).
 
-If any of two blocks may be the older one (`Bounds.clocks_any`), the scenario contains the timestamps of the events.
+If either of two blocks may be the older one (`Bounds.clocks_any`), the scenario contains the timestamps of the events.
 """
 
 from collections.abc import Collection, Sequence
@@ -22,7 +22,7 @@ FIRST_INSTANT_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class TimerRun:
-    """A timer that ran from one step of a path to another. If it has not `ended`, it ran at least until the later
+    """A timer that ran from one step of a path to a later step. If it has not `ended`, it ran at least until the later
     step.
     """
 
@@ -58,13 +58,13 @@ def windows_s(count: int, runs: Sequence[TimerRun]) -> list[tuple[float, float]]
 
 
 def _solve(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: bool) -> list[float] | None:
-    """Return the earliest times that satisfy all timers, or None if there are none."""
+    """Return the earliest times that satisfy the constraints of all timers. Return None if there are none."""
     later = _bounds(count, runs, apart_s, punctual=punctual)
     return _longest_paths([FIRST_INSTANT_S] * count, later)
 
 
 def _longest_paths(at_least: Sequence[float], later: Sequence[tuple[int, int, float]]) -> list[float] | None:
-    """Return the length of the longest path to each step in the graph of constraints `later`, or None if a cycle makes
+    """Return the length of the longest path to each step in the constraint graph `later`. Return None if a cycle makes
     it infinite.
     """
     longest = [*at_least]
@@ -80,7 +80,9 @@ def _longest_paths(at_least: Sequence[float], later: Sequence[tuple[int, int, fl
 
 
 def _bounds(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: bool) -> list[tuple[int, int, float]]:
-    """Return the constraints as (step, other step, minimum number of seconds from the first to the other)."""
+    """Return the constraints on the times of steps, each as (step, second step, minimum number of seconds between
+    them).
+    """
     later: list[tuple[int, int, float]] = [(number - 1, number, apart_s) for number in range(1, count)]
     for run in runs:
         if run.ended:
@@ -93,7 +95,7 @@ def _bounds(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: b
 
 
 class BlockAges:
-    """The required order of the timestamps of all blocks on a path.
+    """The required age order of all blocks on a path, from which their timestamps are chosen.
 
     Blocks are identified by their ordinals in the states of the path. The ordinals change along the path.
     """
@@ -117,16 +119,17 @@ class BlockAges:
             self._events = [self._events[ordinal - 1] for ordinal in (*blocks, *rest)]
 
     def require_older(self, oldest: int, others: Collection[int]) -> None:
-        """Require that one block is older than the others. Block 0 is the inception block, which is always the
-        oldest.
+        """Require that one block is older than the given other blocks. Block 0 is the inception block, which is always
+        the oldest.
         """
         for other in others if oldest else ():
             self._older[self._events[other - 1]].add(self._events[oldest - 1])
 
     def date(self, events: list[dict[str, Any]]) -> bool:
-        """Choose timestamps of the events that meet the requirements, and return true.
+        """Choose timestamps for the events that satisfy the required age order, and return true.
 
-        Return False if no timestamps meet them, because they contradict each other or an agent's clock would go back.
+        Return False if no timestamps satisfy it, because the requirements contradict each other or an agent's clock
+        would go back.
         """
         for index, event in enumerate(events):
             own = [earlier for earlier in range(index) if events[earlier]["agent"] == event["agent"]]

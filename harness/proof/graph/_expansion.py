@@ -18,11 +18,12 @@ _Following = dict[Actions, dict[int, None]]
 
 
 class StateExpansion(NamedTuple):
-    """The successors of one state of the swarm. `ways` is the number of transitions that lead to them.
+    """The successors of one state of the swarm. `ways` is the number of transitions from the state to its successors.
 
-    The other fields have the numbers of successors without losses and without new blocks. `by_timer` has, for each
-    timer that may expire next, the possible successors: the timer expires alone, or timers that must expire at the same
-    moment expire before it or with it. `crossing` has the successors if several timers expire at once.
+    The other fields contain the numbers of those successors that need no lost message and no new block. `by_timer` has,
+    for each timer that may expire next, the possible successors: the timer expires alone, or timers that must expire at
+    the same moment expire before it or together with it. `crossing` has the successors if several timers expire at
+    once.
     """
 
     ways: int
@@ -45,14 +46,17 @@ def expanded(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpan
 
 
 def quiet(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
-    """Return the successors of a state that need no lost message and no new block. The number of transitions is 0."""
+    """Return the successors of a state that need no lost message and no new block.
+
+    The field `ways` of the result is 0.
+    """
     return _quiet(swarm, state, number_of, [*swarm.ending(state)], {})
 
 
 def _quiet(
     swarm: ModelSwarm, state: State, number_of: NumberOf, ending: Sequence[Actions], known: _Following
 ) -> StateExpansion:
-    """Return the successors without message losses and new blocks. `known` may already contain some of them."""
+    """Return the successors that need no lost message and no new block. `known` may already contain some of them."""
     after = {
         actions: known[actions]
         if actions in known
@@ -70,7 +74,9 @@ def _quiet(
 
 @contextmanager
 def cycles_left_alone() -> Iterator[None]:
-    """Switch off Python's garbage collection. Processes that are forked inside the context keep it off."""
+    """Switch off Python's garbage collection of reference cycles. Processes that are forked inside the context keep it
+    off.
+    """
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -89,7 +95,7 @@ class StateStore(Sequence[State]):
         self._numbers: dict[bytes, int] = {}
 
     def add(self, state: State) -> int:
-        """Return the number of a state. A new state is added with the next number."""
+        """Return the number of a state. If the state is new, add it with the next free number."""
         row = self._form.pack(*state)
         number = self._numbers.setdefault(row, len(self._rows))
         if number == len(self._rows):
@@ -110,8 +116,9 @@ class StateStore(Sequence[State]):
 
 
 class SuccessorStore(Sequence[ByTimer]):
-    """The successors of each state, grouped by the timer that expires. One flat array holds them all: a count, then
-    that many successors.
+    """The successors of each state, grouped by the timer that expires.
+
+    One flat array holds all groups. Each group is its number of successors, followed by the successors.
     """
 
     def __init__(self) -> None:

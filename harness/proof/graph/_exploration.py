@@ -1,7 +1,8 @@
-"""Explore all reachable states of a swarm, breadth first. The first violation found therefore has a shortest path.
+"""Explore all reachable states of a swarm, breadth first. Therefore no violation has a shorter path than the first one
+that is found.
 
-The graph also keeps the successors of each state without losses and new blocks (`quiet`), for
-`../questions/_convergence.py`.
+The graph also keeps, for each state, the successors that need no lost message and no new block (`quiet`).
+`../questions/_convergence.py` uses them.
 """
 
 from array import array
@@ -20,10 +21,10 @@ NO_PARENT = -1
 
 @dataclass
 class StateGraph:
-    """The explored states by number, and the predecessor of each. If `ended` is "complete", the graph contains all
-    reachable states.
+    """The explored states by number, and the predecessor of each state. If `ended` is "complete", the graph contains
+    all reachable states.
 
-    `quiet` and `crossing` have the fields `by_timer` and `crossing` of the expansion of each state.
+    `quiet` and `crossing` contain the fields `by_timer` and `crossing` of each state's `StateExpansion`.
     """
 
     swarm: ModelSwarm
@@ -52,7 +53,7 @@ class StateGraph:
         return None if self.flawed is None else self.swarm.flaw(self.states[self.flawed])
 
     def reach(self, state: State, parent: int) -> int:
-        """Return the number of a state. A new state is added and checked for violations."""
+        """Return the number of a state. If the state is new, add it and check it for violations."""
         number = self.states.add(state)
         if number == len(self.parents):
             self.parents.append(parent)
@@ -64,7 +65,7 @@ class StateGraph:
         return number
 
     def take_in(self, expansion: StateExpansion) -> None:
-        """Add the successors of the first state whose successors are still unknown. The order is that of the state
+        """Store the successors of the next state. Call this method once for each state, in the order of the state
         numbers.
         """
         number = len(self.quiet)
@@ -129,7 +130,7 @@ def _all(graph: StateGraph, budget: ExplorationBudget, workers: Workers | None) 
 def _expansions(graph: StateGraph, budget: ExplorationBudget, workers: Workers | None) -> Iterator[StateExpansion]:
     """Yield the successors of each state in order. States that are added during the loop are included.
 
-    Workers compute many states.
+    If there are many waiting states, worker processes compute their successors.
     """
     swarm, states, looked_at = graph.swarm, graph.states, 0
     while looked_at < len(states):

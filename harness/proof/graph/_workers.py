@@ -1,8 +1,8 @@
-"""Explore states in worker processes on all cores.
+"""Explore states in worker processes on all processor cores.
 
-The workers are forked processes. Each starts with the agents and steps that are known at the fork, and continues to
-number local states and zones itself. A message between two processes uses the receiver's number if the sender knows it.
-Otherwise it uses the sender's number, the first time together with its definition.
+The workers are forked processes. Each worker starts with the agents and steps that are known at the fork. From then on,
+it numbers new local states and zones itself. A message between two processes uses the receiver's number of a state if
+the sender knows it. Otherwise it uses the sender's number, the first time together with its definition.
 
 The main process distributes the states in order, and adds their successors in the same order. The result is therefore
 the same as with one process.
@@ -43,7 +43,9 @@ Definitions = list[tuple[int, Any]]
 
 
 class StateBatch(NamedTuple):
-    """States that one process sends to another, in a flat array, with the definitions that the receiver lacks."""
+    """States that one process sends to another process, in a flat array, with the definitions that the receiver does
+    not have yet.
+    """
 
     locals: Definitions
     zones: Definitions
@@ -52,7 +54,9 @@ class StateBatch(NamedTuple):
 
 
 class ForkedStates(NamedTuple):
-    """A task for a worker: idle states in which agents have different chains. The answer is a `NeededVotes`."""
+    """A task for a worker: idle states in which agents have different chains. The worker answers with a
+    `NeededVotes`.
+    """
 
     batch: StateBatch
 
@@ -61,8 +65,8 @@ class SuccessorBatch(NamedTuple):
     """A worker's answer: the successors of some states. `batch` contains the successors that this worker has not sent
     before.
 
-    `expansions` has for each state the number of new successors in `batch`, and its expansion with the worker's
-    numbers.
+    `expansions` contains for each state the number of new successors in `batch`, and its `StateExpansion` with the
+    worker's state numbers.
     """
 
     batch: StateBatch
@@ -87,7 +91,7 @@ class WorkerAnswer(NamedTuple):
 
 
 class _NumberTranslator:
-    """The mapping between the state numbers of two processes. Numbers below `alike` are the same in both."""
+    """A translator between the state numbers of two processes. Numbers below `alike` are equal in both processes."""
 
     def __init__(self, alike: int, content: Callable[[int], Any], adopt: Callable[[Any], int]) -> None:
         self._content = content
@@ -97,7 +101,9 @@ class _NumberTranslator:
         self._new_definitions: Definitions = []
 
     def code(self, ours: int) -> int:
-        """Return the other process's number for our number. A value below -1 means our own number."""
+        """Return the other process's number for our number. If it is unknown, return a value below -1, which stands for
+        our own number.
+        """
         code = self._codes.get(ours)
         if code is None:
             code = self._codes[ours] = -ours - 2
@@ -155,8 +161,8 @@ class _StateTranslator:
 
 
 class _WorkerFunction:
-    """The function of a worker process. It returns the successors of the states in a task, or the votes that they
-    need.
+    """The function that a worker process runs. It returns the successors of the states in a task, or the number of
+    votes that they need.
     """
 
     def __init__(self, swarm: ModelSwarm) -> None:
@@ -240,8 +246,8 @@ class _WorkerHandle:
     def expansions_of(
         self, answer: SuccessorBatch, first: int, add: Callable[[State, int], int]
     ) -> Iterator[StateExpansion]:
-        """Yield the successors of each state in the answer of a worker, beginning with state number `first`. `add`
-        stores new states in the graph.
+        """Yield the successors of each state in a worker's answer. The first state has the number `first`. `add` stores
+        new states in the graph.
         """
         fresh = iter(self._translator.decode(answer.batch))
         numbers = self._numbers
@@ -262,7 +268,7 @@ Give = Callable[["_WorkerHandle", Sequence[State]], None]
 
 
 class Workers:
-    """A pool of `size` worker processes. They start with the first task and stop when the context ends."""
+    """A pool of `size` worker processes. They start with the first task and stop at the end of the `with` block."""
 
     def __init__(self, swarm: ModelSwarm, size: int) -> None:
         self._swarm = swarm
@@ -290,14 +296,14 @@ class Workers:
         return sum(other.steps for other in self._handles)
 
     def pays_off(self, waiting: int) -> bool:
-        """Return true if this number of waiting states is large enough to use the workers."""
+        """Return true if the number of waiting states is large enough for a use of the workers."""
         return self._size > 1 and waiting >= WORTH_WORKERS
 
     def expansions(
         self, states: Sequence[State], first: int, add: Callable[[State, int], int], check: Check = lambda: None
     ) -> Iterator[StateExpansion]:
-        """Yield the successors of each state in order, beginning with number `first`. `states` may grow during the
-        loop.
+        """Yield the successors of each state in order. The first state has the number `first`. `states` may grow during
+        the loop.
         """
         for other, number, answer in self._answers(_WorkerHandle.give, states, check, first):
             assert isinstance(answer, SuccessorBatch)
@@ -314,10 +320,10 @@ class Workers:
     def _answers(
         self, give: Give, states: Sequence[State], check: Check, first: int = 0
     ) -> Iterator[tuple[_WorkerHandle, int, SuccessorBatch | NeededVotes]]:
-        """Yield the answers of the workers in the order of the tasks, each with its worker and the number of its first
-        state.
+        """Yield the answers of the workers in the order of the tasks. Each comes with its worker and the number of its
+        first state.
 
-        `states` may grow meanwhile.
+        `states` may grow during the loop.
         """
         if not self._handles:
             with signals_blocked():  # a Ctrl-C inside a fork must not end it halfway
@@ -348,7 +354,7 @@ class Workers:
 
 
 def _answered(busy: Mapping[int, _WorkerHandle], *, wait_for_one: bool) -> list[int]:
-    """Return the finished tasks, each as the number of its first state. The list is empty if none finishes within
+    """Return the finished tasks, each as the number of its first state. Return an empty list if no task finishes within
     WAIT_S seconds.
     """
     ready = wait([other.connection for other in busy.values()], timeout=WAIT_S if wait_for_one else 0)

@@ -1,13 +1,14 @@
-"""Explore each agent alone. The agent may receive every message that any agent can ever have sent (network model
-`any`).
+"""Explore each agent alone (network model `any`). The agent may receive every message that any agent can ever have
+sent.
 
 A message may be lost, duplicated, delayed for any time and overtaken. An agent can therefore receive each sent message
-at any moment, any number of times, and depends on other agents in no other way. The only exception: no agent can
-mention a block before it is completed.
+at any moment, any number of times. It depends on other agents in no other way, with one exception: no agent can mention
+a block before it is completed.
 
 The local states of each agent and the sent messages are collected together until no new ones appear. The result
-contains everything that a run can show. It may contain more, because one run need not be able to send all these
-messages. A property that holds for all of them holds. If it does not, a violation is not shown.
+contains every local state and message of every possible run. It may contain more, because one run need not be able to
+send all these messages. A property that holds for all of these states therefore holds for every run. If it does not
+hold for one of them, a violation in a run is not yet proven.
 """
 
 import time
@@ -34,7 +35,7 @@ Said = tuple[int, int]
 
 @dataclass
 class SingleAgentFigures:
-    """The figures of an exploration of single agents. `said` counts the different messages of all senders."""
+    """The numeric results of an exploration of single agents. `said` counts the different messages of all senders."""
 
     bounds: Bounds
     states: int = 0
@@ -64,7 +65,7 @@ def collect(
 ) -> SingleAgentFigures:
     """Collect all agent states and messages, until a limit of memory or time is reached or a violation is found.
 
-    `keep` is called with the local states of each division of the blocks.
+    `keep` is called with the local states for each distribution of the blocks among the agents.
     """
     collected, began = SingleAgentFigures(bounds), time.monotonic()
     try:
@@ -94,9 +95,9 @@ def collect(
 
 
 def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator[tuple[int, ...]]:
-    """Yield each distribution of the blocks: a tuple with the agent that completes each block.
+    """Yield each distribution of the blocks among the agents: a tuple that contains the author of each block.
 
-    Agents that are alike are interchangeable, except the captured one.
+    Two distributions count as one if they differ only by an exchange of agents. The captured agent is not exchanged.
     """
     others = [agent_id for agent_id in range(1, agents + 1) if agent_id != captured]
     begun: list[tuple[int, ...]] = [()]
@@ -172,7 +173,7 @@ class _BlockDistribution:
                 busy |= self._lied_to(agent_id, states)
 
     def count(self) -> None:
-        """Add the figures of this distribution to the totals, even if it is incomplete."""
+        """Add the numeric results of this distribution to the totals, even if its exploration is incomplete."""
         collected = self._collected
         collected.states += len(self._came_from)
         collected.looked_at += self._looked_at
@@ -197,7 +198,7 @@ class _BlockDistribution:
             collected.shown.add("4")
 
     def _act(self, state: Alone) -> None:
-        """Explore the steps that an agent takes without a message, such as the expiry of a timer."""
+        """Explore the steps of an agent that need no message, such as the expiry of a timer."""
         agent_id, local, zone, completed = state
         if self._known_flaw(local):
             return
@@ -228,8 +229,8 @@ class _BlockDistribution:
             self._heard.hears(said[0], self.local.messages[said[1]])
 
     def _lied_to(self, agent_id: int, states: list[Alone]) -> bool:
-        """Deliver all messages of the attacker to an agent in each of these states. Return true if any message is
-        new.
+        """Deliver all messages of the attacker to an agent in each of these states. Return true if at least one message
+        is new.
         """
         if self._heard is None:
             return False

@@ -1,7 +1,7 @@
-"""Find the blocks that an agent's state contains, and exchange them for other blocks.
+"""Find the blocks that an agent's state contains, and replace them with different blocks.
 
-Agents compare blocks for equality. Only a tie of phase 2 (Algorithm 15) compares their ages. If any of two blocks may
-be the older one (`Bounds.clocks_any`), the identity of blocks makes no difference.
+Agents only compare blocks for equality, with one exception: a tie of phase 2 (Algorithm 15) compares their ages. If
+either of two blocks may be the older one (`Bounds.clocks_any`), the identity of blocks makes no difference.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -34,7 +34,7 @@ class NumberedBlocks:
         self._block = cache(make)
 
     def note_completed(self, blocks: Iterable[Completed]) -> None:
-        """Add blocks that an agent completed in this or in another process."""
+        """Add blocks that an agent completed in this process or in a worker process."""
         for block_hash, agent_id, ordinal in blocks:
             if block_hash not in self.makers:
                 self.makers[block_hash] = agent_id
@@ -59,23 +59,25 @@ class NumberedBlocks:
         self._chains[chain_hash] = ordinals
 
     def named(self, digest: bytes) -> Ordinals:
-        """Return the numbers of the blocks that belong to a hash: one block for a block hash, all blocks of the chain
+        """Return the numbers of the blocks to which a hash refers: one block for a block hash, all blocks of the chain
         for a chain hash.
 
-        Empty for other hashes.
+        The result is empty for an unknown hash.
         """
         number = self.numbers.get(digest)
         return self._chains.get(digest, ()) if number is None else (number,)
 
     def named_in(self, message: Message) -> frozenset[int]:
-        """Return the numbers of the blocks that a message contains, or whose chain it mentions."""
+        """Return the numbers of the blocks that a message contains or names, and of all blocks in the chains that it
+        names.
+        """
         fields = (getattr(message, name) for name in message.__slots__)
         hashes = [field.block_hash if isinstance(field, Block) else field for field in fields]
         return frozenset().union(*(self.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     def of(self, snapshot: Snapshot) -> Ordinals:
-        """Yield the numbers of the blocks in a state. The order is the same for all states that differ only in their
-        blocks. Numbers may repeat.
+        """Return the numbers of the blocks in a state, each once. Two states that differ only in their blocks list them
+        in the same order.
         """
         return tuple(dict.fromkeys(self._all(snapshot)))
 
@@ -93,7 +95,9 @@ class NumberedBlocks:
         yield from sorted(numbers[candidate] for candidate in candidates if candidate)
 
     def exchanged(self, snapshot: Snapshot, exchange: Mapping[int, int]) -> Snapshot:
-        """Return the state after an exchange of its blocks. `exchange` maps old block numbers to new ones."""
+        """Return the state with its blocks replaced. `exchange` maps the number of each present block to the number of
+        its replacement.
+        """
         us = {self._block(old).timestamp_us: self._block(new).timestamp_us for old, new in exchange.items()}
 
         def block_of(block: Block) -> Block:

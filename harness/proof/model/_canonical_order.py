@@ -1,8 +1,7 @@
-"""Choose one order of the agents to represent all equivalent orders, because equal agents and blocks are
-interchangeable.
+"""Choose one order of the agents to represent all equivalent orders. Equal agents and equal blocks are interchangeable.
 
-The order is chosen by the states of the agents and the relations of their timers, and never by the numbers of states
-and zones. It is therefore the same on all machines, and for any order of exploration.
+The choice depends on the states of the agents and the relations of their timers, but not on the numbers of states and
+zones. The order is therefore the same on all machines, and for any order of exploration.
 """
 
 from collections import defaultdict
@@ -21,9 +20,9 @@ Places = tuple[int, ...]
 
 
 class OrderedAgents(NamedTuple):
-    """Agents in their chosen order, their timers in this order, and the previous position of each agent.
+    """The agents in their chosen order, their timers in the same order, and the previous position of each agent.
 
-    `blocks` has the previous ordinal of each block, from 1. It is empty if the blocks keep their ordinals.
+    `blocks` contains the previous ordinal of each block, counted from 1. It is empty if the blocks keep their ordinals.
     """
 
     agents: tuple[int, ...]
@@ -42,8 +41,9 @@ Above it, equivalent states may count as several states.
 
 
 class CanonicalOrder:
-    """Puts agents into their canonical order. `name_of` returns the ID by which the agent at one position knows another
-    agent.
+    """A sorter that puts agents into their canonical order.
+
+    `name_of` returns the ID that the agent at one position uses for the agent at a second position.
     """
 
     def __init__(self, local: LocalStates, zones: ZoneTable, name_of: Callable[[int, int], int]) -> None:
@@ -85,16 +85,16 @@ class CanonicalOrder:
         return OrderedAgents(agents, zone, places, blocks)
 
     def _blocks(self, agents: Sequence[int]) -> Ordinals:
-        """Return the numbers of the agents' blocks in the order in which they first occur.
+        """Return the numbers of the agents' blocks in the order in which the blocks first occur.
 
-        Empty if blocks keep their ordinals.
+        The result is empty if blocks keep their ordinals.
         """
         if not self._local.bounds.blocks_alike:
             return ()
         return tuple(dict.fromkeys(chain.from_iterable(map(self._local.about, agents))))
 
     def _timers(self, locals_: Sequence[int]) -> list[range]:
-        """Return, for each agent, the range of its timers in the swarm's list of timers."""
+        """Return, for each agent, the range of its timers in the list of all timers of the swarm."""
         timers, first = [], 1
         for local in locals_:
             end = first if local == DEAD else first + len(self._local.known[local].running)
@@ -103,8 +103,8 @@ class CanonicalOrder:
         return timers
 
     def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range]) -> Iterator[Places]:
-        """Yield all orders in which the descriptions of the agents ascend. Agents with equal descriptions appear in
-        every order.
+        """Yield all orders of the agents in which their descriptions ascend. Agents with equal descriptions appear in
+        every possible order.
         """
         known, pattern = self._local.known, self._local.pattern
         bounds = self._zones.bounds(zone) if zone else [()]
@@ -145,8 +145,8 @@ class CanonicalOrder:
         return not timers[group[0]] and len({locals_[place] for place in group}) == 1
 
     def _with_blocks(self, locals_: Sequence[int], looks: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """Return the descriptions of the agents, extended with the positions of the agents that hold the same
-        blocks.
+        """Return the description of each agent, extended with the positions of its blocks in the states of
+        all agents.
         """
         ranks = {look: rank for rank, look in enumerate(sorted(set(looks)))}
         where: dict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -163,7 +163,8 @@ class CanonicalOrder:
     ) -> bool:
         """Return true if these agents with equal descriptions differ only in their blocks.
 
-        Then they have no timers, and are in no tally or in the same ones.
+        They then have no timers and have counted no agent. Each vote count of the remaining agents contains all of them
+        or none.
         """
         if timers[group[0]]:
             return False
@@ -174,7 +175,7 @@ class CanonicalOrder:
         )
 
     def _named(self, local: int, place: int) -> list[set[int]]:
-        """Return, for each kind of vote count, the positions of the agents that the agent at `place` has counted."""
+        """Return, for each type of vote count, the positions of the agents that the agent at `place` has counted."""
         if local == DEAD:
             return [set() for _ in NAMES_OF_OTHERS]
         snapshot = self._local.known[local].snapshot
@@ -185,8 +186,8 @@ class CanonicalOrder:
         return name - 2 if name - 2 < place else name - 1
 
     def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:
-        """Return a description of the state with this order of the agents. If two descriptions differ, the states
-        differ.
+        """Return a description of the state with this order of the agents. Two orders with equal descriptions lead to
+        the same state.
         """
         new_place = {old: new for new, old in enumerate(places)}
         named = [
@@ -199,7 +200,7 @@ class CanonicalOrder:
         return named, about, [[matrix[i][j] for j in order] for i in order]
 
     def _renamed(self, local: int, new: int, places: Places) -> int:
-        """Return the state of an agent at its new position, with the new IDs of the other agents."""
+        """Return the state of an agent at its new position. The IDs of the other agents in it are the new ones."""
         if local == DEAD:
             return local
         if not self._local.known[local].names_others:
@@ -212,7 +213,9 @@ class CanonicalOrder:
 
 
 def _groups(looks: Sequence[Any]) -> list[list[int]]:
-    """Return groups of agents with equal descriptions, as positions, in ascending order of their descriptions."""
+    """Return the agents grouped by equal descriptions, as positions. The groups are in ascending order of their
+    descriptions.
+    """
     in_order = sorted(range(len(looks)), key=looks.__getitem__)
     return [list(group) for _, group in groupby(in_order, looks.__getitem__)]
 

@@ -12,9 +12,10 @@ from ucp.state import AgentState
 class PropertyViolation:
     """A violation: its kind, and a sentence that describes it.
 
-    The kind is a characteristic ("2", "3", "4"), "hang", "crash" or "steps". With an attacker it can also be "name" (an
-    agent accepted a message in the name of another vehicle), "revoked" (of a revoked vehicle), or "honest" (a block in
-    the name of an honest vehicle). `handler` is the handler of a wrong step.
+    The kind is a characteristic ("2", "3", "4"), "hang", "crash" or "steps". With an attacker, there are three further
+    kinds. "name": an agent accepted a message in the name of a vehicle that did not send it. "revoked": an agent
+    accepted a message of a revoked vehicle. "honest": an agent holds a block in the name of an honest vehicle that did
+    not complete it. `handler` is the handler of a wrong step.
     """
 
     kind: str
@@ -27,9 +28,9 @@ FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
 
 
 def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> PropertyViolation | None:
-    """Return the violation in an agent's state, or None.
+    """Return the violation in an agent's state. Return None if the state has no violation.
 
-    `completed` maps each completed block hash to the agent that completed the block. Blocks in the name of the
+    `completed` maps the hash of each completed block to the agent that completed it. Blocks in the name of the
     `captured` agent need not have been completed.
     """
     aside = [block.block_hash for block in (*state.blocks_to_be_committed, *state.reconcile_stack)]
@@ -54,13 +55,17 @@ def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | N
 
 
 def is_deceived(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> bool:
-    """Return true if the agent holds a block in the name of the captured agent that this agent never completed."""
+    """Return true if the agent holds a block in the name of the captured agent that the captured agent never
+    completed.
+    """
     if captured is None:
         return False
     return any(maker == captured and made not in completed for made, maker in _makers(state).items())
 
 
 def _makers(state: AgentState) -> dict[bytes, int]:
-    """Return the author of each block that an agent holds, by block hash, as the blocks name them."""
+    """Return the author of each block that an agent holds, as the block itself names the author. The key is the block
+    hash.
+    """
     held = (*state.chain, *state.blocks_to_be_committed, *state.reconcile_stack)
     return {block.block_hash: block.agent_id for block in held}

@@ -55,7 +55,7 @@ class SwarmTransition(NamedTuple):
     """A transition between two states of the swarm: its actions, the new state, and the previous positions of the
     agents.
 
-    `wave` is the last round of received messages.
+    `wave` is the last round of received messages in the transition.
     """
 
     actions: Actions
@@ -69,9 +69,10 @@ class SwarmTransition(NamedTuple):
 
 
 class _InstantResult(NamedTuple):
-    """The states of all agents after one instant of simultaneous actions and all messages that they cause.
+    """The states of all agents after one instant: simultaneous actions, and all messages that they cause.
 
-    `running` has the previous number of each running timer. The other fields describe how the outcome came about.
+    `running` contains the previous number of each running timer. `started` and `way` describe how the result came
+    about.
     """
 
     agents: tuple[int, ...]
@@ -81,8 +82,8 @@ class _InstantResult(NamedTuple):
 
 
 class _InstantResults(NamedTuple):
-    """The results of one instant, independent of the exact timer values: expired timers, new blocks, remaining faults,
-    and agents.
+    """The results of one instant that do not depend on exact timer values: expired timers, new blocks, remaining
+    faults, and agents.
     """
 
     ended: tuple[int, ...]
@@ -95,8 +96,8 @@ class _InstantResults(NamedTuple):
 class ModelSwarm:
     """The states of a swarm within `bounds`, and the transitions between them.
 
-    If `every_count`, all existing local states are explored: answers are received in each order although they are only
-    counted, and counts are kept although they decide nothing.
+    If `every_count` is true, the swarm explores all existing local states. Agents then receive answers in each order
+    even if they only count them, and keep vote counts even if these decide nothing.
     """
 
     def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
@@ -121,11 +122,13 @@ class ModelSwarm:
     # Actions of an instant
 
     def firsts(self, state: State) -> list[AgentAction]:
-        """Return the next possible timer expiries, one action for each possible result."""
+        """Return the timer expiries that may happen next. There is one action for each possible result of an expiry."""
         return [action for actions in self._firsts(state) for action in actions]
 
     def _firsts(self, state: State) -> list[list[AgentAction]]:
-        """Return the next possible timer expiries: for each timer, a list of actions with the possible results."""
+        """Return the timer expiries that may happen next: for each timer, a list of actions, one for each possible
+        result.
+        """
         running = self._running(state[AGENTS:])
         if not self.bounds.timers_any:
             running = tuple([running[first - 1] for first in self.zones.firsts(state[ZONE])])
@@ -140,7 +143,8 @@ class ModelSwarm:
     def alternatives(self, state: State) -> Iterator[tuple[AgentAction, frozenset[AgentAction]]]:
         """Yield each timer that may expire next, with the set of all timers that must expire at the same moment.
 
-        The ages of blocks are chosen for all results, because no agent can choose the older one of two blocks.
+        If an expiry has several results because the ages of blocks are open, each combination of results comes
+        separately. No agent can choose the older one of two blocks.
         """
         firsts = self._firsts(state)
         tied = [(index,) for index in range(len(firsts))] if self.bounds.timers_any else self.zones.tied(state[ZONE])
@@ -150,8 +154,8 @@ class ModelSwarm:
                 yield actions[0], frozenset(actions)
 
     def ending(self, state: State) -> Iterator[Actions]:
-        """Yield all sets of timers that may expire at the same moment, with at most one timer per agent. Some sets may
-        be impossible.
+        """Yield all sets of timers that may expire at the same moment, with at most one timer per agent. Some of these
+        sets may be impossible.
 
         Without crossing, timers expire one by one.
         """
@@ -166,7 +170,8 @@ class ModelSwarm:
                         yield actions
 
     def actions(self, state: State, ending: Iterable[Actions] | None = None) -> Iterator[Actions]:
-        """Yield all sets of actions that may happen at the same moment: expiring timers, and the completion of blocks.
+        """Yield all sets of actions that may happen at the same moment. An action is the expiry of a timer, the
+        completion of a block, a fault, or an action of the attacker.
 
         `ending` has the sets of timers, if they are known.
         """
@@ -197,7 +202,7 @@ class ModelSwarm:
             yield from self._of_the_captor(self.captor, state)
 
     def _of_the_captor(self, captor: Attacker, state: State) -> Iterator[Actions]:
-        """Yield the actions of the attacker: first the capture of a vehicle, then each forged message with any set of
+        """Yield the actions of the attacker: the capture of a vehicle, and later each forged message with any set of
         receivers.
         """
         assert self.bounds.captured is not None, "it has somebody's keys"
@@ -212,7 +217,9 @@ class ModelSwarm:
         return self.coincidences(state, actions) <= state[LEFT] % LOSSES // COINCIDENCES
 
     def coincidences(self, state: State, actions: Sequence[AgentAction]) -> int:
-        """Return how many independent events must coincide so that these actions happen next and at the same moment."""
+        """Return the number of independent events that must coincide so that these actions happen next and at the same
+        moment.
+        """
         if self.bounds.timers_any:
             return 0
         ended = self._ended(state[AGENTS:], actions)
@@ -227,7 +234,7 @@ class ModelSwarm:
     def _unlike(self, state: State, choices: Iterable[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:
         """Yield one representative of each group of equivalent choices of agents.
 
-        Idle agents in the same local state are equivalent, unless a tally distinguishes them.
+        Idle agents in the same local state are equivalent, unless a vote count distinguishes them.
         """
         known = self.local.known
         locals_ = state[AGENTS:]
@@ -244,7 +251,7 @@ class ModelSwarm:
     # Results of an instant
 
     def after(self, state: State, actions: Actions, lossy: bool) -> Iterator[State]:
-        """Yield the possible states after these simultaneous actions. There are none if their timers cannot expire
+        """Yield the possible states after these simultaneous actions. Yield nothing if their timers cannot expire
         together.
         """
         key = state[AGENTS:], actions, self._most_lost(state, lossy)
@@ -277,8 +284,8 @@ class ModelSwarm:
         return ANY_NUMBER if self.bounds.losses is None else state[LEFT] // LOSSES
 
     def _can_be(self, state: State, instant: _InstantResults) -> bool:
-        """Return true if these timers can expire together and before all others. Each must already be able to expire
-        first alone.
+        """Return true if these timers can expire together and before all other timers. Each of them must be able to
+        expire first when it expires alone.
         """
         if len(instant.ended) < 2 or self.bounds.timers_any:
             return True
@@ -299,7 +306,9 @@ class ModelSwarm:
                 yield self._order.of(outcome.agents, zone)
 
     def _left(self, state: State, actions: Sequence[AgentAction], instant: _InstantResults) -> int:
-        """Return the number of faults that may still occur after these actions."""
+        """Return what remains after these actions (faults, forged messages, coincidences and losses), encoded in one
+        number.
+        """
         left = (state[LEFT] & instant.left) - instant.lies * LIES
         if self.bounds.coincidences:
             left -= self.coincidences(state, actions) * COINCIDENCES
@@ -340,15 +349,15 @@ class ModelSwarm:
         return tuple(running)
 
     def _ended(self, locals_: tuple[int, ...], actions: Sequence[AgentAction]) -> tuple[int, ...]:
-        """Return the numbers of the expired timers. Each number is a position in the list of the swarm's timers,
-        counted from 1.
+        """Return the numbers of the expired timers. The number of a timer is its position in the swarm's list of
+        timers, counted from 1.
         """
         ended = [(action.place, action.number) for action in actions if action.what == "timer"]
         running = self._running(locals_)
         return tuple(sorted([running.index(timer) + 1 for timer in ended]))
 
     def _running_of(self, locals_: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
-        """Return all running timers of the swarm in order, each as (position of the agent, timer)."""
+        """Return all running timers of the swarm in order, each as a pair (position of the agent, timer)."""
         known = self.local.known
         return tuple(
             [(place, timer) for place, local in enumerate(locals_) if local != DEAD for timer in known[local].running]
@@ -367,12 +376,12 @@ class ModelSwarm:
     # Properties of a state
 
     def flaw(self, state: State) -> PropertyViolation | None:
-        """Return the violation in the state of one of the agents, or None."""
+        """Return the violation in the state of one of the agents. Return None if there is no violation."""
         known = self.local.known
         return next((flaw for local in state[AGENTS:] if local != DEAD and (flaw := known[local].flaw)), None)
 
     def violated(self, state: State) -> Iterator[str]:
-        """Yield the characteristics that an attacker has violated although all agents follow the protocol.
+        """Yield the characteristics that the attacker has violated although all honest agents follow the protocol.
 
         An agent accepted a message that the vehicle never sent, or holds a block in its name that it never completed.
         """
@@ -385,7 +394,7 @@ class ModelSwarm:
         return all(local == DEAD or self.local.known[local].idle for local in state[AGENTS:])
 
     def chains(self, state: State) -> set[tuple[int, ...]]:
-        """Return the different chains that the agents hold."""
+        """Return the set of different chains that living agents hold."""
         return {self.local.known[local].chain for local in state[AGENTS:] if local != DEAD}
 
 

@@ -1,12 +1,12 @@
-"""Compute the possible results of one moment: timers expire or blocks are completed, and then all messages are
-received.
+"""Compute the possible results of one moment. In it, timers expire or blocks are completed, and then agents receive all
+messages.
 
-Some agents act before they receive messages of the others, so their messages cross. The messages are received, in any
-order of their senders. Then the answers to them are received, and so on until no agent sends a message. A lossy
-receiver may lose any of the messages. If an agent sends several messages in one action, they arrive in order. Answers
-can overtake each other.
+Several agents may act before they receive each other's messages, so their messages cross. The agents receive the
+messages in any order of the senders. Then they receive the answers to them, and so on until no agent sends a message. A
+receiver in a lossy network may lose any of the messages. If an agent sends several messages in one action, they arrive
+in order. Answers can overtake each other.
 
-For each agent, the outcomes of all orders and all losses are computed once. Mostly there are one or two.
+For each agent, the results of all orders and all losses are computed once. Mostly there are only one or two results.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,7 +19,8 @@ from harness.proof.model._local_steps import LocalStates
 from harness.proof.model._snapshot import AgentStep, Started
 
 ReceivedMessages = tuple[tuple[int, int], ...]
-"""The messages that reach an agent in one round: (ID of the sender for this agent, message), in the order of senders.
+"""The messages that reach an agent in one round: (ID of the sender for this agent, message), in the order of
+senders.
 """
 
 
@@ -36,8 +37,8 @@ MOST_SEEN = 500
 class AgentAction(NamedTuple):
     """An action of one agent: "timer" with the timer's number, "complete" with the block's number, or a fault.
 
-    It can also be an action of the attacker: the agent is "captured", or receives a "lie", a message with this number.
-    If a timer has several possible results because any block may be the older one, `way` selects the result.
+    It can also be an action of the attacker: the agent is "captured", or receives a "lie", a forged message with this
+    number. If a timer has several possible results because any block may be the older one, `way` selects the result.
     """
 
     place: int
@@ -51,17 +52,17 @@ Actions = tuple[AgentAction, ...]
 
 
 class AgentStates(NamedTuple):
-    """The states of all agents, and the timers that each agent started in the present moment."""
+    """The states of all agents, and the timers that each agent started in the present instant."""
 
     locals: tuple[int, ...]
     started: tuple[Started, ...]
 
 
 class MessageRound(NamedTuple):
-    """A round of messages: the sent messages as (position of the sender, message), and the messages that each agent
-    received.
+    """A round of messages: the sent messages, and the messages that each agent received.
 
-    `heard` has, for each place, the indices of the received messages in `air`, in order.
+    `air` contains each sent message as a pair (position of the sender, message). `heard` contains, for each agent, the
+    indices of its received messages in `air`, in order.
     """
 
     before: "MessageRound | None"
@@ -70,9 +71,10 @@ class MessageRound(NamedTuple):
 
 
 class FinalMessageRound(NamedTuple):
-    """The last round of messages in an instant, with all rounds before it.
+    """The last round of messages in an instant. It is linked to all rounds before it.
 
-    `lost` is the number of lost messages, counted for each receiver. It is 0 if losses are not counted.
+    `lost` is the number of lost messages, where a message counts once for each receiver that loses it. It is 0 if
+    losses are not counted.
     """
 
     lost: int
@@ -95,7 +97,7 @@ _Outcome = tuple[AgentStep, tuple[int, ...]]
 
 
 class InstantOutcomes:
-    """Computes and caches the possible results of simultaneous actions."""
+    """A cache of the possible results of simultaneous actions, which computes missing results."""
 
     def __init__(self, local: LocalStates, bounds: Bounds, *, every_order: bool = False) -> None:
         self._local = local
@@ -117,7 +119,7 @@ class InstantOutcomes:
         return self._names[place][other]
 
     def order_matters(self, local: int, place: int, wave: MessageRound, heard: Sequence[int]) -> bool:
-        """Return true if the state of the agent at `place` depends on the order of the messages that it receives in
+        """Return true if the state of the agent at `place` depends on the order in which it receives the messages of
         this round.
         """
         reached = tuple((self.name_of(wave.air[number][0], place), wave.air[number][1]) for number in sorted(heard))
@@ -126,10 +128,10 @@ class InstantOutcomes:
     def outcomes(
         self, locals_: tuple[int, ...], actions: Sequence[AgentAction], most_lost: int, *, tell: bool
     ) -> dict[AgentStates, FinalMessageRound]:
-        """Return the possible results of these actions. For each result, keep the rounds of messages with the fewest
-        losses.
+        """Return the possible results of these actions. Of several ways to the same result, keep the one with the
+        fewest lost messages.
 
-        The rounds of messages are included if requested.
+        The rounds of messages are included if `tell` is true.
         """
         agents, started = list(locals_), [()] * len(locals_)  # type: list[int], list[Started]
         air: list[tuple[int, int]] = []
@@ -196,7 +198,7 @@ class InstantOutcomes:
     def _choices(
         self, known: dict[_Agent, list[_Choice]], agent: _Agent, said: _Said, lossy: bool, answered: bool
     ) -> list[_Choice]:
-        """Return the possible results of a round of messages for one agent, and cache them."""
+        """Return the possible results of a round of messages for one agent, and store them in the cache."""
         place, local, before = agent
         if local == DEAD:
             return [(DEAD, (), (), (), 0)]
@@ -216,7 +218,7 @@ class InstantOutcomes:
         return choices
 
     def _still(self, before: Started, step: AgentStep) -> Started:
-        """Return the timers that an agent started in the present moment and that still run."""
+        """Return the timers that an agent started in the present instant and that are still running."""
         if not before and not step.started:
             return ()
         if step.local == DEAD:
@@ -228,8 +230,8 @@ class InstantOutcomes:
         return tuple([item for item in started if item[0] in running])
 
     def _outcomes_of(self, local: int, heard: ReceivedMessages, lossy: bool, answered: bool) -> list[_Outcome]:
-        """Return the possible steps of an agent that receives these messages, each with an order of messages that leads
-        to it.
+        """Return the possible steps of an agent that receives these messages. Each step comes with an order of messages
+        that leads to it.
         """
         key = local, heard, lossy, answered
         outcomes = self._outcomes.get(key)
@@ -260,11 +262,11 @@ class InstantOutcomes:
         return outcomes
 
     def _when_counting(self, local: int, heard: ReceivedMessages, lossy: bool) -> list[_Outcome] | None:
-        """Return the possible steps if the agent only counts these messages, so that their order has no effect.
-        Otherwise return None.
+        """Return the possible steps if the agent only counts these messages, so that their order has no effect. Return
+        None otherwise.
 
-        Whether an answer counts depends on parts of the state that are no tally, and on whether
-        its sender is in the tally already (docs/explanation/proof.md).
+        Whether an answer counts depends on the state without the vote counts, and on whether its sender is already in
+        the vote count (docs/explanation/proof.md).
         """
         hear, only_counts, lets_be = self._local.hear, self._local.only_counts, self._local.lets_be
         matter, others = [], []
@@ -330,10 +332,10 @@ class InstantOutcomes:
             yield step, (*way, *others)
 
     def _that_matter(self, local: int, heard: ReceivedMessages) -> list[int]:
-        """Return the indices of the messages that may change the agent or cause an answer, possibly after some of the
-        other messages.
+        """Return the indices of the messages that may change the agent or cause an answer, possibly only after some of
+        the remaining messages.
 
-        All of them, if a wrong agent reaches more and more states by the same messages.
+        Return all indices if a wrong agent reaches more and more states by the same messages.
         """
         seen, waiting = {local}, [local]
         matter: set[int] = set()
@@ -352,21 +354,23 @@ class InstantOutcomes:
 
 
 def _keep(ways: dict[AgentStates, FinalMessageRound], there: AgentStates, way: FinalMessageRound) -> None:
-    """Store this way to a result if it is the first one, or loses fewer messages than the stored one."""
+    """Store this way to a result if no way is stored yet, or if it loses fewer messages than the stored one."""
     known = ways.get(there)
     if known is None or way.lost < known.lost:
         ways[there] = way
 
 
 def _keep_fullest(ways: dict[_Key, tuple[int, ...]], there: _Key, way: tuple[int, ...]) -> None:
-    """Store this way to a result if it is the first one, or receives more different messages than the stored one."""
+    """Store this way to a result if no way is stored yet, or if it contains more different messages than the stored
+    one.
+    """
     known = ways.get(there)
     if known is None or len(set(way)) > len(set(known)):
         ways[there] = way
 
 
 def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[_Choice, ...]]:
-    """Return all combinations of the agents' choices that lose at most this number of messages in all."""
+    """Return all combinations of the agents' choices in which at most `most_lost` messages are lost in total."""
     combined: list[tuple[int, tuple[_Choice, ...]]] = [(0, ())]
     for of_one in choices:
         combined = [
@@ -379,8 +383,8 @@ def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[
 
 
 def _is_covered(step: AgentStep, outcomes: Sequence[_Outcome]) -> bool:
-    """Return true if another possible step differs only by more sent messages. The network may lose these, so the
-    result is covered.
+    """Return true if a second possible step differs only by additional sent messages. The network may lose these
+    messages, so the second step covers this one.
     """
     return any(
         other.local == step.local

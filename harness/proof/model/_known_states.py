@@ -28,10 +28,10 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 
 @dataclass(frozen=True, slots=True)
 class KnownLocalState:
-    """A known state of the agent with this ID.
+    """A known state of the agent with the ID `agent_id`.
 
-    `waits` is true if the agent reconciles. `chain` has the numbers of its chain's blocks. `deceived` is true if it
-    holds a block in the captured vehicle's name that this vehicle never completed.
+    `waits` is true if the agent reconciles. `chain` contains the numbers of the blocks in its chain. `deceived` is true
+    if the agent holds a block in the name of the captured vehicle that the captured vehicle never completed.
     """
 
     agent_id: int
@@ -53,8 +53,8 @@ class KnownLocalState:
 class KnownStates:
     """An index of all known states of single agents.
 
-    If `bounds.reduced`, parts of the state that no handler reads before they are written again count as initial.
-    docs/explanation/proof.md explains why this is sound.
+    If `bounds.reduced` is true, states that differ only in irrelevant parts are one state. A part is irrelevant if
+    every handler writes it before any handler reads it. docs/explanation/proof.md explains why this is sound.
     """
 
     def __init__(self, bounds: Bounds, blocks: NumberedBlocks) -> None:
@@ -70,7 +70,9 @@ class KnownStates:
         self._renamed: dict[tuple[int, Names], int] = {}
 
     def number(self, agent_id: int, state: AgentState, taken: Snapshot, flaw: PropertyViolation | None) -> int:
-        """Return the number of an agent's state. `taken` is its snapshot, in which equal parts are shared."""
+        """Return the number of an agent's state. `taken` is the snapshot of the state, in which equal parts
+        are shared.
+        """
         snapshot = taken
         if self.bounds.reduced:
             forgotten = WHAT_ONLY_CHECKS_READ | dead(state)
@@ -100,7 +102,7 @@ class KnownStates:
         return number
 
     def with_tallies(self, local: int, tallies: Snapshot) -> int:
-        """Return the number of the state that has other vote counts but is otherwise equal."""
+        """Return the number of the state that is equal to this one except for its vote counts, which are `tallies`."""
         known = self.known[local]
         snapshot = known.snapshot | {name: self._parts.part(name, value) for name, value in tallies.items()}
         key = self._parts.key(known.agent_id, known.flaw, snapshot)
@@ -127,14 +129,14 @@ class KnownStates:
         return number
 
     def renamed_back(self, local: int, names: Names) -> int:
-        """Return the number of the state before it was `renamed` with these IDs."""
+        """Return the number of the state that becomes this state when it is `renamed` with these IDs."""
         return self.renamed(local, _back(names))
 
     def names_in_order(self, local: int, sender: int) -> Names | None:
-        """Return new IDs for the other agents, so that counted agents come first and the sender follows. Return None if
-        no change is needed.
+        """Return new IDs for the other agents that put the counted agents first, and the sender after them. Return None
+        if no change is needed.
 
-        If IDs make no difference, the behaviour of an agent is the same except for these names
+        If IDs make no difference, the behaviour of an agent is the same except for these IDs
         (docs/explanation/proof.md).
         """
         known = self.known[local]
@@ -145,10 +147,10 @@ class KnownStates:
         return None if tuple(in_order) == self.others else _back(tuple(in_order))
 
     def first_names(self, local: int, senders: Sequence[int]) -> Names | None:
-        """Return new IDs for the other agents, so that these senders come first in their order. Return None if no
-        change is needed.
+        """Return new IDs for the other agents that put these senders first, in their order. Return None if no change is
+        needed.
 
-        It is also None if the agent already distinguishes other agents in its tallies.
+        Also return None if the agent's vote counts already distinguish other agents.
         """
         known = self.known[local]
         if not self._nameless or known.names_others or known.flaw is not None:
@@ -157,7 +159,7 @@ class KnownStates:
         return None if in_order == self.others else _back(in_order)
 
     def _names_others(self, snapshot: Snapshot) -> bool:
-        """Return true if the state contains the ID of any other agent."""
+        """Return true if a vote count in the state contains some, but not all, of the other agents."""
         return any(0 < len(snapshot[name]) < len(self.others) for name in NAMES_OF_OTHERS)
 
 

@@ -1,7 +1,7 @@
 """Compute and cache the step that the real agent takes for each of its states and each input.
 
-To compute a step, the agent is put into the state and given the input, and its new state is taken. This module contains
-no protocol logic.
+To compute a step, the module puts the agent into the state, gives it the input, and takes a snapshot of its new state.
+This module contains no protocol logic.
 """
 
 from collections.abc import Iterator
@@ -86,7 +86,9 @@ class LocalStates(KnownStates):
     # Steps
 
     def hear(self, local: int, sender: int, message: int) -> AgentStep:
-        """Return the step of an agent that receives a message. `sender` is the ID by which it knows the sender."""
+        """Return the step of an agent that receives a message. `sender` is the ID that the agent uses for the sender of
+        the message.
+        """
         key = local, sender, message
         step = self._steps.get(key)
         if step is None:
@@ -133,7 +135,7 @@ class LocalStates(KnownStates):
         return self.ends(local, timer)[way].step
 
     def ends(self, local: int, timer: int) -> list[TimerResult]:
-        """Return the possible results of the expiry of a timer.
+        """Return the possible results when a timer expires.
 
         There are several only if the agent compares the ages of blocks and any block may be the older one.
         """
@@ -151,10 +153,10 @@ class LocalStates(KnownStates):
         return ends
 
     def older(self, local: int, timer: int, way: int) -> tuple[int, frozenset[int]]:
-        """Return the block that must be older than other blocks for this result of a timer, with these other blocks. 0
-        is the inception block.
+        """Return the block that must be the oldest candidate for this result of a timer, and the candidates that must
+        be newer.
 
-        There are no others if the agent does not compare ages.
+        Block 0 is the inception block. The set is empty if the agent does not compare ages.
         """
         ends = self.ends(local, timer)
         oldest = ends[way].oldest
@@ -202,8 +204,8 @@ class LocalStates(KnownStates):
         return step
 
     def _got_in(self, local: int, message: int) -> PropertyViolation | None:
-        """Return a violation if the agent accepts a forged message: of an excluded vehicle, in another vehicle's name,
-        or with another vehicle's block.
+        """Return a violation if the agent accepts a forged message: of an excluded vehicle, in the name of a third
+        vehicle, or with a block in the receiver's own name. Return None otherwise.
         """
         known, said = self.known[local], self.messages[message]
         revoked = self.agents.revoked[known.agent_id]
@@ -224,11 +226,11 @@ class LocalStates(KnownStates):
         return self.agents.gate.sealed(said, NOW_S, genuine=genuine)
 
     def state(self, local: int) -> AgentState:
-        """Return the agent in this state. The object is valid until the next step is computed."""
+        """Return the agent's data in this state. The object is valid until the next step is computed."""
         return self._restored(local).state
 
     def inputs(self) -> Iterator[tuple[int, Message | str | None, AgentStep]]:
-        """Yield each known state with each input that was tried in it, and the resulting step.
+        """Yield each known state with each input that was tried in it, and with the step that the input caused.
 
         The input is a received message, the name of an expired timer, or None for a completed block.
         """
@@ -253,7 +255,10 @@ class LocalStates(KnownStates):
         flaw: PropertyViolation | None = None,
         to_reference: Give | None = None,
     ) -> AgentStep:
-        """Compute a step of the agent. `to_reference` gives the same input to the reference, in decrypted form."""
+        """Compute the step of the agent for the input that `give` gives.
+
+        `to_reference` gives the same input to the reference implementation, in decrypted form.
+        """
         self.steps += 1
         before = self.known[local]
         agent = self.agents.new(before.agent_id) if boots else self._restored(local)
@@ -293,7 +298,9 @@ class LocalStates(KnownStates):
         return AgentStep(local, sent, started)
 
     def _results(self, agent: Agent) -> tuple[tuple[int, ...], Started]:
-        """Take the messages that the agent sent in a step, and the timers that it started. The timers then run on."""
+        """Remove and return the messages that the agent sent in a step, and the timers that it started. The timers
+        continue.
+        """
         sent = tuple(self.message(message) for _, message in agent.messages_to_send())
         started = tuple(
             (number, round((timer.deadline - agent.state.now) * MICROSECONDS))
@@ -307,8 +314,8 @@ class LocalStates(KnownStates):
     def _check_counts(
         self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, results: tuple[tuple[int, ...], Started]
     ) -> None:
-        """Raise UncoveredError if the step differs at another time, after more reconciles or messages, or with
-        dictionaries in reverse order.
+        """Raise UncoveredError if the step depends on the time, on the number of earlier reconciles or messages, or on
+        the order of dictionaries.
         """
         for count, now_s in OTHER_COUNTS:
             agent = self._counting[agent_id]
@@ -335,7 +342,7 @@ class LocalStates(KnownStates):
     # Blocks
 
     def pattern(self, local: int) -> int:
-        """Return a state that represents all states that differ only in their blocks."""
+        """Return one state that represents all states that differ from it only in their blocks."""
         if not self.bounds.blocks_alike or local == DEAD:
             return local
         pattern = self._patterns.get(local)
@@ -344,8 +351,8 @@ class LocalStates(KnownStates):
         return pattern
 
     def about(self, local: int) -> Ordinals:
-        """Return the numbers of the blocks in a state, each once. The order is the same for all states that differ only
-        in their blocks.
+        """Return the numbers of the blocks in a state, each once. Two states that differ only in their blocks list them
+        in the same order.
         """
         about = self._about.get(local)
         if about is None:
@@ -374,7 +381,7 @@ class LocalStates(KnownStates):
     # States
 
     def settled(self, local: int) -> int:
-        """Return the state with simplified vote counts, for the time after all answers have arrived or are lost."""
+        """Return the state with simplified vote counts. Use it when all answers have arrived or are lost."""
         return self._tallies.settled(local)
 
     def _intern(
@@ -387,10 +394,10 @@ class LocalStates(KnownStates):
         *,
         keep: bool = True,
     ) -> int:
-        """Store an agent's state and return its number. `taken` is its snapshot, and `before` the number of the state
-        before the step.
+        """Store an agent's state and return its number. `taken` is its snapshot, and `before` is the snapshot before
+        the step.
 
-        If `keep`, the agent gets further inputs in this state.
+        If `keep` is true, the agent gets further inputs in this state.
         """
         snapshot = self._parts.of(taken, before or {})
         if keep:
@@ -398,14 +405,14 @@ class LocalStates(KnownStates):
         return self.number(agent_id, agent.state, snapshot, flaw)
 
     def content(self, local: int) -> Content:
-        """Return the definition of a state, which another process can read."""
+        """Return the definition of a state in a form that a different process can read."""
         known = self.known[local]
         flaw = known.flaw if known.flaw is not None and known.flaw.kind in FLAWS_OF_STEPS else None
         initiated = self.blocks.named(known.snapshot["top_chain_hash_at_initiation"])
         return known.agent_id, known.snapshot, flaw, initiated
 
     def adopt(self, content: Content) -> int:
-        """Return the number of a state that another process found."""
+        """Return the number of a state that a different process found."""
         agent_id, snapshot, flaw, initiated = content
         self.blocks.learn_chain_hash(snapshot["top_chain_hash_at_initiation"], initiated)
         agent = self.agents.put_into(agent_id, snapshot)

@@ -24,9 +24,9 @@ MOST_AT_ONCE = 100
 
 
 class RealAgents:
-    """One real agent for each ID. If a vehicle is captured, they are agents that check signatures.
+    """One real agent for each ID. If a vehicle is captured, the agents check signatures.
 
-    If agents are `nameless`, each has its own settings, and the ID of the first agent.
+    If agents are `nameless`, each agent has its own settings, but all of them have the ID of the first agent.
     """
 
     def __init__(self, bounds: Bounds) -> None:
@@ -43,12 +43,12 @@ class RealAgents:
 
     @property
     def gate(self) -> SecurityGate:
-        """The keys of the mission and of the attacker. Only valid if a vehicle is captured."""
+        """The keys of the mission and of the attacker. They exist only if a vehicle is captured."""
         assert self._gate is not None, "a vehicle is captured"
         return self._gate
 
     def new(self, agent_id: int, after_each: Callable[[], None] | None = None, *, revoked: bool = False) -> Agent:
-        """Return a new agent. If `after_each` is given, it is called after each handler run, and the agent writes
+        """Return a new agent. If `after_each` is given, the agent calls it after each handler run, and writes
         traces.
         """
         handlers = wrong_handlers(self._bounds.quirks, Random(0))
@@ -67,7 +67,9 @@ class RealAgents:
         return agent
 
     def leave_in(self, agent_id: int, snapshot: Snapshot) -> None:
-        """Record that the agent is now in this state, so that the next change of its state can be smaller."""
+        """Record that the agent is now in this state. The next call of `put_into` then replaces only the parts that
+        differ.
+        """
         self._left_in[agent_id] = snapshot
 
     def made(self, ordinal: int) -> Block:
@@ -81,7 +83,7 @@ class RealAgents:
 
 
 def _calling(handler: EventHandler[Any], after: Callable[[], None]) -> EventHandler[Any]:
-    """Return a handler that runs the given handler and then calls `after`."""
+    """Return a handler that runs `handler` and then calls `after`."""
 
     def run(*inputs: Any) -> str:
         branch = handler.run(*inputs)
@@ -102,8 +104,9 @@ def log(agent: Agent, ordinal: int) -> None:
 
 
 def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
-    """End a timer of an agent. `oldest` becomes the oldest candidate of reconcile phase 2, except for the inception
-    block.
+    """End a timer of an agent. If `oldest` is given, it becomes the oldest candidate of reconcile phase 2.
+
+    The inception block always stays older.
     """
     if oldest is not None:
         counted = agent.state.reconcile_response_dictionary[oldest]
@@ -112,7 +115,9 @@ def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
 
 
 def end_at_once(agent: Agent) -> str | None:
-    """End the timers that expire before any message can arrive. Return the text of a handler's exception, or None."""
+    """End the timers that expire before any message can arrive. Return the text of an exception in a handler, or None
+    if there is none.
+    """
     now_s = agent.state.now
     try:
         for _ in range(MOST_AT_ONCE):
@@ -126,7 +131,9 @@ def end_at_once(agent: Agent) -> str | None:
 
 
 def is_heard(agent: Agent, datagram: bytes, before: Snapshot) -> bool:
-    """Return true if a datagram, which the agent should drop, changes its state."""
+    """Return true if an agent accepts a datagram that it should drop: its state changes, it sends a message, or it does
+    not count the datagram as dropped.
+    """
     dropped = agent.dropped.total()
     agent.receive_datagram(datagram, NOW_S)
     unchanged = all(value is before[name] for name, value in take(agent, before).items())

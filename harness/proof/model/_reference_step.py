@@ -1,8 +1,8 @@
 """Compare one step of an agent with the same step of the independent reference implementation.
 
-The reference is put into the state of the agent and given the same input. Each step is therefore judged by itself, even
-a wrong step without consequences. With the core in use this compares core and reference in every state within the
-bounds.
+The reference is put into the state of the agent and gets the same input. Each step is therefore judged separately, even
+a wrong step without consequences. For the installed agent core, this compares the core with the reference in every
+state within the bounds.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,10 +50,12 @@ class ReferenceComparison:
         to_reference: Give,
         name_of: Callable[[str], str],
     ) -> tuple[str, str] | None:
-        """Return the handler and a sentence if the agent's step differs from the reference's step, otherwise None.
+        """Return the handler and a sentence if the agent's step differs from the reference's step. Return None
+        otherwise.
 
-        `before` is the state in which the agent was given the input, None if it had just been switched on. `give` gives
-        the input to an agent, `to_reference` to the reference. `name_of` returns the name of a block, given its hash.
+        `before` is the state in which the agent got the input. It is None if the agent had just been switched on.
+        `give` gives the input to an agent, and `to_reference` gives it to the reference. `name_of` returns the name of
+        a block, given its hash.
         """
         reference = self._reference(agent_id, before)
         error = _error_of(reference, to_reference)
@@ -141,7 +143,7 @@ TIMERS = ("voting_timer", "phase_one_timer", "phase_two_timer", "phase_three_tim
 
 
 def _state(state: ReferenceState | AgentState) -> tuple[Any, ...]:
-    """Return the parts of a state that affect later steps. Vote counts matter only while their timer runs."""
+    """Return the parts of a state that affect subsequent steps. Vote counts matter only while their timer runs."""
     votes, phase_1, phase_2, phase_3, _ = (timer.active for timer in state.timers)
     return (
         [block.block_hash for block in state.chain],

@@ -1,11 +1,11 @@
-"""Compute the shape of an agent's state: states that differ only in the identity of blocks and agents have the same
+"""Compute the shape of an agent's state. States that differ only in the identity of blocks and agents have the same
 shape.
 
 A shape refers to blocks by their order among the blocks that the agent holds: by timestamp, then by hash. Blocks that
 the agent does not hold are only counted. Like the reductions of `_local_steps.py`, a shape omits parts that are written
-before they are read, and keeps of a vote only whether more agents approve. It also omits the block under construction,
-because an event fills a block within the bounds. Shapes therefore compare the states of any run of any mission with the
-states that exist within bounds.
+before they are read. Of a vote it keeps only whether more agents approve than disapprove. It also omits the block under
+construction, because within the bounds each event fills a block. Shapes can therefore compare the states of any run of
+any mission with the states that exist within bounds.
 """
 
 from bisect import bisect_left
@@ -56,9 +56,10 @@ class HeldBlockOrder:
         )
 
     def number(self, shape: Shape) -> int:
-        """Return a number for a shape: 64 bits of its hash, which are the same on all machines.
+        """Return a number for a shape: 64 bits of its hash, which are equal on all machines.
 
-        `shape` is the rest of a state that holds these blocks, or such a state together with an input.
+        `shape` describes a state that holds these blocks, without the blocks. It can also describe such a state
+        together with an input.
         """
         number = self._numbers.get(shape)
         if number is None:
@@ -67,14 +68,14 @@ class HeldBlockOrder:
         return number
 
     def height(self, chain_hash: bytes) -> int:
-        """Return the number of blocks in the chain up to this chain hash, or ELSEWHERE if the agent does not know
-        it.
+        """Return the number of blocks in the chain up to this chain hash. Return ELSEWHERE if the agent does not know
+        the chain hash.
         """
         return self._heights.get(chain_hash, ELSEWHERE)
 
     def ordinal(self, block_hash: bytes) -> int:
-        """Return the position of this block among the blocks that the agent holds, or ELSEWHERE if it does not hold the
-        block.
+        """Return the position of this block among the blocks that the agent holds. Return ELSEWHERE if it does not hold
+        the block.
         """
         return self._ordinals.get(block_hash, ELSEWHERE)
 
@@ -83,9 +84,9 @@ class HeldBlockOrder:
         return bisect_left(self._blocks, (timestamp_us, block_hash))
 
     def input_shape(self, message: Message) -> Shape:
-        """Return the shape of a message, seen from this agent.
+        """Return the shape of a message, as this agent sees it.
 
-        It refers to the blocks that the agent holds, and omits the sender.
+        The shape refers to the blocks that the agent holds, and omits the sender.
         """
         values = [getattr(message, name) for name in type(message).__slots__]
         about = next((value for value in values if isinstance(value, bytes | Block)), b"")
@@ -110,8 +111,8 @@ class HeldBlockOrder:
 
 
 def shape_of(state: AgentState | ReferenceState, held: HeldBlockOrder) -> Shape:
-    """Return the shape of a state, apart from the held blocks. Together with the shape of `held`, it identifies the
-    state.
+    """Return the shape of a state without the held blocks. Together with the shape of `held`, it identifies
+    the state.
     """
     shape: list[Any] = [state.reconcile_in_progress]
     for timer in state.timers:

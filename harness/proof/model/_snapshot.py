@@ -70,8 +70,8 @@ def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
 
 
 def dead(state: AgentState) -> Snapshot:
-    """Return the initial values of those parts of the state that every handler of a correct agent writes before it
-    reads them.
+    """Return the irrelevant parts of the state with their initial values. Every handler of a correct agent writes these
+    parts before it reads them.
     """
     parts: Snapshot = {}
     if not state.voting_timer.active:
@@ -90,7 +90,8 @@ def dead(state: AgentState) -> Snapshot:
 def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) -> None:
     """Set the agent to the state of a snapshot. Each running timer of the agent gets the deadline RUNNING_S.
 
-    `since` is the agent's present state, if it is known. Parts that both have are not changed.
+    `since` is the agent's present state, if it is known. Parts that are the same in `since` and in the snapshot are not
+    changed.
     """
     state = vars(agent.state)
     set_counts(agent, 0, NOW_S)
@@ -116,20 +117,20 @@ def set_counts(agent: Agent, count: int, now_s: float) -> None:
 
 
 def reverse_dictionaries(agent: Agent) -> None:
-    """Reverse the order of each dictionary in the agent's state. A key of a state has no such order."""
+    """Reverse the order of each dictionary in the agent's state. The key of a state does not contain this order."""
     state = vars(agent.state)
     state.update({name: dict(reversed(value.items())) for name, value in state.items() if type(value) is dict})
 
 
 def _is_part(part: Any, value: Any) -> bool:
-    """Return true if the value equals the stored part of a state."""
+    """Return true if `value` equals `part`, a stored part of a state."""
     if isinstance(part, _TimerState | _ChainState):
         return part.is_of(value)
     return bool(part == value)
 
 
 def replaced(value: Any, hash_of: Callable[[bytes], bytes], block_of: Callable[[Block], Block]) -> Any:
-    """Return a part of the state in which hashes and blocks are replaced."""
+    """Return a part of the state with replaced hashes and blocks. `hash_of` and `block_of` return the replacements."""
     if isinstance(value, bytes):
         return hash_of(value)
     if isinstance(value, Block):
@@ -166,7 +167,7 @@ class _TimerState:
         return self.running or self.paused
 
     def is_of(self, timer: Timer) -> bool:
-        """Return true if the timer is unchanged. A timer that was started again counts as changed."""
+        """Return true if the timer is unchanged. A timer that was restarted counts as changed."""
         return (timer.deadline == RUNNING_S) == self.running and timer.active == (self.running or self.paused)
 
     def put_back(self, timer: Timer) -> None:
@@ -257,9 +258,7 @@ class AgentStep(NamedTuple):
 
 
 class TimerResult(NamedTuple):
-    """A possible result of the expiry of a timer. `oldest` is the phase 2 candidate that must be the oldest for this
-    result.
-    """
+    """A possible result when a timer expires. For this result, `oldest` must be the oldest candidate of phase 2."""
 
     step: AgentStep
     oldest: bytes | None
@@ -290,21 +289,21 @@ class SnapshotParts:
         return part
 
     def of(self, snapshot: Snapshot, like: Snapshot) -> Snapshot:
-        """Return the state `snapshot` with its parts replaced by equal stored parts. All parts of `like` must be stored
-        already.
+        """Return the state `snapshot` with its parts replaced by equal stored parts. All parts of `like` must already
+        be stored.
         """
         return {
             name: value if like.get(name, self) is value else self.part(name, value) for name, value in snapshot.items()
         }
 
     def key(self, agent_id: int, flaw: PropertyViolation | None, snapshot: Snapshot) -> tuple[Any, ...]:
-        """Return a key of a state that consists of stored parts. Equal states have equal keys."""
+        """Return a key of a state whose parts are all stored. Equal states have equal keys."""
         numbers = self._numbers
         return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
 
     def anonymous(self, agent_id: int, flaw: PropertyViolation | None, snapshot: Snapshot) -> int:
-        """Return a number for a state that does not depend on the identity of voters and responders. The number is the
-        same on all machines.
+        """Return a number for a state that ignores which agents voted or answered. The number is the same on all
+        machines.
         """
         parts = [
             len(value) if name in NAMES_OF_OTHERS else self._digests[id(value)] for name, value in snapshot.items()
@@ -329,7 +328,7 @@ class ReductionError(Exception):
 def check_that_nothing_is_lost(before: Snapshot, state: AgentState) -> None:
     """Raise ReductionError if the agent has lost a block.
 
-    Otherwise the completed blocks could not be forgotten (characteristic 2).
+    If no agent loses a block, a state need not contain the list of completed blocks (characteristic 2).
     """
     held = {block.block_hash for name in ("blocks_to_be_committed", "reconcile_stack") for block in before[name]}
     held.update(before["chain"].parts["_block_of_hash"])

@@ -1,6 +1,6 @@
 """Simplify the vote counts in an agent's state to the decision that they lead to.
 
-Agents whose tallies differ, but always lead to the same decision, count as one local state. See
+Two agents with different vote counts that always lead to the same decision have the same local state. See
 docs/explanation/proof.md.
 """
 
@@ -15,10 +15,11 @@ TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "re
 
 
 class VoteCounts:
-    """The simplified vote counts of each agent state after all messages of a moment.
+    """The simplified vote counts of each agent state after all messages of an instant.
 
-    `ends` returns the possible results of a timer's expiry for a state's number and the timer's index in `timers`. The
-    real agent computes them. If `every_count`, the counts of a reconcile are kept.
+    `ends` is a function of the number of a state and the index of a timer in `timers`. It returns the possible results
+    of the timer's expiry, which the real agent computes. If `every_count` is true, the vote counts of a reconcile are
+    not simplified.
     """
 
     def __init__(
@@ -39,7 +40,7 @@ class VoteCounts:
     def settled(self, local: int) -> int:
         """Return the number of the state with simplified vote counts.
 
-        At the end of an instant, all answers have arrived or are lost, so the voters no longer matter.
+        At the end of an instant, all answers have arrived or are lost, so the identity of the voters no longer matters.
         """
         number = self._settled.get(local)
         if number is None:
@@ -71,7 +72,7 @@ class VoteCounts:
     def _of_phase_1(self, local: int) -> Snapshot:
         """Return the simplified vote count of phase 1, if the missing answers cannot change its result.
 
-        Otherwise it is empty.
+        Otherwise return an empty snapshot.
         """
         snapshot = self._states.known[local].snapshot
         yes, no = (snapshot["reconcile_vote_count"][answer] for answer in ("yes", "no"))
@@ -85,13 +86,13 @@ class VoteCounts:
         return {"reconcile_vote_count": {"yes": yes, "no": no}, "reconcile_responders": {*self._states.others}}
 
     def _ends_with(self, local: int, yes: int, no: int) -> Sequence[TimerResult]:
-        """Return the possible results of phase 1 if it ends with these numbers of votes."""
+        """Return the possible results of phase 1 when it ends with these numbers of votes."""
         counted = self._states.with_tallies(local, {"reconcile_vote_count": {"yes": yes, "no": no}})
         return self._ends(counted, self._phase_one)
 
     def _of_phase_2(self, snapshot: Snapshot) -> Snapshot:
-        """Return the count of phase 2 reduced to the candidates with the most votes, or an empty count if missing
-        answers can change them.
+        """Return the candidates of phase 2 with the most votes. Return an empty snapshot if missing answers can change
+        which candidates these are.
         """
         candidates = snapshot["reconcile_response_dictionary"]
         most, next_most, *_ = sorted([*(count for count, _ in candidates.values()), 0, 0], reverse=True)
@@ -102,11 +103,11 @@ class VoteCounts:
         return {"reconcile_response_dictionary": left, "reconcile_responders": {*self._states.others}}
 
     def _silent(self, snapshot: Snapshot) -> int:
-        """Return the number of agents that have not answered yet."""
+        """Return the number of other agents that have not yet answered."""
         return len(self._states.others) - len(snapshot["reconcile_responders"])
 
     def _check_that_it_ends_alike(self, local: int, settled: int) -> None:
-        """Raise ReductionError if a timer's expiry gives another result after the simplification."""
+        """Raise ReductionError if the simplification changes the result of a timer's expiry."""
         if settled != local and any(
             self._settled_ends(local, timer) != self._settled_ends(settled, timer)
             for timer in self._states.known[local].running

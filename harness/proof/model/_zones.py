@@ -1,10 +1,10 @@
-"""Store the possible remaining times of all running timers as zones (difference bounds matrices), with a number for
-each.
+"""Store the possible remaining times of all running timers as zones (difference bounds matrices), and give each zone a
+number.
 
 A zone is a set of possible remaining times of n timers: all times with x_i - x_j <= m[i][j], where x_0 = 0. The matrix
-is closed (no bound can be tightened), so equal sets have equal matrices. A zone is stored for any time that may have
-passed: with each point it contains all earlier points, down to the first expiry. Bounds are whole microseconds between
-minus and plus the longest duration, so their number is finite.
+is closed (no bound can be tightened), so equal sets have equal matrices. A stored zone covers any amount of time that
+may have passed: with each point it contains all earlier points, down to the first expiry. Bounds are whole microseconds
+between minus and plus the longest duration, so their number is finite.
 """
 
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ EVER_US = 10**15
 
 
 class ZoneTable:
-    """All zones by number, with cached results of their operations. A zone is a set of possible remaining timer
-    values.
+    """All zones by number, with cached results of their operations. A zone is a set of possible remaining times of
+    timers.
     """
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class ZoneTable:
         return self._matrices[zone]
 
     def adopt(self, matrix: Matrix) -> int:
-        """Return the number of a zone that another process found."""
+        """Return the number of a zone that a different process found."""
         return self._intern(matrix)
 
     def firsts(self, zone: int) -> list[int]:
@@ -51,9 +51,7 @@ class ZoneTable:
         return any(row[0] == 0 for row in self._matrices[zone][1:])
 
     def tied(self, zone: int) -> list[tuple[int, ...]]:
-        """Return, for each timer that may expire next, the indices of the timers that must then expire at the same
-        moment.
-        """
+        """Return, for each timer that may expire next, the indices of the timers that must expire together with it."""
         tied = self._tied.get(zone)
         if tied is None:
             firsts = self.firsts(zone)
@@ -65,7 +63,9 @@ class ZoneTable:
         return tied
 
     def bounds(self, zone: int) -> list[tuple[int, ...]]:
-        """Return a description of each timer by its bounds, which does not depend on the order of the timers."""
+        """Return a description of each timer by its bounds. The description does not depend on the order of
+        the timers.
+        """
         bounds = self._bounds.get(zone)
         if bounds is None:
             matrix = self._matrices[zone]
@@ -76,10 +76,11 @@ class ZoneTable:
         return bounds
 
     def after(self, zone: int, ended: tuple[int, ...], running: tuple[int, ...]) -> int | None:
-        """Return the zone after all timers in `ended` expired at the same moment, or None if they cannot.
+        """Return the zone after all timers in `ended` expired at the same moment. Return None if they cannot expire
+        together.
 
-        `running` has, for each timer that runs then, its number before. For a timer that was just started, it has -1
-        minus its duration in microseconds.
+        `running` contains, for each timer that runs afterwards, its number before. For a timer that was just started,
+        it contains -1 minus its duration in microseconds.
         """
         key = zone, ended, running
         if key not in self._after:
@@ -87,7 +88,7 @@ class ZoneTable:
         return self._after[key]
 
     def permuted(self, zone: int, places: tuple[int, ...]) -> int:
-        """Return the zone with its timers in another order. `places` contains the previous number of each timer."""
+        """Return the zone with its timers in a new order. `places` contains the previous number of each timer."""
         key = zone, places
         if key not in self._permuted:
             matrix, order = self._matrices[zone], (0, *places)
@@ -95,7 +96,7 @@ class ZoneTable:
         return self._permuted[key]
 
     def adrift(self, zone: int) -> int:
-        """Return the zone with the same differences between timers, in which all of them may run for any further time.
+        """Return the zone with the same differences between timers, but with any remaining time until the first expiry.
 
         If nothing can happen before the first expiry, the time until then makes no difference.
         """
@@ -108,9 +109,10 @@ class ZoneTable:
         return self._adrift[zone]
 
     def coincidences(self, zone: int, ended: tuple[int, ...]) -> int:
-        """Return how many independent events must coincide so that these timers expire next and at the same moment.
+        """Return the number of independent events that must coincide so that these timers expire next and at the same
+        moment.
 
-        This is the number of differences between timers that are open in the zone and fixed when these timers expire.
+        This is the number of differences between timers that are open in the zone but fixed when these timers expire.
         The timers must be able to expire at the same time.
         """
         key = zone, ended
@@ -123,9 +125,9 @@ class ZoneTable:
         return self._coincidences[key]
 
     def _ended(self, zone: int, ended: Sequence[int]) -> list[list[int]] | None:
-        """Return the bounds at the moment when these timers expire and no other has expired before.
+        """Return the bounds at the moment when these timers expire and no other timer has expired before.
 
-        Return None if that is impossible.
+        Return None if this moment is impossible.
         """
         matrix = [list(row) for row in self._matrices[zone]]
         size = range(len(matrix))
@@ -167,7 +169,7 @@ class ZoneTable:
 
 
 def _apart(matrix: Sequence[Sequence[int]], timers: range) -> int:
-    """Return the number of timers, where timers with fixed differences count as one."""
+    """Return the number of groups of timers, where all timers with fixed differences belong to one group."""
     return sum(
         not any(matrix[timer][other] + matrix[other][timer] == 0 for other in timers if other < timer)
         for timer in timers

@@ -1,3 +1,3 @@
-"""Answer questions about a complete state graph: endless cycles, ways to one common chain, and the votes that they
-need.
+"""Answer questions about a complete state graph: does it contain endless cycles, which states lead to one common chain,
+and how many votes do they need?
 """

@@ -1,4 +1,4 @@
-"""Compute the states from which a goal can be reached, whichever timer expires next."""
+"""Compute the states from which the swarm reaches a goal, whichever timer expires next."""
 
 from array import array
 from collections.abc import Callable, Iterable, Sequence
@@ -8,15 +8,15 @@ ByTimer = tuple[tuple[int, ...], ...]
 """The numbers of the possible successors of a state, for each timer that may expire next."""
 
 Check = Callable[[], object]
-"""A function that is called repeatedly, and raises GivenUpError when the limit of memory or time is reached."""
+"""A function that is called repeatedly, and raises LimitReachedError when the limit of memory or time is reached."""
 
 
 class BackwardReachableStates:
-    """A growing set of states: the goals, and all states from which a path leads to them.
+    """A growing set of states: the goals, and all states that lead to a goal.
 
-    The durations of timers determine the next timer, but a zone may leave several timers open. All of these must
-    therefore lead to the goals, unless timers expire in `any_order`. If timers must expire at the same moment, only the
-    transit times of messages determine their order, so any order that leads to the goals is enough.
+    The durations of timers determine the next timer to expire, but a zone may leave several timers possible. All of
+    these must therefore lead to the goals, unless timers expire in `any_order`. If timers must expire at the same
+    moment, only the transit times of messages determine their order, so one order that leads to the goals is enough.
     """
 
     def __init__(self, by_timer: Sequence[ByTimer], any_order: bool, check: Check = lambda: None) -> None:
@@ -48,11 +48,11 @@ class BackwardReachableStates:
 
     @property
     def first_left(self) -> int:
-        """The first state outside the set, or -1 if there is none."""
+        """The first state outside the set. It is -1 if there is none."""
         return self._inside.find(0)
 
     def add(self, goals: Iterable[int]) -> None:
-        """Add goals, and then all states from which a path leads to them."""
+        """Add goals, and then all states that lead to them."""
         waiting = [number for number in goals if not self._inside[number]]
         for number in waiting:
             self._inside[number] = 1
@@ -73,7 +73,7 @@ class BackwardReachableStates:
 def _ends(by_timer: Sequence[ByTimer], check: Check) -> "array[int]":
     """Return, for each state, the index at which the list of its predecessors begins in one flat array.
 
-    The last entry counts all transitions.
+    The last entry is the number of all transitions.
     """
     count = array("q", bytes(8 * (len(by_timer) + 1)))
     for choices in by_timer:

@@ -1,6 +1,6 @@
 """Find states from which the swarm cannot become idle with one common chain, and cycles that never end.
 
-Both questions concern the successors without losses and without new blocks, except the blocks of further votes.
+The search follows only successors that need no lost message and no new block, except the blocks of further votes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,19 +17,19 @@ from harness.proof.questions._graph_cycles import cycles
 Watch = Callable[[str], None]
 """A function that is called repeatedly with the present question.
 
-It raises GivenUpError when the limit of memory or time is reached.
+It raises LimitReachedError when the limit of memory or time is reached.
 """
 
 
 @dataclass
 class ConvergenceResult:
-    """The result of the search: endless cycles, and states without a way to one common chain.
+    """The result of the search: endless cycles, and states from which the swarm does not reach one common chain.
 
     - `forks`: number of idle states with several chains. `fork` is the nearest of them.
     - `cycles`: cycles as lists of their states, the nearest first.
     - `astray`: numbers of states without a path to an idle swarm with one chain, after 0, 1, 2, ... further votes. The
       list ends at 0 states, or at one vote for each agent.
-    - `lost`: the nearest state without such a path after all these votes.
+    - `lost`: the nearest state without a path to one chain even after one vote for each agent.
     - `reluctant`: the nearest state for which one vote is not enough.
     """
 
@@ -45,7 +45,9 @@ class ConvergenceResult:
 
 @cycles_left_alone()
 def look(graph: StateGraph, watch: Watch = lambda asked: None, workers: Workers | None = None) -> ConvergenceResult:
-    """Search a complete state graph for both problems. `workers` compute the votes that diverged idle states need."""
+    """Search a complete state graph for endless cycles and for states that do not lead to one chain. `workers` compute
+    how many votes diverged idle states need.
+    """
     idle_states = dict(_idle_states(graph, partial(watch, "idle states")))
     forks = [number for number, chains in idle_states.items() if chains > 1]
     result = ConvergenceResult(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "cycles")))
@@ -71,7 +73,7 @@ def look(graph: StateGraph, watch: Watch = lambda asked: None, workers: Workers 
 
 
 def _idle_states(graph: StateGraph, check: Check) -> Iterator[tuple[int, int]]:
-    """Yield each idle state with its number of different chains."""
+    """Yield each idle state, with the number of different chains in it."""
     for number, by_timer in enumerate(graph.quiet):
         check()
         state = graph.states[number]
@@ -80,7 +82,9 @@ def _idle_states(graph: StateGraph, check: Check) -> Iterator[tuple[int, int]]:
 
 
 def _needed(graph: StateGraph, forks: Sequence[int], watch: Watch, workers: Workers | None) -> dict[int, int | None]:
-    """Return the number of further votes that each state needs, or None if one vote per agent is not enough."""
+    """Return the number of further votes that each state needs. The number is None if one vote per agent is
+    not enough.
+    """
     needed: dict[int, int | None] = {}
 
     def check() -> None:

@@ -1,7 +1,7 @@
 """Compute how many further votes an idle swarm with different chains needs until all chains are equal.
 
-A further vote is the vote on a block that an agent completes in the idle state. Its successors are first explored along
-single paths until one path leads to one chain. All successors are explored only if no such path was found.
+A further vote is the vote on a block that an agent completes in the idle state. The search first explores single paths
+until one path leads to one chain. It explores all successors only if it finds no such path.
 """
 
 from collections import Counter
@@ -40,7 +40,9 @@ class ExtraVotes:
         self._explored = 0
 
     def needed(self, fork: State) -> int | None:
-        """Return the smallest number of votes, or None if one vote per agent is not enough. Raises UndecidedError."""
+        """Return the smallest number of votes that makes all chains equal. Return None if one vote per agent is not
+        enough. Raises UndecidedError.
+        """
         if len(self._enough) + len(self._too_few) > MAX_CACHED:
             self._enough.clear()
             self._too_few.clear()
@@ -56,9 +58,9 @@ class ExtraVotes:
         return any(self._leads(after, votes - 1, instants + 1) for after in self._after_a_vote(fork))
 
     def _after_a_vote(self, fork: State) -> Iterator[State]:
-        """Yield the states after a vote of each agent. Of several agents in equal states, only one is tried.
+        """Yield the states after a vote of each agent. Of several agents in equal states, only one agent votes.
 
-        Agents whose chain is rarest come first.
+        Agents with the rarest chain come first.
         """
         locals_, known = fork[AGENTS:], self._swarm.local.known
         alike = {
@@ -69,7 +71,7 @@ class ExtraVotes:
             yield from self._swarm.after(fork, (AgentAction(place, "complete", fork[BLOCKS] + 1),), lossy=False)
 
     def _leads(self, state: State, votes: int, instants: int) -> bool:
-        """Return true if the swarm can become idle with equal chains from this state, whichever timer expires next."""
+        """Return true if the swarm becomes idle with equal chains from this state, whichever timer expires next."""
         if not self._find_path(state, votes, set(), instants) and self._too_few.get(state, -1) < votes:
             self._explore_all(state, votes, instants)
         return self._is_enough(state, votes)
@@ -79,7 +81,9 @@ class ExtraVotes:
         return enough is not None and enough <= votes
 
     def _find_path(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
-        """Return true if a path without repeated states was found. If not, a path may still exist."""
+        """Return true if a path to equal chains was found. A path may exist even if none was found, because each state
+        is tried once.
+        """
         if self._is_enough(state, votes):
             return True
         if state in tried or instants > MAX_PATH_INSTANTS or self._too_few.get(state, -1) >= votes:
@@ -95,7 +99,7 @@ class ExtraVotes:
         return leads
 
     def _timers_lead(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
-        """Return true if a path was found for each timer that may expire next.
+        """Return true if a path to equal chains was found for each timer that may expire next.
 
         With timers in any order, a path for one timer is enough.
         """
@@ -115,7 +119,7 @@ class ExtraVotes:
         return len(self._swarm.chains(state)) <= 1 or (votes > 0 and self._a_vote_leads(state, votes, instants))
 
     def _by_timer(self, state: State) -> Iterator[Iterator[State]]:
-        """Yield, for each timer that may expire next, an iterator over the successors."""
+        """Yield, for each timer that may expire next, an iterator over the successors of the state."""
         ending = [*self._swarm.ending(state)]
         for action, tied in self._swarm.alternatives(state):
             if (action,) in ending:

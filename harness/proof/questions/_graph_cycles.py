@@ -8,13 +8,15 @@ from harness.proof.questions._attractor import Check
 
 
 def cycles(graph: StateGraph, check: Check = lambda: None) -> list[list[int]]:
-    """Return a shortest cycle of each strongly connected component. The component nearest to the start is first."""
+    """Return a shortest cycle of each strongly connected component. The component that is nearest to the initial state
+    comes first.
+    """
     parts = [part for part in _parts(graph, check) if len(part) > 1 or part[0] in _after(graph, part[0])]
     return [_shortest_cycle(graph, min(part), set(part)) for part in sorted(parts, key=min)]
 
 
 def _after(graph: StateGraph, number: int) -> set[int]:
-    """Return the successors of a state. If the graph is incomplete, return only the explored ones."""
+    """Return the successors of a state. If the graph is incomplete, leave out unexplored successors."""
     following = {state for after in graph.quiet[number] for state in after} | {*graph.crossing.get(number, ())}
     if graph.ended == "complete":
         return following
@@ -41,9 +43,9 @@ def _shortest_cycle(graph: StateGraph, start: int, part: set[int]) -> list[int]:
 
 
 def _after_a_cycle(graph: StateGraph, check: Check) -> list[int]:
-    """Return all states that lie on a cycle or can be reached from one.
+    """Return all states that lie on a cycle or can be reached from a cycle.
 
-    States without a predecessor among the remaining states are removed until none is left to remove.
+    The function repeatedly removes states that have no predecessor among the remaining states, until there are none.
     """
     ways_in = array("q", bytes(8 * len(graph.quiet)))
     for number in range(len(graph.quiet)):

@@ -1,4 +1,4 @@
-"""Describe endless cycles of the agents: an example of each form, with its conditions and a scenario.
+"""Describe the endless cycles of agents, with an example of each form: its conditions and a scenario that shows it.
 
 Two cycles have the same form if the same timers run in their states, for any agents and any chains.
 """
@@ -32,10 +32,10 @@ class Livelock:
 
     - `ways`: number of components of the graph with a cycle of this form.
     - `coincidences`: number of pairs of instants on the example's path that must be equal by chance, to within the
-      transit time of a message. Another path may need fewer. None if timers expire in any order.
+      transit time of a message. A different path may need fewer. None if timers expire in any order.
     - `completions`: the possible times of the blocks on the path.
     - `losses`: number of messages that receivers lose on the path.
-    - `cycle`: the cycle that the simulation of the example showed. None if the simulation took another path.
+    - `cycle`: the cycle that the simulation of the example showed. None if the simulation took a different path.
     - `contradictory`: true if no clocks give all ties of the path the required results.
     """
 
@@ -86,7 +86,7 @@ def forms(graph: StateGraph, cycles: Sequence[list[int]]) -> list[list[list[int]
 
 
 def _form(graph: StateGraph, cycle: Sequence[int]) -> _Form:
-    """Return the form of a cycle, which does not depend on the choice of the cycle's first state."""
+    """Return the form of a cycle. It does not depend on the state with which the list of the cycle's states begins."""
     known = graph.swarm.local.known
     looks = [
         tuple(
@@ -131,10 +131,10 @@ def show(graph: StateGraph, cycles: Sequence[list[int]], path: Path, name: str) 
 
 
 def _nearest(graph: StateGraph, alike: Sequence[list[int]]) -> list[_CycleExample]:
-    """Return some cycles of one form, with the best example first.
+    """Return some example cycles of one form, with the best example first.
 
-    Cycles that real clocks allow come first, then those with the fewest coincidences, then those with the fewest blocks
-    of fixed time.
+    The order is: first cycles that real clocks allow, then the fewest coincidences, then the fewest blocks whose
+    completion time is fixed.
     """
     tried: list[tuple[bool, int, int, _CycleExample]] = []
     for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MAX_PLAYED]:
@@ -148,8 +148,8 @@ def _nearest(graph: StateGraph, alike: Sequence[list[int]]) -> list[_CycleExampl
 
 
 def _livelock_of(graph: StateGraph, ways: int, rounds: Sequence[_CycleExample], path: Path, name: str) -> Livelock:
-    """Return the first cycle that the simulation confirms, as a livelock. If the simulation confirms none, return the
-    first one.
+    """Return a livelock with the first cycle that the simulation confirms as its example. If the simulation confirms no
+    cycle, use the first one.
     """
     bounds = graph.swarm.bounds
     chosen: tuple[_CycleExample, PlayedExample] | None = None

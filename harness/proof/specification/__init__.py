@@ -2,9 +2,9 @@
 
 See docs/explanation/specification.md.
 
-`_tlc` runs TLC. `_second_opinion` explores the same bounds with `harness.proof` and with TLC, and compares the states,
-which `_spec_states` writes in one form. `_validate` checks recorded runs against the specification, in the form that
-`_recorded_incarnations` writes.
+`_tlc` runs TLC. `_second_opinion` explores the same bounds with `harness.proof` and with TLC, and compares the states.
+`_spec_states` converts the states of both to the same form. `_validate` checks recorded runs against the specification.
+`_recorded_incarnations` encodes these runs for TLC.
 """
 
 from harness.proof.specification._second_opinion import SecondOpinion, second_opinion

@@ -1,8 +1,8 @@
 """Encode the recorded steps of agents as numbers, so that the TLA+ module Recorded can read them.
 
 The specification knows no hash function and treats hashes as names. This module therefore computes the hashes of blocks
-and chains (eq. 3.1 and 3.2). It replaces each block hash and each timestamp by its position among all of them, and each
-chain hash by the number of the chain.
+and chains (eq. 3.1 and 3.2). It replaces each block hash by its position among all block hashes, each timestamp by its
+position among all timestamps, and each chain hash by the number of the chain.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -58,7 +58,7 @@ class UnreadableError(Exception):
 
 
 class EncodedTimestamp(int):
-    """A timestamp. The encoder later replaces it by its position among all timestamps."""
+    """A timestamp that waits for its encoding. The encoder replaces it by its position among all timestamps."""
 
 
 Item = Any
@@ -69,8 +69,8 @@ Item = Any
 class EncodedIncarnation:
     """The encoded steps of an agent between two restarts. `lines` contains the trace line of each step.
 
-    `whole` is true if no steps are missing at the end. `unread` is the reason why later lines could not be encoded, or
-    None.
+    `whole` is true if no steps are missing at the end. `unread` is the reason why the lines after these steps could not
+    be encoded, or None if all lines are encoded.
     """
 
     agent_id: int
@@ -83,8 +83,8 @@ class EncodedIncarnation:
 
 
 class ChainNumbers:
-    """Numbers for chains: one for the inception block, and one for each chain that extends a numbered chain by a
-    block.
+    """A numbering of chains. The inception block alone is the first chain. Each extension of a numbered chain by a
+    block gets a further number.
     """
 
     def __init__(self) -> None:
@@ -104,7 +104,8 @@ class ChainNumbers:
 
 
 def lives(trace: Trace, header: CheckedHeader, chains: ChainNumbers, *, ended: bool) -> Iterator[EncodedIncarnation]:
-    """Yield the encoded steps of each incarnation of an agent, up to the first line that cannot be encoded.
+    """Yield the encoded steps of each incarnation of an agent, up to the first line of the incarnation that cannot be
+    encoded.
 
     `ended` is true if the agent reached the end of its mission, so that its last steps are recorded.
     """
@@ -151,7 +152,7 @@ class _IncarnationEncoder:
         }
 
     def step(self, run: HandlerRun) -> Item:
-        """Return the encoded step. Raises UnreadableError if it cannot be compared with the specification."""
+        """Return the encoded step. Raises UnreadableError if the step cannot be compared with the specification."""
         unknown = {kind: word for kind, word in unknown_names([run]).items() if kind not in IGNORED_KINDS}
         if unknown:
             raise UnreadableError(next(iter(unknown.values())))
@@ -184,7 +185,9 @@ class _IncarnationEncoder:
         )
 
     def _came(self, run: HandlerRun) -> tuple[Item, bool]:
-        """Return the encoded input, and true if the agent must drop it. Raises ValueError if it is invalid."""
+        """Return the encoded input of a handler run, and true if the agent must drop the input. Raises ValueError if it
+        is invalid.
+        """
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger):
             sender, _, message = decoded(run.input)
@@ -210,8 +213,8 @@ class _IncarnationEncoder:
         return (LOGGED, event.encoded_bytes, *_block(block))
 
     def _sealed(self, run: HandlerRun) -> bytes | None:
-        """Return the encrypted data of the completed block, if the mission encrypts and the data have the right length.
-        Otherwise return None.
+        """Return the encrypted data of the completed block. Return None if the mission does not encrypt, or if the data
+        have the wrong length.
         """
         sealed = sealed_of(run.sealed)
         seals = sealed is not None and sealed_to(self._header.initial_data) is not None
@@ -249,7 +252,9 @@ class _IncarnationEncoder:
         return tuple(items)
 
     def _on_top(self, top: tuple[bytes, int], block_hash: bytes) -> tuple[bytes, int]:
-        """Return the hash and the number of the chain that has one more block (eq. 3.2)."""
+        """Return the hash and the number of the chain that results from one more block on top of this chain
+        (eq. 3.2).
+        """
         digest = next_chain_hash(top[0], block_hash)
         self._number_of[digest] = number = self._chains.on_top(top[1], block_hash)
         return digest, number

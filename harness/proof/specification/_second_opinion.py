@@ -26,10 +26,12 @@ INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4":
 
 @dataclass(frozen=True)
 class SecondOpinion:
-    """The results of both explorations. `states` and `specified` are None if one of them is incomplete.
+    """The results of both explorations: with the real agent, and with TLC. `states` and `specified` are None if one
+    exploration is incomplete.
 
-    States that differ only in remaining timer durations count as one. `specified` therefore is at most the number of
-    states that TLC counts. `only_real` and `only_specified` are the numbers of states that only one of the two has.
+    States that differ only in remaining timer durations count as one state. `specified` is therefore at most the number
+    of states that TLC counts. `only_real` and `only_specified` are the numbers of states that only one of the two
+    explorations found.
     """
 
     bounds: Bounds
@@ -51,7 +53,9 @@ class SecondOpinion:
 
     @property
     def agrees(self) -> bool:
-        """True if both explorations found the same violation, or no violation and the same states."""
+        """True if both explorations are complete and found the same violation or none, the same states, and the same
+        answer about endless cycles.
+        """
         same = not self.only_real and not self.only_specified and self.livelock == self.specified_livelock
         return self.decided and self.flaw == self.violated and same
 
@@ -129,8 +133,8 @@ def second_opinion(
     *,
     watch: Callable[[ExplorationProgress], None] = lambda progress: None,
 ) -> SecondOpinion:
-    """Explore the bounds in both ways, and return the results. Raises BoundsError for bounds that the specification
-    does not support, and NoCheckerError without TLC.
+    """Explore the bounds with the real agent and with TLC, and return the results. Raises BoundsError for bounds that
+    the specification does not support, and NoCheckerError without TLC.
     """
     bounds, limits = replace(bounds, reduced=False), limits or Limits()
     config = _config(bounds)

@@ -1,6 +1,7 @@
-"""Convert the states and settings of the TLA+ specification and of real agents to the same form.
+"""Convert the states and settings of real agents and of the TLA+ specification to the same form.
 
-Blocks are called 1, 2, ... in the order in which they were completed; a chain hash is the blocks of its chain.
+Blocks are called 1, 2, ... in the order in which they were completed. A chain hash is represented by the blocks of its
+chain.
 """
 
 import json
@@ -152,7 +153,9 @@ class _HashTranslator:
 
 
 def unspecified(settings: Settings) -> str | None:
-    """Return the name of a setting that differs from its default and that the specification lacks, or None."""
+    """Return the name of a setting that differs from its default and does not exist in the specification. Return None
+    if there is none.
+    """
     constants = (MODULES / "Swarm.tla").read_text("utf-8")
     choices = {name for name, choice in CHOICES.items() if choice.constant is not None and choice.constant in constants}
     known, usual = choices | TIMERS.keys() | SIZES, Settings()

