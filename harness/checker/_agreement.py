@@ -1,4 +1,5 @@
-"""Decide whether agents with different chains had a chance to agree. The checks of characteristics 5 and 6 use this.
+"""Decide whether agents with different chains had a chance to agree. The checks of characteristics 5 and 6 use the
+decision.
 
 Two idle agents with different chains stay different, because only a vote or a query of another agent's phase 2 starts a
 reconcile. A difference is therefore a violation only if the network was fully connected, and the differing agent then
@@ -19,8 +20,8 @@ from harness.checker.recurring_cycles import cycle_of
 
 
 def check_endless_cycle(name: str, evidence: Evidence) -> Judgement | None:
-    """Return the verdict `violated` if the network connects all agents, but some agents repeat a cycle forever. Return
-    None in every other case.
+    """Return the verdict `violated` if some agents repeat a cycle forever, although all agents took part and the
+    network connects them. Return None in every other case.
 
     `harness.checker._liveness` has the evidence.
     """

@@ -206,8 +206,8 @@ class Evidence:
         return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
 
     def describe_unknown_name(self, *kinds: Kind, agent_id: int | None = None) -> str | None:
-        """Return a description of the first undefined name of these kinds in the agent's trace. Return None if there is
-        none. Without an agent, search all traces.
+        """Return a description of the first undefined name of these kinds (such as "handler") in the agent's trace.
+        Return None if there is none. Without an agent, search all traces.
         """
         for named, unknown in self.unknown.items():
             if agent_id in (None, named) and (words := first_unknown(unknown, kinds)):

@@ -1,4 +1,6 @@
-"""Decode the recorded inputs of an agent: datagrams, events, sealed data and stores."""
+"""Decode the recorded inputs of an agent: datagrams, events, encrypted event data, and the states that it stored on
+disk.
+"""
 
 import base64
 from collections.abc import Iterable, Iterator

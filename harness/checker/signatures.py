@@ -69,10 +69,10 @@ def are_signed(exports: Iterable[Export]) -> bool:
 
 
 def vouch(exports: Iterable[Export], keys: TrustedKeys | None) -> tuple[list[str], str | None]:
-    """Return a sentence for each export with a wrong signature, and the reason why valid signatures prove nothing, or
-    None.
+    """Return a sentence for each export with a wrong signature, and the reason why correct signatures prove nothing.
 
-    The exports may be unsigned if no keys are given. They then count as exports of a mission without keys.
+    The reason is None if correct signatures prove the exports. The exports may be unsigned if no keys are given. They
+    then count as exports of a mission without keys.
     """
     exports = list(exports)
     if keys is None and not are_signed(exports):

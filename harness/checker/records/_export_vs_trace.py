@@ -140,7 +140,9 @@ def _contents(agent_id: int, export: Export, incarnation: ReplayedIncarnation) -
 
 
 def compare_with_itself(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield contradictions inside the trace of one agent, before and after its restarts."""
+    """Yield each contradiction inside one trace: within an incarnation, or between the end of an incarnation and the
+    start of the next one.
+    """
     for agent_id, incarnations in evidence.incarnations.items():
         for incarnation in incarnations:
             yield from _in_incarnation(evidence, agent_id, incarnation)

@@ -62,7 +62,9 @@ ALGORITHM = {name: handler.algorithm for name, handler in HANDLERS.items()}
 
 
 def compare_algorithms(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each trace line whose Algorithm number does not belong to its handler. Other checks use only the name."""
+    """Yield each trace line whose Algorithm number does not belong to its handler. Other checks use only the handler's
+    name.
+    """
     for agent_id, trace in evidence.traces.items():
         said = dict.fromkeys((run.handler, run.algorithm) for run in trace.runs)
         for handler, number in said:

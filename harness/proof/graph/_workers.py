@@ -74,8 +74,8 @@ class SuccessorBatch(NamedTuple):
 
 
 class NeededVotes(NamedTuple):
-    """A worker's answer: the number of further votes that each state needs until all chains are equal. None means
-    unknown.
+    """A worker's answer: the number of further votes that each state needs until all chains are equal. `votes` is None
+    if the worker could not find the numbers.
     """
 
     votes: list[int | None] | None
@@ -124,7 +124,7 @@ class _NumberTranslator:
 
 
 class _StateTranslator:
-    """One end of the connection between two processes, which translates the numbers of states."""
+    """A translator of state numbers at one end of the connection between two processes."""
 
     def __init__(self, swarm: ModelSwarm) -> None:
         local, zones = swarm.local, swarm.zones
@@ -310,7 +310,9 @@ class Workers:
             yield from other.expansions_of(answer, number, add)
 
     def needed(self, forks: Sequence[State], check: Check) -> Iterator[int | None]:
-        """Yield the number of further votes that each state needs until all chains are equal. Raises UndecidedError."""
+        """Yield the number of further votes that each state needs until all chains are equal. Raises UndecidedError if
+        a worker reaches its limit of states.
+        """
         for _, _, answer in self._answers(_WorkerHandle.give_forks, forks, check):
             assert isinstance(answer, NeededVotes)
             if answer.votes is None:

@@ -332,7 +332,7 @@ class ModelSwarm:
         )
 
     def _running_after(self, at: dict[tuple[int, int], int], there: AgentStates) -> tuple[int, ...]:
-        """Return, for each timer that runs after a step, its number before the step.
+        """Return, for each timer that runs after a step, the number that it had before the step.
 
         For a timer that was just started, return -1 minus its duration.
         """

@@ -53,8 +53,8 @@ class SecondOpinion:
 
     @property
     def agrees(self) -> bool:
-        """True if both explorations are complete and found the same violation or none, the same states, and the same
-        answer about endless cycles.
+        """True if both explorations led to a result, and found the same violation or none, the same states, and the
+        same answer about endless cycles.
         """
         same = not self.only_real and not self.only_specified and self.livelock == self.specified_livelock
         return self.decided and self.flaw == self.violated and same
