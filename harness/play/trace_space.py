@@ -57,6 +57,8 @@ def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) 
     if expected < quota:
         return remark, ""
     source = "half of the free disk space" if scenario.trace_quota_mb is None else "`trace_quota_mb`"
+    if trace_quota(scenario, directory) == LEAST_BYTES_PER_AGENT:
+        source = "the least for each agent"
     return remark, (
         f"the traces will probably end early, because their quota is {_size(quota)} ({source}), and the run will then "
         "not be judged completely: raise the quota, or choose fewer agents or a shorter mission"

@@ -38,7 +38,7 @@ class CheckerError(MachineError):
 
 @dataclass(frozen=True)
 class TlcResult:
-    """The result of TLC. If `violated` names an invariant, the search is incomplete. `told` is the complete printed
+    """The result of TLC. If `violated` names an invariant, the search is incomplete. `output` is the complete printed
     output.
 
     `states` is the file with all different states and transitions. It exists if `checked` was called with `dump`.
@@ -47,7 +47,7 @@ class TlcResult:
     generated: int
     distinct: int
     violated: str | None
-    told: str
+    output: str
     states: Path
 
 
@@ -103,15 +103,15 @@ def checked(
         yield _read(done.stdout, folder / "all.dot")
 
 
-def _read(told: str, states: Path) -> TlcResult:
-    counts, violated = _COUNTS.findall(told), _VIOLATED.search(told)
+def _read(output: str, states: Path) -> TlcResult:
+    counts, violated = _COUNTS.findall(output), _VIOLATED.search(output)
     over = counts and counts[-1][2] == "0"
     if not counts or not (violated or over):
-        error = _ERROR.search(told)
-        why = " ".join((error[0] if error else told[-MOST_SHOWN:]).split())
+        error = _ERROR.search(output)
+        why = " ".join((error[0] if error else output[-MOST_SHOWN:]).split())
         raise CheckerError(f"TLC stopped before the end: {why[:MOST_SHOWN]}")
     generated, distinct, _ = map(int, counts[-1])
-    return TlcResult(generated, distinct, violated and violated[1], told, states)
+    return TlcResult(generated, distinct, violated and violated[1], output, states)
 
 
 def in_tla(value: object) -> str:

@@ -246,7 +246,7 @@ def _rejected(constants: Constants, batch: _EncodedStepBatch) -> dict[int, tuple
     with looked_at("Recorded", _config(constants), others=records, memory_mb=MEMORY_MB) as said:
         rejected = {
             int(number): (int(step), tuple(sorted(_WHAT.findall(what))))
-            for number, step, what in _REJECTED.findall(said.told)
+            for number, step, what in _REJECTED.findall(said.output)
         }
     positions = 1
     for number, life in enumerate(batch.lives, 1):
