@@ -79,7 +79,7 @@ _NAMES_OF = {
     "harness.sweep.matrix": ("Finished", "Matrix", "load_matrix", "run_matrix"),
     "harness.sweep.matrix.matrix_frame": ("matrix_frame",),
 }
-"""Module -> its public names, to import at their first use."""
+"""Module -> its public names. The module is imported when one of these names is first used."""
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 
 if not TYPE_CHECKING:  # a type checker would accept any name

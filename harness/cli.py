@@ -28,7 +28,7 @@ def _quit(signal_number: int, frame: object) -> None:
 
 def _interrupts_are_quiet(quiet: bool) -> None:
     """Let Ctrl-C end the process at once while it only imports modules, because Python would otherwise print a
-    traceback.
+    traceback of the import.
 
     A program that merely imports this module keeps its own handler.
     """
@@ -63,9 +63,11 @@ class CommandEntry(NamedTuple):
     panel: str
     """Heading of the command in the help."""
     location: str
-    """MODULE:NAME of the function, or of the group of commands."""
+    """The place of the command's function or group of commands, as MODULE:NAME."""
     summary: str
-    """The first paragraph of the command's own help. At most 62 characters, which fill a line of a terminal."""
+    """The first paragraph of the command's own help. It has at most 62 characters, so it fits into one line of a
+    terminal.
+    """
 
 
 COMMANDS = {
@@ -168,7 +170,7 @@ COMMANDS = {
 """Name of each command -> its entry, in the order of the help."""
 
 WITH_VARIANT = ("run", "check", "replay", "coverage", "explore", "prove", "conformance")
-"""Commands with the option --variant: they play agents or judge them. `matrix` has its own."""
+"""Commands that play or judge agents and therefore have the option --variant. `matrix` defines its own --variant."""
 
 OLD_NAMES = {
     "again": "`ucp-harness bisect --once`",
@@ -180,14 +182,14 @@ OLD_NAMES = {
 class OldCommandNameError(HarnessError):
     """An error: the user called a command by its old name.
 
-    `git bisect run` stops at status 128. It would take status 2 for a bad commit.
+    `git bisect run` stops at status 128. It would interpret status 2 as a bad commit.
     """
 
     exit_status = 128
 
 
 class LazyCommandGroup(TyperGroup):
-    """All commands. The module of a command is imported only when the command is called."""
+    """The group of all commands. The module of a command is imported only when the command is called."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] in COMMANDS:
@@ -255,7 +257,7 @@ class _OutputWithoutBrokenPipe(io.FileIO):
 
 
 def main() -> NoReturn:
-    """Run the command line. A mistake of the user leads to one sentence and an exit status, never to a traceback."""
+    """Run the command line. A user's mistake causes a message of one sentence and an exit status, never a traceback."""
     if sys.stdout is None:  # the caller closed it
         sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     elif sys.stdout is (original := sys.__stdout__):

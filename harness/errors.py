@@ -6,9 +6,10 @@ from contextlib import contextmanager
 from typing import Self
 
 VIOLATED, WRONG_REQUEST, CANNOT_HERE, INCOMPLETE, INTERRUPTED = 1, 2, 3, 4, 130
-"""Exit statuses besides 0. 1: a verdict is bad, an agent failed, or the result of a command is negative. 2: the
-scenario, an argument or an input file is wrong. 3: this machine cannot do it. 4: more time is needed for a
-result. 130: interrupted. `harness.cli` lists all of them."""
+"""Exit statuses other than 0. 1: a verdict is bad, an agent failed, or the result of a command is negative. 2: the
+scenario, an argument or an input file is wrong. 3: this machine cannot run the command. 4: more time is needed for a
+result. 130: interrupted. The docstring of `harness.cli` lists all statuses.
+"""
 
 
 class HarnessError(Exception):
@@ -66,7 +67,7 @@ class UnsupportedError(MachineError):
 
     @classmethod
     def of(cls, agent_id: int, command: Sequence[str], words: str) -> Self:
-        """Return the error for an agent. `words` is the message from the agent, which may be empty."""
+        """Return the error for an agent. `words` is the message that the agent printed, which may be empty."""
         why = words.rstrip(".") or "it does not say why"
         return cls(f"not supported by agent {agent_id} ({shlex.join(command)}): {why}")
 
@@ -74,7 +75,7 @@ class UnsupportedError(MachineError):
 class AgentFailedError(HarnessError):
     """An error: an agent under test crashed, hung, could not be started, or gave an invalid answer.
 
-    `outcome` says which, in a word. `detail` completes a sentence that starts with "agent 3".
+    `outcome` names the kind of failure in one word. `detail` completes a sentence that starts with "agent 3".
     """
 
     exit_status = VIOLATED

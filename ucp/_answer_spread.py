@@ -1,11 +1,11 @@
-"""Delay the answers of an agent by a random time, if the setting `answer_spread_s` asks for it.
+"""Delay the answers of an agent by a random time, if the setting `answer_spread_s` is above 0.
 
 One agent asks, and all others answer at the same moment. On a radio channel that they share, many of these answers
-collide. With `answer_spread_s`, each answer waits for its own share of this time.
+collide. With `answer_spread_s`, each agent delays its answer by a different part of this time.
 
-The share is computed from the datagram, so an agent draws no random number, a rerun sends at the same times, and anyone
-can check the wait. A hash of the datagram is as good as a random number here: no two datagrams are equal, because each
-has its sender and its sequence number.
+The delay is computed from the datagram. An agent therefore draws no random number, a repeated run sends at the same
+times, and a checker can compute the delay. A hash of the datagram is as good as a random number here: no two datagrams
+are equal, because each contains its sender and its sequence number.
 """
 
 from heapq import heappop, heappush
@@ -22,10 +22,12 @@ from ucp.messages import (
 from ucp.trace import RecordedBytes
 
 ANSWERS = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceResponse, BlockResponse))
-"""The messages that wait. Algorithms 3, 9, 13 and 17 send them."""
+"""Messages that the agent delays. Algorithms 3, 9, 13 and 17 send them."""
 
 Outgoing = tuple[int, Message, RecordedBytes | None]
-"""Sequence number, message, and the datagram as the trace has it. None without a trace."""
+"""An outgoing message: its sequence number, the message, and the datagram for the trace. The datagram is None without a
+trace.
+"""
 
 
 def answer_wait_s(datagram: bytes, spread_s: float) -> float:
@@ -37,7 +39,7 @@ def answer_wait_s(datagram: bytes, spread_s: float) -> float:
 
 
 class WaitingAnswers:
-    """The delayed answers of one agent, which wait for their sending times."""
+    """The answers of one agent that wait for their sending times."""
 
     def __init__(self, agent_id: int, spread_s: float) -> None:
         self._agent_id = agent_id
@@ -50,9 +52,9 @@ class WaitingAnswers:
         return self._waiting[0][0] if self._waiting else None
 
     def exchange(self, outbox: list[Outgoing], now: float) -> list[Outgoing]:
-        """Hold back the answers in `outbox` until they are due. Return all messages to send now, in order.
+        """Add the answers in `outbox` to the waiting ones. Return all messages to send now, in order.
 
-        An answer that has waited comes before the messages of the last input.
+        An answer that has waited comes before the messages of the current input.
         """
         others = []
         for outgoing in outbox:

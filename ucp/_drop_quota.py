@@ -1,8 +1,8 @@
 """A limit for the space that dropped datagrams take in the trace, because any sender can send such datagrams.
 
-A flood of datagrams that are dropped would fill the disk of a vehicle. The agent therefore writes them whole only
-within a quota. It counts the others, and writes their number. The trace thus accounts for each datagram, and its size
-does not depend on the flood.
+A flood of datagrams that are dropped would fill the disk of a vehicle. The agent therefore writes complete datagrams
+only within a quota. It counts the other datagrams and writes their number. The trace thus accounts for each datagram,
+and its size does not depend on the flood.
 """
 
 from collections import Counter
@@ -12,15 +12,17 @@ from ucp.trace import DroppedDatagram, RecordedBytes
 
 QUOTA_BYTES = 1024 * 1024
 BYTES_PER_S = 128
-"""Growth of the quota per mission second, so that the trace has samples of a long flood."""
+"""Growth of the quota in bytes per mission second. Because the quota grows, the trace of a long flood contains samples
+of it.
+"""
 COUNTED_S = 10.0
-"""Mission seconds between two lines with the number of datagrams of one reason."""
+"""Minimum number of mission seconds between two counts of dropped datagrams with the same reason."""
 LINE_BYTES = 80
-"""Size of a line without its datagram."""
+"""Assumed size of a trace line without its datagram."""
 
 
 class DropQuota:
-    """Select the dropped datagrams that are written whole, and count the others."""
+    """Choose the dropped datagrams that the trace contains completely, and count the others."""
 
     def __init__(self) -> None:
         self._left_bytes = float(QUOTA_BYTES)
@@ -28,7 +30,9 @@ class DropQuota:
         self._counts: Counter[str] = Counter()
 
     def lines(self, entry: DroppedDatagram) -> Iterator[DroppedDatagram]:
-        """Yield the trace entries to write now: this entry if it is within the quota, and the counts that are due."""
+        """Yield the trace entries to write now: this dropped datagram if it is within the quota, and the counts that
+        are due.
+        """
         self._left_bytes = min(QUOTA_BYTES, self._left_bytes + (entry.t - self._at_s) * BYTES_PER_S)
         self._at_s = entry.t
         size = LINE_BYTES + len(entry.datagram.text)
@@ -41,7 +45,9 @@ class DropQuota:
             yield from self.counts(entry.t)
 
     def counts(self, t: float) -> Iterator[DroppedDatagram]:
-        """Yield an entry for each reason with the number of datagrams that were not written since the last count."""
+        """Yield one entry per reason with the number of datagrams that were dropped and not written since the last
+        count.
+        """
         self._counted_at_s = t
         for reason, count in self._counts.items():
             yield DroppedDatagram(t, reason, RecordedBytes(""), count)

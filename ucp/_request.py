@@ -4,12 +4,12 @@ import json
 from typing import Any
 
 MAX_PARTS = 100
-"""Maximum number of objects and lists in a request."""
+"""Maximum number of objects and lists in the JSON text of a request."""
 
 
 def check_request(request: dict[str, Any]) -> None:
     """Raise ValueError if a request contains NaN, a lone surrogate, or too many parts. Python's JSON parser accepts all
-    three of these.
+    of these.
     """
     try:
         text = json.dumps(request, allow_nan=False, ensure_ascii=False)

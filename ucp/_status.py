@@ -6,7 +6,7 @@ from ucp.agent import Agent
 
 
 def status_of(agent: Agent) -> dict[str, Any]:
-    """Return the values of the status that the agent knows. The caller adds the other values."""
+    """Return those values of the status that the agent core knows. The caller adds the other values."""
     state = agent.state
     return {
         "agent_id": agent.agent_id,

@@ -155,7 +155,7 @@ class Agent:
             self.replace_handlers(handlers)
 
     def replace_handlers(self, wrong: Iterable[EventHandler[Any]]) -> None:
-        """Replace the correct handlers of these names by wrong handlers. All others are reset to the correct ones."""
+        """Replace the handlers of these names by wrong handlers. All other handlers become correct again."""
         handlers = HANDLERS | {handler.name: handler for handler in wrong}
         self._on_message = {message: handlers[handler.name] for message, handler in ON_MESSAGE.items()}
         self._on_timer = {timer: handlers[handler.name] for timer, handler in ON_TIMER.items()}
@@ -179,7 +179,7 @@ class Agent:
     ) -> None:
         """Handle a decoded message, or drop it if `drop_reason` returns a reason.
 
-        `datagram` is the encoded message, for the trace. Dropped messages are counted in `dropped`.
+        `datagram` is the encoded message, which the trace records. Dropped messages are counted in `dropped`.
         """
         if reason := drop_reason(self.agent_id, self.roster, sender, message):
             self._drop(now, reason, datagram)
@@ -230,7 +230,8 @@ class Agent:
     def silent_until(self) -> float | None:
         """Return the mission second until which a running reconcile keeps the agent from answering messages.
 
-        That is when the running timer of its reconcile expires. None if it does not reconcile, or no such timer runs.
+        This is the expiry of the running timer of the reconcile. Return None if the agent does not reconcile, or if no
+        such timer runs.
         """
         if self.state.reconcile_in_progress:
             for timer in self.state.reconcile_timers:
@@ -239,8 +240,8 @@ class Agent:
         return None
 
     def handle_timer(self, now: float) -> None:
-        """Run the handlers of all timers that have expired by `now`, earliest first, and release the delayed answers
-        that are due.
+        """Run the handlers of all timers that have expired by `now`, earliest first, and send the delayed answers that
+        are due.
         """
         while (
             (timer := self._next_running_timer()) is not None and timer.deadline is not None and timer.deadline <= now
@@ -275,9 +276,9 @@ class Agent:
         self._handle(now, OperatorTrigger("reconcile"), None, self._on_local_event["Reconcile Begin"])
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
-        """Return the messages that handlers have sent, in order, as (sequence number, message). Then forget them.
+        """Return the messages that handlers have sent since the previous call, in order, as (sequence number, message).
 
-        `answer_spread_s` has no effect on them. A driver of the network calls `datagrams_to_send`.
+        The setting `answer_spread_s` does not delay them. A driver with a network calls `datagrams_to_send` instead.
         """
         return [(sequence, message) for sequence, message, _ in self._take_outbox()]
 
@@ -304,7 +305,7 @@ class Agent:
     # How a handler runs
 
     def _drop(self, now: float, reason: str, datagram: RecordedBytes | None) -> None:
-        """Count and trace a datagram that is dropped."""
+        """Count a dropped datagram, and write it to the trace."""
         self.dropped[reason] += 1
         if self._tracing:
             self._trace.append(DroppedDatagram(now, reason, datagram or RecordedBytes("")))
@@ -317,7 +318,7 @@ class Agent:
         handler: EventHandler[Any],
         *inputs: object,
     ) -> None:
-        """Run a handler, then all handlers that it triggers, in order. `trace_input` is written to the trace."""
+        """Run a handler, then all handlers that it triggers, in order. The trace records `trace_input` as the input."""
         core = self._core
         core.now, core.running = now, handler
         branch = handler.run(core, *inputs)
@@ -378,7 +379,7 @@ def drop_reason(agent_id: int, roster: Container[int], sender: int, message: Mes
 
 
 def tally_of(core: Core, handler: EventHandler[Any]) -> Tally | None:
-    """Return the vote counts of the handler, or its choice, for the trace. Return None if it has neither."""
+    """Return the counters of a handler for the trace: its votes, or its choice. Return None if it has neither."""
     if handler.tally is None:
         return None
     if handler.tally == "majority_response_block_hash":

@@ -1,4 +1,4 @@
-"""Write the files of an agent: its chain export as a whole, and its trace and log line by line."""
+"""Write the files of an agent. The chain export is replaced as a whole. Trace and log grow line by line."""
 
 import contextlib
 import errno
@@ -10,9 +10,9 @@ from typing import Any, BinaryIO
 
 CHUNK_BYTES = 64 * 1024
 RESERVED_BYTES = 1024 * 1024
-"""Space for an export of about 700 blocks."""
+"""Disk space reserved for the chain export. It is enough for about 700 blocks."""
 KEPT_FREE_SHARE = 0.1
-"""Share of the file system that traces and logs leave to stores and exports."""
+"""Share of the file system that traces and logs leave free for stores and chain exports."""
 MAX_KEPT_FREE_BYTES = 16 * 1024 * 1024
 
 
@@ -40,9 +40,9 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 class ReservedSpace:
-    """Disk space that is reserved for the export, so that other files cannot take it.
+    """Disk space that is reserved for the chain export, so that no other file takes it.
 
-    The space is that of a file without a name, so it is free again when the process ends.
+    An unnamed file holds the space, so the space is free again when the process ends.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -52,7 +52,7 @@ class ReservedSpace:
             os.posix_fallocate(self._descriptor, 0, RESERVED_BYTES)
 
     def release(self) -> bool:
-        """Release the reserved space. Return false if it was released before."""
+        """Release the reserved space. Return false if it was already released."""
         if self._descriptor is None:
             return False
         os.close(self._descriptor)
@@ -78,10 +78,10 @@ class LogFile:
 
 
 class TraceFile:
-    """A trace file. Only whole lines are appended, and it ends at the first line that cannot be written.
+    """A trace file. It contains only complete lines, and ends before the first line that cannot be written.
 
-    An incomplete last line of an earlier incarnation is removed. `problem` is the reason of the end, so that a trace
-    that ends early is distinguished from an agent that became silent.
+    An incomplete last line of an earlier incarnation is removed. `problem` is the reason why the trace ends. It
+    distinguishes a trace that ended early from an agent that became silent.
     """
 
     def __init__(self, path: Path) -> None:
@@ -112,7 +112,7 @@ class TraceFile:
 
 
 def leave_space(file: BinaryIO) -> None:
-    """Raise OSError if the file system has no more free space than stores and exports need."""
+    """Raise OSError if the file system has only the space left that stores and exports need."""
     system = os.fstatvfs(file.fileno())
     if system.f_bavail * system.f_frsize < min(
         MAX_KEPT_FREE_BYTES, system.f_blocks * system.f_frsize * KEPT_FREE_SHARE

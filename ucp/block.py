@@ -24,7 +24,7 @@ LATEST_US = 2**64 - 1
 """Latest timestamp in microseconds."""
 
 CHAIN_HASHES_KEPT = 4096
-"""Number of chain hashes in the cache. Agents of one process, and their judge, compute the same ones."""
+"""Number of chain hashes in the cache. The agents of one process and the checker compute the same chain hashes."""
 
 BLOCK_FIELDS = {"agent_id": FieldKind.U32, "timestamp_us": FieldKind.U64}
 """The header of a block."""
@@ -32,7 +32,7 @@ BLOCK_HEADER = struct_of(BLOCK_FIELDS)
 
 
 def hash_digest(data: bytes) -> bytes:
-    """Return the hash H of the protocol: SHA-256, 32 bytes."""
+    """Return the SHA-256 of the data, which is the protocol's hash function H. It has 32 bytes."""
     digest: bytes = sha256(data).digest()
     return digest
 

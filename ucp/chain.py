@@ -1,6 +1,6 @@
 """The chain of an agent: a stack of blocks on the inception block, with indexes by block hash and by chain hash.
 
-Every question that a handler asks is one dictionary look-up, however long the mission has run.
+Each query of a handler takes one dictionary look-up, regardless of the number of blocks.
 """
 
 from collections.abc import Iterator
@@ -47,8 +47,8 @@ class Chain:
         return chain_hash in self._height_of_chain_hash
 
     def successor(self, chain_hash: bytes) -> Block | None:
-        """Return the block that follows the block with this chain hash. Return None at the top of the chain. Raises
-        KeyError if the chain hash is unknown.
+        """Return the block that follows the block with this chain hash. Return None for the top block. Raises KeyError
+        if the chain hash is unknown.
         """
         height = self._height_of_chain_hash[chain_hash]
         return self._blocks[height] if height < len(self._blocks) else None

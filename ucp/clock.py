@@ -23,17 +23,17 @@ class MissionClock:
         self._started = time.monotonic() - (time.time() - epoch_us / MICROSECONDS)
 
     def now(self) -> float:
-        """Return the mission time in seconds. It is 0 before the start."""
+        """Return the mission time in seconds. Before the start of the mission it is 0."""
         if self.epoch_us is None:
             return 0.0
         return max(0.0, (time.monotonic() - self._started) * self.speedup)
 
     def timestamp_us(self, now: float) -> int:
-        """Return the mission time `now` as microseconds since the Unix epoch. With a speedup, it runs ahead of wall
-        time.
+        """Return the mission time `now` as microseconds since the Unix epoch. With a speedup, this time runs ahead of
+        wall time.
         """
         return (self.epoch_us or 0) + round(now * MICROSECONDS)
 
     def wall_s(self, mission_s: float) -> float:
-        """Return the number of seconds of wall time in `mission_s` mission seconds."""
+        """Convert a number of mission seconds to seconds of wall time."""
         return mission_s / self.speedup

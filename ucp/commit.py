@@ -1,7 +1,7 @@
 """Build and commit blocks: Algorithms 1-6 (Sections 3.6.1 and 3.6.2).
 
-A full block waits in the deque. The agent proposes it to the local UVS, and commits it if more agents approve than
-disapprove. Otherwise the chains have diverged, and the agent starts a reconcile.
+A full block waits in the deque. The agent proposes it to the vehicles in range, and commits it if more agents approve
+than disapprove. Otherwise the chains have diverged, and the agent starts a reconcile.
 """
 
 from ucp.block import LATEST_US, Block, next_chain_hash
@@ -96,9 +96,10 @@ def receive_vote_add_block(core: Core, sender: int, message: BlockAddResponse) -
 def vote_timer_expiration(core: Core) -> str:
     """Algorithm 5, Vote Timer Expiration: commit the proposed block, vote again, or reconcile.
 
-    The pseudo-code does nothing if the chain changed during an approved vote. The text and Section 4.3 vote again.
-    Otherwise an agent would become idle with a block in its deque. A tie is no majority and starts a reconcile. With
-    the setting `asks_after_commit`, Algorithm 20 asks which agents did not follow, after the commit has arrived.
+    The pseudo-code does nothing if the chain changed during an approved vote. According to the text and to Section 4.3,
+    the agent votes again. Otherwise it would become idle with a block in its deque. A tied vote is no majority, so the
+    agent starts a reconcile. With the setting `asks_after_commit`, Algorithm 20 sends a query some time after the
+    commit, to find agents that did not follow it.
     """
     if core.reconcile_in_progress:
         return "reconcile in progress"
@@ -123,8 +124,8 @@ def vote_timer_expiration(core: Core) -> str:
 def receive_commit_block(core: Core, sender: int, message: CommitBlock) -> str:
     """Algorithm 6, Receive Commit Block: append another agent's block if it follows this agent's top block.
 
-    In Figure 3.9 this handler also has a local trigger. Here it has none: an agent commits its own blocks directly,
-    because the first test of this handler would refuse them during Reconcile Finalize.
+    In Figure 3.9 a local event also triggers this handler. In this implementation only a message triggers it. An agent
+    commits its own blocks directly, because the first test of this handler would refuse them during Reconcile Finalize.
     """
     if core.reconcile_in_progress:
         return "reconcile in progress"

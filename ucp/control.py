@@ -1,6 +1,7 @@
 """The control socket of an agent, through which other programs request its status and send commands.
 
-A Unix stream socket; one JSON object per line in, one per line out (see contract/CONTRACT.md).
+The socket is a Unix stream socket. Each request and each answer is a line with a JSON object (see
+contract/CONTRACT.md).
 """
 
 import contextlib
@@ -30,7 +31,7 @@ class UnsupportedCommandError(CommandError):
 
 
 class ControlServer:
-    """A server that executes `commands` by name. When it ends, it removes its socket file."""
+    """A server that executes the functions in `commands` by name. When it ends, it removes its socket file."""
 
     def __init__(self, path: Path, commands: dict[str, Command], loop: Loop) -> None:
         self._path = path
@@ -39,7 +40,7 @@ class ControlServer:
         self._listener: socket.socket | None = None
 
     def start(self) -> None:
-        """Start to accept connections. A socket file of an agent that has ended is replaced. Raises OSError."""
+        """Start to accept connections. An old socket file of an agent that has ended is replaced. Raises OSError."""
         self._listener = listener = socket.socket(socket.AF_UNIX)
         listener.setblocking(False)
         # The socket gets its name only after it listens, so a client that sees the name can connect.
@@ -89,9 +90,10 @@ class ControlServer:
 
 
 class _ControlClient:
-    """A connection to the control socket. It answers requests line by line, no faster than the client reads.
+    """A connection of a client to the control socket. It answers one request at a time, and waits until the client has
+    read the answer.
 
-    It ends if the client disconnects or sends a line above the limit. Other connections continue.
+    The connection ends if the client disconnects or sends a line above the limit. Other connections continue.
     """
 
     def __init__(self, connection: socket.socket, answer: Callable[[bytes], dict[str, Any]], loop: Loop) -> None:

@@ -17,19 +17,21 @@ from ucp.timers import Timer
 from ucp.trace import RecordedBytes, SentMessage
 
 Seal = Callable[[bytes, int], bytes]
-"""A function that seals event data, given this data and the timestamp of its block."""
+"""The type of a function that encrypts event data. Its arguments are the event data and the timestamp of the block."""
 
 
 class Core(AgentState):
-    """The state of an agent, and the operations on it. Their results stay here until the agent takes them.
+    """The state of an agent, and the operations of its handlers. The results of a handler stay here until the agent
+    collects them.
 
     `outbox` has the (sequence, message, recorded datagram) to broadcast. `changes`, `announced` and `started` are the
     changes, messages and timers of the running handler, as in a trace. They and the recorded datagrams exist only with
-    `tracing`. `sealed` is the event data that the handler sealed, because a replay cannot seal it again.
+    `tracing`. `sealed` is the event data that the handler encrypted. The trace needs it, because a replay cannot
+    encrypt it again.
     """
 
     running: EventHandler[Any]
-    """The running handler."""
+    """The event handler that is running."""
 
     def __init__(
         self,
@@ -53,7 +55,7 @@ class Core(AgentState):
         self._sequence = 0
 
     def trigger(self, event: LocalEvent) -> None:
-        """Trigger a local event. Its handler runs after the current handler has ended."""
+        """Trigger a local event. Its handler runs after the running handler has ended."""
         assert event in self.running.triggers, f"{self.running.name} does not declare that it triggers {event}"
         self.triggered.append((event, self.running.name))
 
@@ -97,7 +99,7 @@ class Core(AgentState):
                 self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Return the event data of the block under construction. If the mission requires it, they are encrypted
+        """Return the event data of the block under construction, encrypted if the mission requires it
         (`ucp.secure`).
         """
         events = bytes(self.current_block)

@@ -11,15 +11,17 @@ from ucp._dataclass import dataclass
 from ucp.wire import FieldKind, struct_of
 
 EVENT_FIELDS = {"timestamp_us": FieldKind.U64, "event_id": FieldKind.U8, "length": FieldKind.U16}
-"""The header of an event."""
+"""The fields of an event header."""
 _HEADER = struct_of(EVENT_FIELDS)
 EVENT_HEADER_BYTES = _HEADER.size
 MAX_EVENT_BYTES = EVENT_HEADER_BYTES + 256
-"""The largest event of the thesis: 256 bytes of data and its header."""
+"""Maximum size of an event in the thesis: a header and 256 bytes of data."""
 
 MEAN_TIME_BETWEEN_EVENTS_S = 30.0
 MAX_MEAN_S = 31 * 86400.0
-"""Maximum mean in seconds. No mission is longer, and a search for an event over years takes minutes."""
+"""Maximum mean interval of random events in seconds. It is longer than any mission. With a longer mean, the search for
+the next event would take minutes.
+"""
 TRIAL_PERIOD_S = 1.0
 EVENT_DATA_BYTES = (32, 64, 128, 256)
 
@@ -31,7 +33,7 @@ DEFAULT_LOG: tuple[EventKind, ...] = ("mode", "arming", "text", "position")
 
 
 class MalformedEventsError(ValueError):
-    """An error: event data do not consist of whole events."""
+    """An error: event data does not consist of complete events."""
 
 
 @dataclass(unsafe_hash=True, slots=True)
@@ -86,7 +88,8 @@ def decode_event(event_data: bytes, offset: int) -> tuple[LoggableEvent, int]:
 class RandomEvents:
     """The random event source of Algorithm 21: each second, with probability 1/mean, an event with random ID and data.
 
-    The thesis gives no loop period: one trial per second, each agent with a random phase.
+    The thesis does not specify the period of the loop. This implementation tries once per second, and each agent starts
+    at a random fraction of a second.
     """
 
     def __init__(self, rng: Random, mean_s: float = MEAN_TIME_BETWEEN_EVENTS_S) -> None:

@@ -15,8 +15,8 @@ def export_chain(
 ) -> dict[str, Any]:
     """Return the chain export of an agent as a JSON object.
 
-    The chain is listed from its oldest block, the deque from its front, and the reconcile stack to its top.
-    `signatures` are the makers' signatures by block hash, in a secured mission.
+    The chain is listed from its oldest block, the deque from its front, and the reconcile stack to its top. In a
+    secured mission, `signatures` has the signature of each block by block hash.
     """
     inception = state.chain.inception
 

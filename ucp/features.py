@@ -35,12 +35,11 @@ FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     **{feature: _has(name, value) for feature, (name, value) in ALTERNATIVES.items()},
     **{name: _is_not_zero(name) for name, number in NUMBERS.items() if number.is_feature},
 }
-"""Feature -> function that returns true if a mission file needs it. The file must be complete.
-
-Only the settings of `ucp.settings.ADDED` may be missing in the file.
+"""Feature -> function that returns true if a mission file needs it. The mission file must contain all keys, except the
+settings in `ucp.settings.ADDED`.
 """
 
 
 def needed_features(mission: Mapping[str, Any]) -> list[str]:
-    """Return the features that an agent needs for a mission. The mission file must be complete."""
+    """Return the features that an agent needs for a mission. The mission file must contain all keys."""
     return [name for name, is_needed in FEATURES.items() if is_needed(mission)]

@@ -39,7 +39,7 @@ class EventHandler(Generic[P]):
     starts: tuple[str, ...]
     triggers: tuple[LocalEvent, ...]
     tally: str | None = None
-    """Attribute of the state with the counters or the choice of the handler. None without one."""
+    """Name of the state attribute with the counters or the choice of this handler. None if the handler has neither."""
 
     @property
     def title(self) -> str:

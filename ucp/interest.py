@@ -1,9 +1,10 @@
 """Decide which messages can have an effect on an agent, so that a simulation need not deliver the others.
 
 All messages are broadcast, so each of N agents receives the messages of all others. Most of them have no effect: an
-answer matters only to agents that asked, and an agent that reconciles answers no message. This module decides it from
-the state of an agent, without a handler run. A driver in virtual time may withhold messages without effect. Radios
-deliver them, and the handlers then do nothing, as Algorithms 1-20 define.
+answer matters only to agents that sent the query, and an agent that reconciles answers no message. This module decides
+from the state of an agent whether a message has an effect, without running a handler. A driver in virtual time may
+withhold messages without effect. Real networks deliver them, and the handlers then do nothing, as Algorithms 1-20
+define.
 """
 
 from collections.abc import Callable
@@ -25,12 +26,13 @@ from ucp.settings import Settings
 from ucp.state import AgentState
 
 Question = tuple[type[Message], bytes]
-"""A question of an agent: the type of the answers, and their block or chain.
+"""An open query of an agent: the type of the expected answers, and the block or chain that they concern.
 
-An agent can have two questions at a time: one about its vote (type Block Add Response), and one of its reconcile."""
+An agent can have two open queries: one of its vote (type Block Add Response), and one of its reconcile.
+"""
 
 ONLY_COUNTED = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceResponse))
-"""Answers whose handlers only count (Algorithms 4, 10 and 14). They send no message and change no timer."""
+"""Answers that only change a counter (Algorithms 4, 10 and 14). Their handlers send no message and change no timer."""
 
 ASKED: dict[type[Message], Callable[[Any, Settings], Question]] = {
     BlockAddRequest: lambda message, settings: (
@@ -41,7 +43,7 @@ ASKED: dict[type[Message], Callable[[Any, Settings], Question]] = {
     ChainHashSuccessorQuery: lambda message, settings: (NextInSequenceResponse, message.chain_hash),
     RequestForBlock: lambda message, settings: (BlockResponse, message.block_hash),
 }
-"""Message -> the question of its sender from now on. Other messages are no questions."""
+"""Type of a query -> function that returns the open query of its sender from now on. Other messages open no query."""
 
 ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
     BlockAddResponse: lambda message: (
@@ -52,7 +54,9 @@ ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
     NextInSequenceResponse: lambda message: (NextInSequenceResponse, message.chain_hash),
     BlockResponse: lambda message: (BlockResponse, message.block.block_hash),
 }
-"""Message -> the question that it answers. It has no effect on agents without this question."""
+"""Type of an answer -> function that returns the open query that it answers. The answer has no effect on agents without
+this query.
+"""
 
 STILL_ASKED: dict[type[Message], Callable[[AgentState], bool]] = {
     BlockAddResponse: lambda state: state.voting_timer.active,
@@ -91,4 +95,4 @@ MATTERS: dict[type[Message], Callable[[AgentState, int, Any], bool]] = {
         state.phase_three_timer.active and message.block.block_hash == state.majority_response_block_hash
     ),
 }
-"""Message -> function of (state, sender, message) that returns true if the message can have an effect."""
+"""Type of a message -> function of (state, sender, message) that returns true if the message can have an effect."""

@@ -1,7 +1,7 @@
 """An event loop for sockets, timers and signals, smaller than asyncio.
 
-`asyncio` can do the same. But its import takes longer than all other steps of an agent's start, and as much memory.
-With more agents than processors, the start of a swarm would mostly consist of this import.
+`asyncio` offers the same functions. But its import takes longer than all other steps of an agent's start together, and
+as much memory. With more agents than processors, the start of a swarm would mostly consist of this import.
 """
 
 import heapq
@@ -31,7 +31,7 @@ class Loop:
     """An event loop. `run` calls functions one after another when they are due, until `stop` is called.
 
     `on_error` gets the exception of a callback, and the loop continues. Without `on_error`, the exception ends the
-    loop. `selector` waits for sockets. The default one rounds times up to milliseconds.
+    loop. `selector` waits for sockets. The default selector rounds waiting times up to milliseconds.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Loop:
         self._running = False
 
     def run(self) -> None:
-        """Run the loop until `stop` is called. The caller may then start it a second time."""
+        """Call the due functions until `stop` is called. The caller may run the loop again afterwards."""
         while self._running:
             self._call_back(self._selector.select(self._seconds_to_next_timer()))
             self._call_due_timers()

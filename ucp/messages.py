@@ -21,7 +21,7 @@ from ucp.block import BLOCK_HEADER, HASH_BYTES, MAX_AGENT_ID, MAX_EVENT_DATA_BYT
 from ucp.wire import VARIABLE, FieldKind, Fields, struct_of
 
 PORT = 14600
-"""Default UDP port. The mission file of an agent contains its port."""
+"""Default UDP port. The mission file of an agent can name a different port."""
 MAGIC = b"UC"
 VERSION = 1
 HEADER_FIELDS = {
@@ -34,7 +34,7 @@ HEADER_FIELDS = {
 }
 HEADER = struct_of(HEADER_FIELDS)
 MAX_DATAGRAM_BYTES = 1472
-"""One UDP datagram without IP fragmentation at MTU 1500."""
+"""Maximum size of a datagram: one UDP datagram without IP fragmentation at an MTU of 1500 bytes."""
 
 
 class MalformedDatagramError(ValueError):
@@ -66,7 +66,7 @@ class BlockAddRequest:
 class BlockAddResponse:
     """A vote on a proposed block (Algorithms 3 and 4).
 
-    `chain_hash` is the proposer's, repeated when the setting `vote_names_chain` is on.
+    With the setting `vote_names_chain`, `chain_hash` repeats the chain hash of the proposal.
     """
 
     NAME: ClassVar[str] = "Block Add Response"
@@ -165,7 +165,8 @@ class NextInSequenceResponse:
     """The block hash and the timestamp of the successor, in answer to a Chain Hash Successor Query (Algorithms 13 and
     14).
 
-    `block_hash` None is the reserved "Is Top Of Chain"; the timestamp is then that of the responder's top block.
+    A `block_hash` of None stands for the reserved answer "Is Top Of Chain". The timestamp is then that of the
+    responder's top block.
     """
 
     NAME: ClassVar[str] = "Next in Sequence Response"
@@ -262,14 +263,14 @@ _FIXED_BYTES: dict[type[Message], int] = {
     message: HEADER.size + struct_of({name: kind for name, kind in message.WIRE.items() if kind not in VARIABLE}).size
     for message in TYPE_CODES
 }
-"""Length of the datagram of each message, without its part of variable length."""
+"""Length in bytes of each type of datagram, without the part of variable length."""
 _MORE_BYTES: dict[type[Message], Callable[[Any], int]] = {
     BlockAddResponse: lambda message: HASH_BYTES if message.chain_hash else 0,
     CommitBlock: lambda message: BLOCK_HEADER.size + len(message.block.event_data),
     NextInSequenceResponse: lambda message: HASH_BYTES if message.block_hash else 0,
     BlockResponse: lambda message: BLOCK_HEADER.size + len(message.block.event_data),
 }
-"""Length of this part of variable length."""
+"""Type of a message -> function that returns the length in bytes of the part of variable length."""
 
 
 def datagram_bytes(message: Message) -> int:
@@ -341,7 +342,7 @@ def _flag(body: bytes) -> bool:
 
 
 def decode_block(body: bytes) -> Block:
-    """Parse an encoded block. Raises MalformedDatagramError if no message can carry it."""
+    """Parse an encoded block. Raises MalformedDatagramError for a block that no message could carry."""
     if not BLOCK_HEADER.size < len(body) <= BLOCK_HEADER.size + MAX_EVENT_DATA_BYTES:
         raise MalformedDatagramError("wrong length")
     agent_id, timestamp_us = BLOCK_HEADER.unpack_from(body)

@@ -18,10 +18,12 @@ from ucp.short_value import shown, shown_key
 SCHEMA = "ucp-mission/1"
 MAX_MISSION_BYTES = 4 * 1024 * 1024
 MAX_INITIAL_DATA_BYTES = 512 * 1024
-"""The first line of a trace contains the initial data in base64. The reader takes lines of at most 16 MiB."""
+"""Maximum size of the initial data. The first line of a trace contains them in base64, and readers accept lines of at
+most 16 MiB.
+"""
 MAX_SPEEDUP = 1000.0
 LATEST_EPOCH_US = 2**63 - 1
-"""Latest start of a mission. Timestamps of the next centuries then fit into a block."""
+"""Latest start of a mission. Timestamps after it still fit into the 64 bits of a block timestamp."""
 MAX_NAME = 40
 """Maximum number of characters of an unknown name in an error message."""
 
@@ -45,7 +47,9 @@ class Network:
 
 @dataclass(frozen=True)
 class EventSource:
-    """The source of events: Algorithm 21 ("random"), the telemetry of the vehicle ("mavlink"), or none ("none")."""
+    """The source of an agent's events: Algorithm 21 ("random"), the telemetry of the vehicle ("mavlink"), or none
+    ("none").
+    """
 
     source: Literal["random", "mavlink", "none"] = "random"
     mean_s: float = MEAN_TIME_BETWEEN_EVENTS_S
@@ -68,9 +72,9 @@ class Security:
 class Mission:
     """The content of a mission file.
 
-    `epoch_us` is the start of the mission in microseconds since the Unix epoch. With None, the agent waits for the
+    `epoch_us` is the start of the mission in microseconds since the Unix epoch. If it is None, the agent waits for the
     command `start`. `speedup` is the number of mission seconds per second of wall time. `store` is the file of the
-    agent's store, relative to the directory of the mission file. None means no store.
+    agent's store, relative to the directory of the mission file. If it is None, the agent has no store.
     """
 
     agent_id: int
@@ -144,7 +148,7 @@ def parse_mission(document: Any) -> Mission:
 
 
 def is_epoch(value: object) -> TypeGuard[int]:
-    """Return true if the value can be the start of a mission in microseconds since the Unix epoch."""
+    """Return true if this value is a valid start of a mission, in microseconds since the Unix epoch."""
     return type(value) is int and 0 <= value <= LATEST_EPOCH_US
 
 

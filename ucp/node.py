@@ -43,9 +43,9 @@ WRONG_MISSION = 2
 class Node:
     """An agent with its socket, files, clock and event source.
 
-    Its files are in `directory`. `loop` replaces the main loop; contract/examples/ros2 passes one of rclpy. Raises
-    OSError if the port or a file cannot be opened, StoreError for the store of another agent, and MissionError for
-    unusable keys.
+    Its files are in `directory`. `loop` replaces the main loop. The example contract/examples/ros2 passes a loop that
+    runs on rclpy. Raises OSError if the port or a file cannot be opened, StoreError if the store belongs to another
+    agent, and MissionError for unusable keys.
     """
 
     def __init__(self, mission: Mission, directory: Path, loop: Loop | None = None) -> None:
@@ -136,7 +136,7 @@ class Node:
         return status
 
     def _log_exception(self, error: Exception) -> None:
-        """Log an exception of a handler, and continue, because other agents depend on this one."""
+        """Log an exception of a handler and continue. An agent that ended would affect the other agents."""
         import traceback
 
         self._log_line("".join(traceback.format_exception(error)).rstrip())
@@ -177,7 +177,7 @@ class Node:
             self._feed(partial(self.agent.receive_datagram, data))
 
     def log_event(self, event_id: int, data: bytes) -> None:
-        """Log an event. Before the start and after the end of the mission, it is ignored."""
+        """Log an event. Events before the start and after the end of the mission are ignored."""
         if not self.generating:
             return
         event = LoggableEvent(self.clock.timestamp_us(self.clock.now()), event_id, data)
@@ -194,7 +194,8 @@ class Node:
         """Give the agent one input. Then write its records, broadcast its messages, and set its next timer.
 
         Store and trace come before the broadcast, because the process can be killed in between. A dropped datagram
-        changes neither the store nor a timer, and any sender can cause many of them, so the rest is left out then.
+        changes neither the store nor a timer, and any sender can cause many of them. These steps are therefore skipped
+        for dropped datagrams.
         """
         feed(self.clock.now())
         entries, datagrams = self.agent.trace(), self.agent.datagrams_to_send()
@@ -361,7 +362,7 @@ class Node:
         return self.mission.quirks
 
     def _trace_command(self, request: dict[str, Any]) -> None:
-        """Write a command that triggers no handler to the trace. Before the mission, do nothing."""
+        """Write a command that triggers no handler to the trace. Do nothing before the start of the mission."""
         if self.clock.running:
             self._record_entries([CommandEntry(self.clock.now(), str(request.get("command")), request)])
 

@@ -1,10 +1,10 @@
 """Read files of unknown origin within limits of time and memory.
 
-A file that another person or another machine made may be endless, huge, or no file at all: a reader of a FIFO waits
-forever, and a reader of `/dev/zero` fills the memory. JSON makes memory from bytes: each `[]` of three bytes becomes 64
-bytes. Every reader in this project therefore opens files with `open_plain_file`, reads at most a given number of bytes,
-and counts the values of a JSON text before it parses the text. Problems are an OSError or a ValueError with a
-description for the user.
+A file that another person or another machine made may be endless, huge, or no file at all: a program that reads a FIFO
+may wait forever, and a program that reads `/dev/zero` fills its memory. Parsed JSON takes more memory than its text:
+each `[],` of three bytes becomes 64 bytes. Every reader in this project therefore opens files with `open_plain_file`,
+reads at most a given number of bytes, and counts the values of a JSON text before it parses the text. Its functions
+raise OSError or ValueError with a description for the user.
 """
 
 import contextlib
@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 MAX_JSON_WEIGHT = 250_000
-"""Maximum weight of a JSON text. A list or an object weighs 5, and any other value 1, as their memory does. A value of
-the wrong type takes 400 bytes in the error of a validation, so the largest weight takes about 100 MiB."""
+"""Maximum weight of a JSON text, a measure of its memory. A list or an object weighs 5, and any other value 1. A value
+of the wrong type takes 400 bytes in a validation error, so a text of the maximum weight takes about 100 MiB.
+"""
 
 _CHUNK_BYTES = 64 * 1024
 
@@ -44,7 +45,7 @@ def open_plain_file(path: Path) -> io.BufferedReader:
 
 
 def read_plain_file(path: Path, most_bytes: int) -> bytes:
-    """Return the content of a regular file. Raises OSError, also if it has more than `most_bytes`."""
+    """Return the content of a regular file. Raises OSError, for example if the file has more than `most_bytes`."""
     with open_plain_file(path) as file:
         size = os.fstat(file.fileno()).st_size
         content = bytearray()
@@ -61,7 +62,9 @@ def read_text(path: Path, most_bytes: int) -> str:
 
 
 def check_weight(text: str | bytes, most: int = MAX_JSON_WEIGHT) -> None:
-    """Raise ValueError if a JSON text has a weight (memory) above `most`. Commas and brackets in strings count."""
+    """Raise ValueError if the weight of a JSON text is above `most`. Commas and brackets inside strings count as
+    well.
+    """
     if isinstance(text, str):
         weight = text.count(",") + 4 * (text.count("[") + text.count("{"))
     else:
@@ -82,7 +85,9 @@ def parse_json(text: str | bytes, *, strict: bool = True, most_weight: int = MAX
 
 
 def parse_json_at(text: str, position: int) -> tuple[Any, int]:
-    """Return the JSON value that begins at this position, and the position of its end. Raises ValueError."""
+    """Parse the JSON value that begins at this position. Return the value and the position after it. Raises
+    ValueError.
+    """
     with _limits(text, MAX_JSON_WEIGHT):
         return json.JSONDecoder().raw_decode(text, position)
 
@@ -101,7 +106,7 @@ def _limits(text: str, most_weight: int) -> Iterator[None]:
 
 
 def json_problem(error: ValueError) -> str:
-    """Return the description of an error of `parse_json` or `read_json`."""
+    """Return a description of an error that `parse_json` or `read_json` raised."""
     if isinstance(error, json.JSONDecodeError):
         return f"not JSON at line {error.lineno}"
     return "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else str(error)

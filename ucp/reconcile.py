@@ -20,7 +20,7 @@ from ucp.messages import (
 )
 
 IS_TOP_OF_CHAIN = b""
-"""The reserved candidate "Is Top Of Chain" in the dictionary of phase 2; sorts before every block hash."""
+"""The reserved candidate "Is Top Of Chain" among the candidates of phase 2. It sorts before every block hash."""
 
 
 @event_handler(7, "already in progress", "begun", triggers=("Reconcile Phase 1",))
@@ -48,7 +48,9 @@ def reconcile_phase_1(core: Core) -> str:
 
 @event_handler(9, "reconcile in progress", "yes", "no", sends=(ChainContainResponse,))
 def receive_request_chain_contain(core: Core, sender: int, message: ChainContainQuery) -> str:
-    """Algorithm 9, Receive Request Chain Contain: answer a query (the text before it calls it 10, Figure 3.13)."""
+    """Algorithm 9, Receive Request Chain Contain: answer a query. The thesis calls the algorithm 10 in the text before
+    it (Figure 3.13).
+    """
     if core.reconcile_in_progress:
         return "reconcile in progress"
     contained = core.chain.contains_chain_hash(message.chain_hash)
@@ -82,7 +84,7 @@ def receive_phase_1_response(core: Core, sender: int, message: ChainContainRespo
 def reconcile_phase_1_timer_expiration(core: Core) -> str:
     """Algorithm 11, Reconcile Phase 1 Timer Expiration: pop a block, or go on to phase 2.
 
-    A tie continues with phase 2 as printed (`<`), unless the setting `phase1_tie` is "pop".
+    A tie continues with phase 2, as in the printed pseudo-code (`<`), unless the setting `phase1_tie` is "pop".
     """
     yes, no = core.reconcile_vote_count["yes"], core.reconcile_vote_count["no"]
     if yes + no == 0:
@@ -103,7 +105,7 @@ def reconcile_phase_1_timer_expiration(core: Core) -> str:
     12, "asked", sends=(ChainHashSuccessorQuery,), starts=("phase two",), tally="reconcile_response_dictionary"
 )
 def reconcile_phase_2(core: Core) -> str:
-    """Algorithm 12, Reconcile Phase 2: ask which block follows the newest block in common."""
+    """Algorithm 12, Reconcile Phase 2: ask which block follows the top block of this agent's shortened chain."""
     core.reconcile_response_dictionary.clear()
     core.reconcile_responders.clear()
     core.start(core.phase_two_timer, core.settings.phase2_timeout_s)
@@ -123,7 +125,8 @@ def reconcile_phase_2(core: Core) -> str:
 def receive_request_next_in_sequence(core: Core, sender: int, message: ChainHashSuccessorQuery) -> str:
     """Algorithm 13, Receive Request Next in Sequence: name the next block, or detect that the chain has diverged.
 
-    The reconcile may begin while our own vote runs: the voting timer runs on, and Algorithm 5 then does nothing.
+    The reconcile may begin while the agent's own vote is in progress. The voting timer continues, and Algorithm 5 does
+    nothing when it expires.
     """
     if core.reconcile_in_progress:
         return "reconcile in progress"
@@ -166,7 +169,9 @@ def receive_response_next_in_sequence(core: Core, sender: int, message: NextInSe
 
 
 def most_named(candidates: Mapping[bytes, Sequence[int]]) -> list[bytes]:
-    """Return the candidates of phase 2 with the most votes. There are several in a tie, and none without an answer."""
+    """Return the candidates of phase 2 with the most votes. A tie gives several candidates, and a phase without answers
+    gives none.
+    """
     most = max((count for count, _ in candidates.values()), default=0)
     return [candidate for candidate, (count, _) in candidates.items() if count == most]
 
@@ -174,8 +179,8 @@ def most_named(candidates: Mapping[bytes, Sequence[int]]) -> list[bytes]:
 def without_minority_top(candidates: Mapping[bytes, Sequence[int]]) -> Mapping[bytes, Sequence[int]]:
     """Return the candidates of phase 2, without "Is Top Of Chain" if too few agents named it for a majority.
 
-    The responders that name a block would refuse the next proposed block (Algorithms 3 and 5). The asking agent counts
-    for "Is Top Of Chain".
+    Agents that answer with a block would disapprove the next proposal of this agent (Algorithms 3 and 5). The vote of
+    this agent itself counts for "Is Top Of Chain".
     """
     with_us = 1 + candidates.get(IS_TOP_OF_CHAIN, (0,))[0]
     blocks = {candidate: counted for candidate, counted in candidates.items() if candidate != IS_TOP_OF_CHAIN}
@@ -196,9 +201,9 @@ def reconcile_phase_2_timer_expiration(core: Core) -> str:
     """Algorithm 15, Reconcile Phase 2 Timer Expiration: choose the block that most answers named.
 
     In a tie the oldest timestamp decides, and with equal timestamps the lowest hash. With the setting `phase2_tie`
-    "block", a tie never ends the search while a block is on offer. With `top_needs_majority`, only the majority of a
-    vote ends the search. Without it, a refused agent may learn that no block follows, propose again, and be refused
-    forever.
+    "block", a tie never ends the search if one of the candidates is a block. With `top_needs_majority`, "Is Top Of
+    Chain" ends the search only with the majority of a vote. Without this setting, an agent whose proposal was
+    disapproved may receive the answer that no block follows, propose again, and be disapproved again without end.
     """
     candidates: Mapping[bytes, Sequence[int]] = core.reconcile_response_dictionary
     if not candidates:
@@ -231,8 +236,8 @@ def reconcile_phase_2_timer_expiration(core: Core) -> str:
 def reconcile_phase_3(core: Core) -> str:
     """Algorithm 16, Reconcile Phase 3: take the chosen block from the reconcile stack, or request it.
 
-    The pseudo-code stops after a block from the stack. Section 3.5.3 step 4 continues with phase 2. Otherwise the
-    reconcile would never end.
+    The pseudo-code stops after it takes a block from the stack, and the reconcile would never end. This handler
+    continues with phase 2, as step 4 of Section 3.5.3 does.
     """
     block_hash = core.majority_response_block_hash
     assert block_hash is not None, "phase 3 is triggered with a majority response"
@@ -267,8 +272,9 @@ def receive_request_block_for_hash(core: Core, sender: int, message: RequestForB
 def receive_response_block_for_hash(core: Core, sender: int, message: BlockResponse) -> str:
     """Algorithm 18, Receive Response Block for Hash: commit the requested block.
 
-    The thesis pauses the timer during the test. A handler is atomic here, so the pause has no effect. `Core.commit`
-    computes the chain hash again, which the agents of the field test did not (`ucp.quirks`).
+    The thesis pauses the phase 3 timer during the test of the block. A handler is atomic here, so the pause has no
+    effect. `Core.commit` updates the top chain hash. The agents of the field test did not do this (quirk
+    `stale_chain_hash`).
     """
     if not core.phase_three_timer.active:
         return "not in phase 3"
@@ -303,10 +309,11 @@ def reconcile_phase_3_timer_expiration(core: Core) -> str:
 def reconcile_finalize(core: Core) -> str:
     """Algorithm 20, Reconcile Finalize: commit the reconcile stack again, and broadcast each block.
 
-    Section 4.2 pauses between commits so that other agents can follow: the handler runs again after `finalize_gap_s`,
-    and the flag stays set until then. With the setting `asks_after_commit`, the gap also follows a commit of Algorithm
-    5. The stack is empty then, and the handler only asks for the successor of the chain. An agent without this chain
-    learns by this query that it has diverged (Algorithm 13).
+    Section 4.2 requires a pause between commits, so that other agents can follow. After each commit, the handler
+    therefore waits for `finalize_gap_s` and runs again. The flag `reconcile_in_progress` stays set until the stack is
+    empty. With the setting `asks_after_commit`, the handler also runs a gap after a commit of Algorithm 5. The stack is
+    empty then, and the handler only asks for the successor of the chain. An agent without this chain detects by this
+    query that it has diverged (Algorithm 13).
     """
     if core.settings.asks_after_commit and not core.reconcile_in_progress:
         core.send(ChainHashSuccessorQuery(core.chain.top_chain_hash))

@@ -84,7 +84,7 @@ class HashField(XStrFixedLenField):
 
 
 class OptionalHashField(HashField):
-    """An optional hash at the end of a message. It is None if no bytes are left."""
+    """A scapy field: an optional hash at the end of a message. Its value is None if no bytes are left."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name, None)
@@ -97,7 +97,9 @@ class OptionalHashField(HashField):
 
 
 class BlockTimestampField(LongField):
-    """The timestamp of a block. None means the timestamp of the newest event in the block."""
+    """A scapy field: the timestamp of a block. A value of None stands for the timestamp of the newest event in the
+    block.
+    """
 
     def __init__(self, name: str) -> None:
         super().__init__(name, None)  # type: ignore[arg-type]
@@ -109,7 +111,7 @@ class BlockTimestampField(LongField):
 
 
 class CiphertextField(XStrField):
-    """The encrypted bytes before the authentication tag."""
+    """A scapy field: the encrypted bytes before the authentication tag."""
 
     def getfield(self, pkt: Packet, s: bytes) -> tuple[bytes, bytes]:
         return s[-TAG_BYTES:], s[:-TAG_BYTES]
@@ -130,7 +132,7 @@ _FIELDS: dict[FieldKind, Callable[[str], Any]] = {
 
 
 def _fields(declared: Fields, *last: Any, **special: Any) -> list[Any]:
-    """Return the scapy fields for the declared fields, followed by `last`. `special` replaces some of them by name."""
+    """Convert declared message fields to scapy fields, and append `last`. `special` replaces single fields by name."""
     return [*(special[name] if name in special else _FIELDS[kind](name) for name, kind in declared.items()), *last]
 
 
@@ -268,7 +270,7 @@ class ChainHashSuccessorQuery(Packet):
 
 
 class NextInSequenceResponse(Packet):
-    """An answer in reconcile phase 2. A `block_hash` of None means "Is Top Of Chain"."""
+    """An answer in reconcile phase 2. If `block_hash` is None, the answer is "Is Top Of Chain"."""
 
     name = messages.NextInSequenceResponse.NAME
     fields_desc = _fields(messages.NextInSequenceResponse.WIRE)
@@ -303,7 +305,7 @@ bind_bottom_up(UDP, UCP, dport=PORT)
 
 
 def to_layer(message: Message) -> Packet:
-    """Return a message as a scapy layer, which can follow a UCP header."""
+    """Convert a message to a scapy layer that can follow a UCP header."""
     return LAYERS[type(message)](message.body())
 
 

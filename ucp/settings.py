@@ -24,15 +24,16 @@ class NumberSetting:
     """The declaration of a setting whose value is a number."""
 
     sentence: str
-    """What the setting does, for the table in contract/CONTRACT.md."""
+    """The effect of the setting, as the table in contract/CONTRACT.md states it."""
     allowed: str
-    """The range in words."""
+    """The allowed range of the setting as text."""
     low: float
     high: float
     whole: bool = False
     is_feature: bool = False
-    """An agent needs a feature with the name of the setting for each value except the default. Missions and traces
-    leave out the default."""
+    """True if an agent needs a feature, named like the setting, for each value other than the default. Missions and
+    traces omit the default.
+    """
 
 
 @dataclass(eq=False, frozen=True, slots=True)
@@ -42,15 +43,23 @@ class ChoiceSetting:
     """
 
     sentence: str
-    """What the setting does, for the table in contract/CONTRACT.md; for a boolean, what it does when it is true."""
+    """The effect of the setting, as the table in contract/CONTRACT.md states it. For a boolean setting, the effect of
+    true.
+    """
     values: tuple[bool, ...] | tuple[str, ...] = (False, True)
-    """The allowed values, the default first."""
+    """The allowed values of the setting. The first one is the default."""
     is_reading: bool = False
-    """The setting chooses between readings of the thesis. `explore` and `reconstruct` try the other readings."""
+    """True if the setting chooses between interpretations of the thesis. `explore` and `reconstruct` try the other
+    values.
+    """
     always_written: bool = False
-    """Missions and traces name the setting even at its default. The first agents of contract 2 require the key."""
+    """True if missions and traces contain the setting even with its default. The first agents of contract 2 require
+    it.
+    """
     constant: str | None = None
-    """The constant of the TLA+ specification that is true unless the setting has its default."""
+    """The constant in the TLA+ specification that is true if the setting does not have its default. None without
+    one.
+    """
 
     @property
     def allowed(self) -> str:
@@ -191,10 +200,10 @@ ADDED = (
     *(name for name, choice in CHOICES.items() if not choice.always_written),
     *(name for name, number in NUMBERS.items() if number.is_feature),
 )
-"""Settings that the first agents of contract 2 do not have."""
+"""Settings that were added later. The first agents of contract 2 do not know them."""
 ALTERNATIVES: dict[str, tuple[str, bool | str]] = {
     name if value is True else f"{name}={value}": (name, value)
     for name, choice in CHOICES.items()
     for value in choice.values[1:]
 }
-"""Feature -> the setting and the value for which an agent needs the feature."""
+"""Name of a feature -> the setting and the value that need this feature."""

@@ -18,7 +18,7 @@ class _ShortRepr(reprlib.Repr):
 
 
 def shown_key(key: object) -> str:
-    """Return a key of a mapping for an error message. A long key is shortened."""
+    """Return a mapping key for an error message. A long key is shortened."""
     return key if isinstance(key, str) and key.isprintable() and len(key) <= MAX_CHARACTERS else shown(key)
 
 

@@ -13,7 +13,7 @@ from ucp.timers import Timer
 
 
 class AgentState:
-    """The blocks, queries and counters of an agent. `now` is the mission second of its last input."""
+    """The state of an agent: its blocks, queries and counters. `now` is the mission second of its last input."""
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Settings) -> None:
         self.agent_id = agent_id
@@ -51,7 +51,7 @@ class AgentState:
         )
         self.timers = (self.voting_timer, *self.reconcile_timers)
         self.triggered: deque[tuple[LocalEvent, str]] = deque()
-        """Local events whose handlers have not run yet, and the names of the handlers that triggered them."""
+        """Local events that wait for their handlers, each with the name of the handler that triggered it."""
 
         self.reconciles = 0
         self.chain_changed_at = 0.0
@@ -59,7 +59,7 @@ class AgentState:
         self._held_aside: set[bytes] = set()  # hashes of the blocks in the deque and on the reconcile stack
 
     def holds(self, block_hash: bytes) -> bool:
-        """Return true if the block is in the chain, the deque or the reconcile stack."""
+        """Return true if the agent holds the block in its chain, deque or reconcile stack."""
         return block_hash in self.chain or block_hash in self._held_aside
 
     @property

@@ -2,11 +2,11 @@
 
 The store is a journal. An entry is a line: the CRC-32 of the rest in eight hexadecimal digits, a space, and JSON. The
 first entry identifies the agent. Each other entry has the changes by one input, as in a trace, and the new blocks. The
-agent writes an entry before other agents can observe the changes. Each entry has all changes of its input, so that the
-entries up to any line lead to a state of the agent. Reading ends at the first damaged line.
+agent writes an entry before other agents can observe the changes. Each entry has all changes of its input, so the
+entries up to any line describe a state that the agent had. A reader stops at the first damaged line.
 
-An agent that boots writes a new journal with the recovered data, and replaces the old one when the new one is on disk.
-A valid journal therefore exists at any time.
+An agent that boots writes a new journal with the recovered data, and replaces the old journal when the new one is on
+disk. A valid journal therefore exists at any time.
 """
 
 import base64
@@ -31,17 +31,17 @@ SCHEMA = "ucp-store/1"
 MAX_LINE_BYTES = 64 * 1024 * 1024
 
 Change = tuple[str, str]
-"""Operation and block hash, as in a trace."""
+"""A change of an agent's state: the operation and the block hash, as in a trace."""
 
 
 class StoreError(Exception):
-    """An error: this agent must not change the store. The message is one sentence."""
+    """An error: this agent must not change the store file. The message is one sentence."""
 
 
 @dataclass(slots=True)
 class SecuredState:
-    """Additional stored data of a secured agent: its start time, the signatures of blocks, and the received lists
-    of excluded vehicles.
+    """The data that a secured agent stores in addition: its start time, the signatures of blocks, and the received
+    revocations.
     """
 
     started_us: int
@@ -58,7 +58,7 @@ class SecuredState:
         self.revocations = (*self.revocations, *map(base64.b64decode, entry.get("revocations", ())))
 
     def entry(self, before: "SecuredState | None" = None) -> dict[str, Any]:
-        """Return the data that are new since `before`, as one entry for the store file."""
+        """Return the data that changed since `before`, as one entry for the store file."""
         new: dict[str, Any] = {}
         if before is None:
             new["started_us"] = self.started_us
@@ -96,17 +96,17 @@ class StoredState:
         yield from self.stack
 
     def encode(self) -> bytes:
-        """Return the blocks of chain, deque and reconcile stack, in this order. A length (u16) precedes each block."""
+        """Encode the blocks of chain, deque and reconcile stack, in this order. A length (u16) precedes each block."""
         return b"".join(len(data).to_bytes(2, "big") + data for data in (block.block_data() for block in self.blocks()))
 
     def check(self) -> None:
-        """Raise ValueError if this state is impossible for an agent."""
+        """Raise ValueError if no agent can have this state."""
         held = [block.block_hash for block in self.blocks()]
         if len({*held}) < len(held) or not {*self.completed} <= {*held}:
             raise ValueError("a block is in two places, or one that it completed in none")
 
     def _change(self, operation: str, block: Block) -> None:
-        """Apply one change, which has the same form as in a trace."""
+        """Apply one change, an operation with a block."""
         match operation:
             case "complete":
                 self.completed.append(block.block_hash)
@@ -124,8 +124,8 @@ class StoredState:
                 self.stack.remove(block)
 
     def replay(self, entry: dict[str, Any], known: dict[str, Block]) -> None:
-        """Apply all changes in one entry of the store file. Add its blocks to `known`, an index by hash of all blocks
-        so far.
+        """Apply all changes in one entry of the store file. Add its blocks to `known`, which maps the hashes of all
+        blocks so far to the blocks.
         """
         for agent_id, timestamp_us, event_data in entry["blocks"]:
             block = block_on_disk(agent_id, timestamp_us, base64.b64decode(event_data))
@@ -147,7 +147,7 @@ class Store:
 
     def __init__(self, path: Path, state: AgentState) -> None:
         self.problem: str | None = None
-        """The error of the disk at which the store ends early, or None."""
+        """The disk error that ended the store early. None without an error."""
         self._path = path
         self._state = state
         self._header = {
@@ -157,7 +157,7 @@ class Store:
         }
         self._written: set[str] = set()
         self._secured: SecuredState | None = None
-        """The last written data of this incarnation."""
+        """The data of a secured agent as it was last written to the disk."""
         self._file: BinaryIO | None = None
         self.recovered = self._read()
 
@@ -183,7 +183,7 @@ class Store:
     def write(self, changes: list[Change], secured: SecuredState | None = None) -> None:
         """Write the changes of one input to the disk. The first write after a start also contains the restored data.
 
-        The entry also has the new data of a `secured` agent.
+        `secured` is the additional data of a secured agent.
         """
         if self.problem is not None:
             return
@@ -236,9 +236,10 @@ class Store:
 
 
 def read_store(path: Path) -> tuple[Any, StoredState]:
-    """Return the header of a store and the state after all complete entries. The header is None in an empty store.
+    """Read a store file. Return its header and the state after the last complete entry. The header is None if the store
+    is empty.
 
-    Raises OSError, or StoreError for an entry with the right checksum that no agent wrote.
+    Raises OSError, or StoreError for an entry that has a valid checksum but was not written by an agent.
     """
     entries = _entries(path)
     stored, known = StoredState(), dict[str, Block]()
@@ -269,14 +270,14 @@ def _line(document: dict[str, Any]) -> bytes:
 
 
 def _append(file: BinaryIO, lines: bytes) -> None:
-    """Append the lines to the file, and make sure that they are on the disk. Raises OSError."""
+    """Append lines to the file and force them to the disk. Raises OSError."""
     if file.write(lines) != len(lines):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     os.fdatasync(file.fileno())
 
 
 def _sync_directory(path: Path) -> None:
-    """Make sure that the names of new files in a directory are on the disk."""
+    """Force the names of new files in this directory to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -4,7 +4,7 @@ time.
 
 
 class Timer:
-    """A timer. `deadline` is a mission second, or None while the timer is stopped or paused."""
+    """A timer of an agent. `deadline` is a mission second. It is None while the timer is stopped or paused."""
 
     __slots__ = ("_paused", "deadline", "name")
 
@@ -30,7 +30,7 @@ class Timer:
             self.deadline = None
 
     def resume(self, now: float) -> None:
-        """Continue after a pause. If the pause had no duration, the deadline is exactly the same as before."""
+        """Continue after a pause. If the pause ended at the second at which it began, the deadline does not change."""
         if self._paused is not None:
             paused_at, deadline = self._paused
             self.deadline = deadline + (now - paused_at)

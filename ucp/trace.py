@@ -1,9 +1,10 @@
 """The trace of an agent. It has a line of JSON for each handler run, and for each input that runs no handler.
 
-A trace has all inputs in full, including dropped datagrams, so the agent can run again from it. `changes` is complete:
-a replay of the changes gives the contents of chain, deque and reconcile stack after each step.
+A trace contains all inputs completely, including dropped datagrams, so the run of the agent can be repeated from it.
+`changes` is complete: a replay of the changes gives the contents of chain, deque and reconcile stack after each step.
 
-A line has datagrams, events and stores in base64. In memory they stay decoded until their text is needed.
+In a line, datagrams, events and stores are encoded in base64. In memory they are encoded only when their text is
+needed.
 """
 
 import base64
@@ -22,14 +23,14 @@ Tally = dict[str, int | list[int]]
 
 
 class Encodable(Protocol):
-    """An object that can be converted to bytes: a datagram, an event, or a store."""
+    """A protocol: an object that can be converted to bytes, such as a datagram, an event or a store."""
 
     def encode(self) -> bytes: ...
 
 
 class RecordedBytes:
-    """Recorded bytes. `text` is their base64 form. `content` is the decoded object. It is None if the bytes come from a
-    file.
+    """Recorded bytes. `text` is their base64 form. `content` is the decoded object. It is None if the bytes were read
+    from a file.
 
     Sender and receivers of a datagram share one object.
     """
@@ -37,7 +38,7 @@ class RecordedBytes:
     __slots__ = ("_text", "content")
 
     def __init__(self, text: str | None = None, content: Encodable | None = None) -> None:
-        """Create the object from base64 text or from a decoded object. The caller may omit one of the two."""
+        """Create the object from base64 text or from a decoded object. One of the two arguments may be None."""
         self._text = text
         self.content = content
 
@@ -65,7 +66,7 @@ class RecordedBytes:
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> dict[str, Any]:
-        """Let pydantic read the object from a string in a trace line."""
+        """Let pydantic parse this object from a string in a trace line."""
         made = {"type": "no-info", "function": cls}
         return {"type": "function-after", "function": made, "schema": handler(str)}
 
@@ -74,7 +75,7 @@ class RecordedBytes:
 class SentMessage:
     """A sent message in a trace line. `block` is the hash of the block that the message concerns, or None.
 
-    `datagram` is None in a trace of version 1, which lacks it.
+    `datagram` is None in a trace of version 1, which does not contain datagrams.
     """
 
     message: str
@@ -172,7 +173,7 @@ class HandlerRun:
 class DroppedDatagram:
     """A trace line about a datagram that the agent dropped, with the reason.
 
-    With a `count`, the line stands for this number of datagrams, and `datagram` is empty.
+    A line with a `count` stands for this number of datagrams. Its `datagram` is empty.
     """
 
     t: float

@@ -1,8 +1,8 @@
 """Define triggers, the reasons why a handler runs. There is a class for each kind of reason.
 
-A trace writes a trigger as a JSON object (`to_json`). `parse` reads one, and pydantic does so wherever a field has the
-type `Trigger`. An object that names no kind, several kinds, or a kind with missing or wrong values is an
-`UnknownTrigger`: no agent that follows the contract writes one.
+A trace writes a trigger as a JSON object (`to_json`). `parse` converts the JSON object back, and pydantic calls it for
+fields of type `Trigger`. An object with no kind, several kinds, or missing or wrong values becomes an `UnknownTrigger`.
+An agent that follows the contract never writes such an object.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ class Trigger:
 
     @property
     def subject(self) -> int | str:
-        """The value of the key `kind`, for example the name of a message or timer, or an event ID."""
+        """The value of the key `kind`, such as the name of a message or timer, or an event ID."""
         raise NotImplementedError
 
     def to_json(self) -> dict[str, int | str]:
@@ -78,7 +78,7 @@ class TimerTrigger(Trigger):
 
 @dataclass(unsafe_hash=True, slots=True)
 class LocalTrigger(Trigger):
-    """A trigger: another handler, whose name is stored here, triggered a local event."""
+    """A trigger: a handler triggered a local event. It has the name of this handler."""
 
     handler: str
 
@@ -140,11 +140,13 @@ _OF_ONE_VALUE: dict[str, tuple[type, Callable[[Any], Trigger]]] = {
     "boot": (int, BootTrigger),
 }
 KINDS = frozenset(("message", *_OF_ONE_VALUE))
-"""The keys of which a trigger has exactly one."""
+"""The keys that name the kind of a trigger. A trigger has exactly one of them."""
 
 
 def parse(fields: Mapping[str, int | str]) -> Trigger:
-    """Return the trigger that a JSON object of a trace describes. Without a valid key, it is an `UnknownTrigger`."""
+    """Return the trigger that a JSON object of a trace describes. Return an `UnknownTrigger` if the object is not
+    valid.
+    """
     kinds = KINDS.intersection(fields)
     if len(kinds) != 1:
         return UnknownTrigger(fields)

@@ -2,7 +2,7 @@
 
 The program reads lines of JSON from standard input. Each line has an input and its time. The program answers with a
 line on standard output: its broadcasts, the time of its next timer, and its trace lines. It has no socket, no file and
-no clock. A mission line starts a new agent. contract/CONTRACT.md defines this for any agent.
+no clock. A line with a mission starts a new agent. contract/CONTRACT.md defines these lines for all agents.
 """
 
 import base64
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from ucp.secure.secured_agent import SecuredAgent
 
 LATEST_S = 1e12
-"""Latest mission second. Later timestamps do not fit into an event."""
+"""Latest mission second. The timestamps of later events would not fit into their fields."""
 MAX_LINE_BYTES = 16 * MAX_MISSION_BYTES
-"""Maximum length of a line. A mission with a store is the longest."""
+"""Maximum length of an input line in bytes. A mission with a store is the longest line."""
 
 
 class InputError(Exception):
@@ -64,7 +64,9 @@ def serve(lines: BinaryIO, answers: BinaryIO) -> None:
 
 
 class VirtualAgent:
-    """An agent from its start to its end. Its first line is `{"t", "mission", "trace", "store"}`. Raises InputError."""
+    """An agent in virtual time, from its start to its end. Its first input is a line with the keys `t`, `mission`,
+    `trace` and `store`. Raises InputError.
+    """
 
     def __init__(self, given: dict[str, Any]) -> None:
         try:
@@ -83,7 +85,7 @@ class VirtualAgent:
         self._epoch_us = mission.epoch_us
         self._tracing = given.get("trace", True) is True
         self._rng = Random(mission.seed)
-        """The random draws of its quirks."""
+        """The random number generator of the agent's quirks."""
         make, self._secured = _agent_factory(mission, given), mission.security is not None
         self._agent = make(
             mission.agent_id,
@@ -129,7 +131,7 @@ class VirtualAgent:
             raise InputError("neither a mission, a datagram, an event, a timer nor a command")
 
     def answer(self) -> str:
-        """Return the results of the last input as one line of text."""
+        """Return the outputs that the last input caused, as one line of text."""
         entries = [*self._agent.trace(), *self._traced_commands]
         self._traced_commands = []
         self._handled += sum(isinstance(entry, HandlerRun) for entry in entries)
@@ -305,7 +307,7 @@ def _store_document(stored: StoredState) -> dict[str, Any]:
 
 
 def _parse_store(value: Any, *, secured: bool) -> StoredState:
-    """Parse stored data in the form of the command `store`'s answer. Raises InputError."""
+    """Parse stored data, which has the form of the answer to the command `store`. Raises InputError."""
 
     def blocks(place: str) -> list[Block]:
         return [
@@ -326,6 +328,6 @@ def _parse_store(value: Any, *, secured: bool) -> StoredState:
 
 
 def main() -> int:
-    """Answer input lines until the end of standard input. The exit status is 0."""
+    """Answer each input line until standard input ends. Return exit status 0."""
     serve(sys.stdin.buffer, sys.stdout.buffer)
     return 0

@@ -10,8 +10,8 @@ from struct import Struct
 
 
 class FieldKind(Enum):
-    """The type of a field in a message. The value of a member with a fixed size is its big-endian format in Python's
-    `struct`.
+    """The type of a field in a message. For a type of fixed size, the value of the member is its big-endian format in
+    Python's `struct`.
     """
 
     U8 = "B"
@@ -25,15 +25,15 @@ class FieldKind(Enum):
     """Number of the incarnation of a vehicle, in secured datagrams."""
     HASH = "32s"
     OPTIONAL_HASH = "hash or nothing"
-    """The last field: the remaining bytes, 32 or none."""
+    """The last field of a message: either 32 bytes, or nothing."""
     BLOCK = "block"
-    """The last field: the remaining bytes, a block."""
+    """The last field of a message: an encoded block, which takes all remaining bytes."""
 
 
 Fields = Mapping[str, FieldKind]
 
 VARIABLE = frozenset((FieldKind.OPTIONAL_HASH, FieldKind.BLOCK))
-"""Kinds that have no fixed size."""
+"""Kinds of fields that have no fixed size."""
 
 
 def struct_of(fields: Fields) -> Struct:

@@ -31,7 +31,7 @@ MAX_TIME_S = 31 * 86400.0
 
 
 def seconds_of(option: str, text: str) -> float:
-    """Return the seconds in a time such as 90s, 30m or 8h. Raises BadParameter that names the option."""
+    """Return the number of seconds in a time such as 90s, 30m or 8h. Raises BadParameter, which names the option."""
     duration = _DURATION.fullmatch(text.strip())
     seconds = float(duration[1]) * _UNITS[duration[2]] if duration else 0.0
     if not 0 < seconds <= MAX_TIME_S:
@@ -53,8 +53,8 @@ def _may_hold_scenario(path: Path) -> bool:
 
 
 def opener_of(bundle: Path | None) -> "DatagramOpener | None":
-    """Return an object that decrypts the datagrams of a secured mission. Return None without a key file. Raises
-    KeysError, MachineError.
+    """Return an object that decrypts the datagrams of a secured mission with this key bundle. Return None without a
+    bundle. Raises KeysError, MachineError.
     """
     if bundle is None:
         return None
@@ -76,7 +76,7 @@ DepotKey = Annotated[
 
 
 def depot_of(path: Path | None) -> "Depot | None":
-    """Return the key, read from a file, that decrypts event data. Return None without a file. Raises KeysError,
+    """Read the depot key from a file. The key decrypts event data. Return None without a path. Raises KeysError,
     MachineError.
     """
     if path is None:
@@ -112,7 +112,9 @@ def trusted_keys(path: Path | None) -> "PublicKeys | None":
 
 
 def roster_of(text: str) -> int | list[int]:
-    """Return the value for the key `agents` of a scenario: a number, or a list of IDs. Raises ScenarioError."""
+    """Return the value of the scenario key `agents` for this text of the user: a number, or a list of IDs. Raises
+    ScenarioError.
+    """
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isascii() and part.isdecimal() and len(part) < 10 for part in parts):
         raise ScenarioError(f"`--agents` is {text!r}: use a number of agents, or IDs such as 10,28,32")
@@ -120,8 +122,8 @@ def roster_of(text: str) -> int | list[int]:
 
 
 def refuse_existing(paths: Iterable[Path]) -> None:
-    """Raise RunDirectoryError if an output file exists. Call this before long work whose results could not be
-    written.
+    """Raise RunDirectoryError if an output file already exists. A command calls this before a long computation, because
+    its results could not be written afterwards.
     """
     for path in paths:
         if path.exists():
@@ -129,7 +131,7 @@ def refuse_existing(paths: Iterable[Path]) -> None:
 
 
 def write_new(path: Path, parts: Iterable[str]) -> None:
-    """Write a new file.
+    """Write the text `parts` to a new file.
 
     Raises RunDirectoryError if the file exists or cannot be created, and MachineError if writing fails.
     """
@@ -150,7 +152,8 @@ def write_new(path: Path, parts: Iterable[str]) -> None:
 
 @contextlib.contextmanager
 def write_whole(path: Path) -> Iterator[None]:
-    """Yield while the caller writes a new file or directory. If the caller fails, remove it.
+    """Let the caller write a new file or directory inside the context. If the caller fails, remove the incomplete
+    output.
 
     Raises RunDirectoryError if `path` exists or cannot be created, and MachineError if writing fails.
     """

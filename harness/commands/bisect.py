@@ -30,7 +30,9 @@ from ucp.agent_files import write_atomically
 
 NOT_FOUND = 1
 CHANGED, UNTESTABLE, WRONG_ONCE_REQUEST = 1, 125, 128
-"""Exit statuses of --once, as `git bisect run` defines them. It stops at 128 and above."""
+"""Exit statuses of `bisect --once`, as `git bisect run` defines them. `git bisect run` stops at a status of 128 or
+above.
+"""
 FILES_SHOWN = 12
 CHANGES_SHOWN = 8
 ONCE = "With --once"
@@ -43,7 +45,9 @@ class OnceUsageError(typer.BadParameter):
 
 
 class BisectCommand(TyperCommand):
-    """The command `bisect`. With --once, wrong arguments give exit status 128, at which `git bisect run` stops."""
+    """The command `bisect`. With the option --once, wrong arguments cause exit status 128, at which `git bisect run`
+    stops.
+    """
 
     def make_context(self, info_name: str | None, args: list[str], *rest: Any, **options: Any) -> Any:
         once = "--once" in args
@@ -144,7 +148,7 @@ class _PlayRequest:
     limit_s: float
 
     def workshops(self, directory: Path) -> list[SubjectPlayer]:
-        """Return a player of the scenario or record for each agent command. Raises HarnessError."""
+        """Return a player for each agent command. It plays the scenario or the record. Raises HarnessError."""
         subject = subject_of(self.subject, self.seed, self.agent)
         workshops = []
         for number, command in enumerate(self.commands):
@@ -206,8 +210,8 @@ def _try_once(
 
 
 def _changes(before: Outcome | None, outcomes: Sequence[Outcome], of_records: bool) -> list[str]:
-    """Return the differences between the results and the expected result. Without an expected result, compare with the
-    record or the first result.
+    """Return the differences between the outcomes and the expected outcome. Without an expected outcome, compare with
+    the record or with the first outcome.
     """
     if before is not None:
         return [sentence for outcome in outcomes for sentence in differences(before, outcome)]

@@ -120,7 +120,9 @@ def _test_all(agents: Mapping[str, Sequence[str]], only: str | None, page: Path,
 
 
 def _unused_path(place: Path) -> Path:
-    """Return `place`, or a path with the first free number, so that earlier results are not overwritten."""
+    """Return `place` if no file exists there. Otherwise append the first free number to it, so that earlier results are
+    not overwritten.
+    """
     number, fresh = 1, place
     while fresh.exists():
         number += 1

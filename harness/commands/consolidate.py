@@ -1,4 +1,6 @@
-"""Implement `ucp-harness consolidate`, which merges the exports of all vehicles into one record in order of time."""
+"""Implement `ucp-harness consolidate`, which merges the chain exports of all vehicles into one record, sorted by
+time.
+"""
 
 import json
 from collections.abc import Callable, Iterable, Iterator
@@ -106,7 +108,7 @@ def _write_outputs(
     geojson_file: Path | None,
     csv_file: Path | None,
 ) -> Iterator[str]:
-    """Write the requested files. Yield a line of text with the path of each file."""
+    """Write the requested output files. Yield a line of text with the path of each file."""
     if out is not None:
         write_new(out, record_outputs.lines(record, reconciled))
         yield str(out)
@@ -120,7 +122,9 @@ def _write_outputs(
 
 
 def _tracks(record: MergedRecord) -> list[EventTrack]:
-    """Return the logged paths of vehicles, and those in flight logs of vehicles that logged no position."""
+    """Return the tracks of the vehicles: the positions that vehicles logged as events, and the flight logs of the other
+    vehicles.
+    """
     logged = record_outputs.tracks(record)
     known = {track.agent_id for track in logged}
     flown = record_outputs.flown_tracks(record_outputs.flight_logs(record))

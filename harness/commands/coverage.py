@@ -21,7 +21,7 @@ from harness.scenario import load_scenario
 from ucp.settings import Settings
 
 BLOCK_SIZE_SETTINGS = {*EVENT_FILLS_BLOCK, "max_event_bytes"}
-"""Settings that only affect the size of blocks. In the state space of `prove`, blocks have no size."""
+"""Settings that affect only the size of blocks. They have no effect on `prove`, whose blocks have no size."""
 
 
 def coverage_command(
@@ -68,7 +68,7 @@ def coverage_command(
 
 
 def _relevant_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings that differ from their defaults and affect the steps of an agent."""
+    """Return the settings that differ from their defaults and affect the local states of an agent."""
     default = dataclasses.asdict(Settings())
     return {
         name: value

@@ -48,7 +48,7 @@ def diff_command(
 
 
 def _lines(difference: RunDifference) -> Iterator[str]:
-    """Yield the lines of the result. In these lines, A is the first run, and B is the second run."""
+    """Yield the lines of the printed result. They call the first run A and the second run B."""
     for differing in difference.keys:
         yield f"{differing.key}: {_value(differing.a)} in A, {_value(differing.b)} in B"
     yield from _programs(difference)
@@ -64,7 +64,7 @@ def _lines(difference: RunDifference) -> Iterator[str]:
 
 
 def _programs(difference: RunDifference) -> Iterator[str]:
-    """Yield lines about the agents' programs. Yield none if all agents of A and B are the harness's own."""
+    """Yield lines about the programs of the agents. Yield no line if all agents of both runs are the harness's own."""
     a, b = difference.programs["a"], difference.programs["b"]
     if a == b:
         yield from [f"in both runs {in_sentence(a)}"] if a else []
@@ -91,7 +91,9 @@ def _differences(difference: RunDifference) -> Iterator[str]:
 
 
 def _step_texts(first_difference: FirstDifference) -> tuple[str, str]:
-    """Return the differing handler runs of A and B as text. Changes and messages are included only if they differ."""
+    """Return the first differing handler run of each of the two runs as text. Changes and messages are included only if
+    they differ.
+    """
     a, b = first_difference.a, first_difference.b
     changes = a is None or b is None or a.changes != b.changes
     sent = a is None or b is None or a.sent != b.sent

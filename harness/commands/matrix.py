@@ -22,7 +22,7 @@ from harness.sweep.matrix.variant_comparison import compare_runs
 from ucp.agent_files import write_atomically, write_json_atomically
 
 NIGHTS = "Compare nights"
-"""Panel of the options that compare with earlier results."""
+"""Title of the help panel for options that compare a matrix with earlier results."""
 
 
 def matrix_command(

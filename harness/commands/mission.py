@@ -195,7 +195,7 @@ def _texts(option: str, pairs: list[str] | None) -> dict[str, str]:
 
 
 def _pairs(option: str, pairs: list[str] | None) -> dict[str, Any]:
-    """Return the value of each key. A value that is not valid JSON counts as text."""
+    """Return the values of options in the form KEY=VALUE, by key. A value that is not valid JSON is a text."""
     values: dict[str, Any] = {}
     for key, text in _texts(option, pairs).items():
         try:
@@ -206,6 +206,8 @@ def _pairs(option: str, pairs: list[str] | None) -> dict[str, Any]:
 
 
 def _events(values: dict[str, Any]) -> dict[str, Any]:
-    """Divide the value of `log` at its commas, so that `--event log=mode,position` needs no brackets."""
+    """Split the value of `log` at its commas, so that the user can write `--event log=mode,position` without
+    brackets.
+    """
     log = values.get("log")
     return {**values, "log": log.split(",")} if isinstance(log, str) else values

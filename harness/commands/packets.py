@@ -82,6 +82,8 @@ def _output_lines(
 
 
 def _paint() -> Paint:
-    """Return a function that colours text red on a terminal, and otherwise returns it unchanged."""
+    """Return a function that colours a text red. If the output is no terminal, the function returns the text
+    unchanged.
+    """
     console = output()
     return partial(typer.style, fg="red") if console.is_terminal and not console.no_color else str

@@ -60,7 +60,7 @@ def replay_command(
 
 
 def _play(console: Console, records: Sequence[RecordedTrace], until: float | None, as_json: bool) -> NoReturn:
-    """Replay whole records, and print the differences."""
+    """Replay complete records, and print the differences."""
     replayed_records, differ, judged = list[ReplayedRecord](), False, False
     for record in records:
         _print_problems(record)
@@ -81,7 +81,7 @@ def _play(console: Console, records: Sequence[RecordedTrace], until: float | Non
 def _step_through(
     console: Console, record: RecordedTrace, until: float | None, at_start: bool, breaks: Sequence[str], debug: bool
 ) -> NoReturn:
-    """Step through a record as the user's commands demand. When the commands end, replay the remaining steps."""
+    """Let the user step through a record with commands. After the last command, replay the remaining steps."""
     _print_problems(record)
     names = ReplayNames(record)
     player = RecordPlayer(record, until, IN_USE if debug else REFERENCE)
@@ -103,7 +103,9 @@ def _step_through(
 
 
 def _in_use(in_use: ReplayResult, result: ReplayResult) -> list[Text]:
-    """Return a sentence if the installed agent core plays the record differently than the reference does."""
+    """Return a warning if the installed agent core handles the recorded inputs differently from the reference.
+    Otherwise return None.
+    """
     if [each.line for each in in_use.deviations] == [each.line for each in result.deviations]:
         return []
     edited = f", with the edited {', '.join(edited_files())}," if edited_files() else ""

@@ -57,7 +57,7 @@ def report_command(run: Annotated[Path, typer.Argument(help="Run directory.")]) 
 
 
 def _missing(source: report.ReportSource) -> Iterator[str]:
-    """Yield a sentence for each part of a complete run that this run lacks."""
+    """Yield a sentence for each part of a complete run that is missing in this run."""
     if source.archive.recorded and source.record.outcome == "running":
         yield "the end of the run is not recorded: the run is still active, or it was killed"
     if not source.record.characteristics:

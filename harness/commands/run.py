@@ -218,7 +218,7 @@ def _with_options(
     image_from_host: bool,
     programs: Programs,
 ) -> Scenario:
-    """Return the scenario with the options of the command line, which replace keys of the file."""
+    """Return the scenario with the options of the command line. An option replaces the key of the scenario."""
     document: dict[str, Any] = scenario.model_dump() | command_keys(scenario, programs)
     if speedup is not None:
         if not 0 < speedup <= 1000:

@@ -62,7 +62,7 @@ def _table(runs: list[PastRun]) -> Table:
 
 
 def _verdict(record: RunRecord) -> tuple[Kind, str]:
-    """Return a summary of all verdicts in a few words, and its class: good, bad or unknown."""
+    """Return a short summary of all verdicts of a run, and its class: good, bad or unknown."""
     kinds = {key: kind_of(judgement.verdict) for key, judgement in record.judgements.items()}
     bad = {key: BAD_IN_WORDS[key] for key, kind in kinds.items() if kind == "bad" and key in BAD_IN_WORDS}
     if bad:

@@ -104,7 +104,7 @@ class _AvailableBinary:
     size_bytes: int
     version: str | None = None
     commit: str | None = None
-    """First digits of the commit hash."""
+    """First digits of the hash of the git commit from which the binary was built."""
     sha256: str | None = None
     defaults: str | None = None
     """Path of the default parameters."""
@@ -148,7 +148,9 @@ def _build_details(vehicle: VehicleType, binary: Path) -> dict[str, Any]:
 
 
 class _DownloadBar:
-    """A progress bar on a terminal. Elsewhere, it only reports that the command waits for another installation."""
+    """A progress bar for a download on a terminal. Without a terminal, it only reports that the command waits for
+    another installation.
+    """
 
     def __init__(self, console: Console, what: str) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn())

@@ -25,7 +25,9 @@ _TIME_COMMANDS: list[tuple[re.Pattern[str], str, str | None]] = [
     (re.compile("step"), "step", None),
     (re.compile(r"step (\d{1,9}(?:\.\d{1,9})?)(?: s)?"), "step", "seconds"),
 ]
-"""Pattern of a sentence about virtual time, the command for the run, and the key of the number in the sentence."""
+"""Patterns of sentences about virtual time. Each has the command for the run, and the key of the number in the
+sentence.
+"""
 _COMMAND_EXAMPLES = (
     "`partition 1 2 | 3`, `heal`, `1 does not reach 2 3`, `1 reaches 2 3 again`, "
     f"{', '.join(f'`{verb} 1`' for verb in VERBS)}, an entry of a timeline such as `{{loss: 0.5}}`; in virtual time "
@@ -59,7 +61,7 @@ def tell_command(
 
 
 def _parse_requests(sentence: str) -> list[dict[str, Any]]:
-    """Return the requests for a sentence of the user, such as "speed 10".
+    """Parse a sentence of the user, such as "speed 10". Return the requests for the run.
 
     Raises ScenarioError for an unknown sentence.
     """

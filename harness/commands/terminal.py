@@ -30,7 +30,7 @@ MARKS: dict[Kind, str] = {"good": "✔", "bad": "✘", "unknown": "-"}
 EVIDENCE_SHOWN = 5
 LINE_EVERY_S = 10.0
 UNLIMITED = 1_000_000
-"""Width of the output in a pipe or file, in characters."""
+"""Maximum width of the output in a pipe or file, in characters."""
 
 
 def output(*, stderr: bool = False, highlight: bool = True) -> Console:
@@ -42,7 +42,7 @@ def output(*, stderr: bool = False, highlight: bool = True) -> Console:
 
 
 def show_result(console: Console, result: checker.Result, record: RunRecord) -> None:
-    """Print verdicts and numeric results. `record` contains the expectations of the scenario."""
+    """Print the verdicts and the numeric results of a run. `record` contains the expectations of the scenario."""
     expect, table = record.expect, Table.grid(padding=(0, 2))
     for key, judgement in result.judgements.items():
         expected = expect.remark(key, judgement.verdict) == AS_EXPECTED
@@ -81,7 +81,7 @@ def show_rogue(console: Console, injected: list[RogueInjection]) -> None:
 
 
 def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Path) -> NoReturn:
-    """Print the result of a matrix and exit. Without a table to print, print JSON."""
+    """Print the result of a matrix as a table and end the command. Without a table, print the result as JSON."""
     if table is None:
         print_json(record.to_json())
     else:
@@ -95,7 +95,7 @@ def end_sweep(record: "MatrixRecord", table: RenderableType | None, picture: Pat
 
 
 def print_lines(texts: Iterable[str]) -> None:
-    """Print lines without markup. A character that the terminal cannot show becomes a question mark."""
+    """Print lines as they are, without markup. A character that the terminal cannot show becomes a question mark."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
     for text in texts:
@@ -111,7 +111,9 @@ def complain(sentence: str) -> None:
 
 
 class StatusLine:
-    """A progress display on standard error: one changing line on a terminal, otherwise a line every 10 s."""
+    """A progress display on standard error. A terminal shows one line that changes. Other outputs get a line every 10
+    s.
+    """
 
     def __init__(self) -> None:
         self._console = Console(stderr=True)

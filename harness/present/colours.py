@@ -34,18 +34,20 @@ class AgentColours:
 
 
 def inks(agent_ids: Iterable[int]) -> dict[int, AgentColours]:
-    """Return the colours of each agent. The same set of agents always gets the same colours."""
+    """Return the colour of each agent. The colours depend only on the set of agents."""
     return {agent_id: _ink(position) for position, agent_id in enumerate(sorted(set(agent_ids)))}
 
 
 def ramp(first: Rgb, last: Rgb, steps: int) -> list[AgentColours]:
-    """Return `steps` colours that change gradually from `first` to `last`. These two should differ in lightness."""
+    """Return `steps` colours that change gradually from `first` to `last`. The first and the last colour should differ
+    in lightness.
+    """
     fills = [_mixed(first, last, step / (steps - 1)) for step in range(steps)]
     return [AgentColours(fill, fill, _text_on(fill)) for fill in fills]
 
 
 def contrast(first: str, second: str) -> float:
-    """Return the contrast ratio of two colours by WCAG 2, from 1 to 21."""
+    """Return the contrast ratio of two colours as WCAG 2 defines it, from 1 to 21."""
     dark, light = sorted((_luminance(first), _luminance(second)))
     return (light + 0.05) / (dark + 0.05)
 

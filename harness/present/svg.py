@@ -16,7 +16,7 @@ WIDTH, MARGIN = 900, 16
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu Sans', sans-serif"
 INK, QUIET, RULE, GROUND = "#1c2126", "#57616b", "#d9dee2", "#ffffff"
 COLOURS = ("#0072b2", "#a83900", "#00785a", "#8a3f74")
-"""Colours of the lines in a panel: hues of Okabe and Ito, dark enough for text on white."""
+"""Colours of the lines in a chart: hues of Okabe and Ito, dark enough for text on a white background."""
 CLASSES = ("first", "second", "third", "fourth")
 DASHES = ("", "6 3", "2 3", "9 3 2 3")
 TITLE_LENGTH = 80
@@ -53,12 +53,12 @@ class ChartArea:
 
     @property
     def across(self) -> tuple[float, float]:
-        """The start and end of a horizontal axis in pixels."""
+        """The left and the right end of the horizontal axis, in pixels."""
         return self.x + _LEFT, self.x + self.width - _RIGHT
 
     @property
     def up(self) -> tuple[float, float]:
-        """The start and end of a vertical axis in pixels."""
+        """The bottom and the top of the vertical axis, in pixels."""
         return self.y + self.height - _BOTTOM, self.y + _TOP
 
 
@@ -99,15 +99,15 @@ def log_axis(first: float, last: float, place: tuple[float, float], most: int = 
 
 
 def step(span: float, most: int) -> float:
-    """Return the smallest round distance of ticks (1, 2, 2.5 or 5 times a power of ten) that divides `span` into at
-    most `most` parts.
+    """Return the tick distance of an axis: the smallest round number (1, 2, 2.5 or 5 times a power of ten) that divides
+    `span` into at most `most` parts.
     """
     unit: float = 10.0 ** math.floor(math.log10(span / most))
     return next(factor * unit for factor in (1, 2, 2.5, 5, 10) if factor * unit * most >= span * (1 - 1e-9))
 
 
 def frame(title: str, across: Axis, up: Axis, across_texts: Iterable[str], up_texts: Iterable[str]) -> Markup:
-    """Draw the title, grid lines and ticks of a chart."""
+    """Draw the parts of a chart other than its data: title, grid lines and ticks."""
     parts = [
         Markup('<text x="{}" y="{}" font-weight="600" fill="{}">{}</text>').format(
             n(across.start - _LEFT + 4), n(up.end - _TOP + 16), INK, title
@@ -130,7 +130,7 @@ def frame(title: str, across: Axis, up: Axis, across_texts: Iterable[str], up_te
 
 
 def line(points: Iterable[tuple[float, float]], number: int) -> Markup:
-    """Draw a line through these points, with the colour and dashes of line number `number`."""
+    """Draw a line through these points. `number` is the number of the line, and selects its colour and its dashes."""
     dash = DASHES[number % len(DASHES)]
     return Markup('<path class="line" d="M{}" stroke="{}" stroke-width="2" stroke-linejoin="round"{}/>').format(
         "L".join(f"{n(x)} {n(y)}" for x, y in points),
@@ -140,7 +140,7 @@ def line(points: Iterable[tuple[float, float]], number: int) -> Markup:
 
 
 def dot(x: float, y: float, number: int, tip: str) -> Markup:
-    """Draw a dot with a tooltip."""
+    """Draw a dot with the tooltip `tip`."""
     return Markup(
         '<circle cx="{}" cy="{}" r="3" fill="{}" stroke="{}" stroke-width="2"><title>{}</title></circle>'
     ).format(n(x), n(y), GROUND, COLOURS[number % len(COLOURS)], tip)

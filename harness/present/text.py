@@ -8,10 +8,12 @@ from typing import Any
 from rich.text import Text
 
 _EPOCH_FROM_US = 1_000_000_000_000_000
-"""Timestamps from here on (2001) are since the Unix epoch. Smaller ones are since the start of a virtual run."""
+"""Limit that separates two kinds of timestamps. From this value on (the year 2001), they count from the Unix epoch.
+Smaller ones count from the start of a virtual run.
+"""
 _LAST_EPOCH_US = 253_402_300_799_000_000
 MAX_WORD = 120
-"""Number of characters of a misspelt word that are compared."""
+"""Maximum number of characters of a misspelt word that are compared with the allowed words."""
 
 
 def moment(timestamp_us: int) -> str:
@@ -84,7 +86,7 @@ def shown(words: str, style: str = "") -> Text:
 
 def did_you_mean(word: object, allowed: Iterable[object]) -> str:
     """Return a hint with the most similar allowed word, such as "; did you mean `loss_15`?". Return an empty text if no
-    word is similar.
+    allowed word is similar.
     """
     from difflib import get_close_matches  # imported late, because only errors need it
 

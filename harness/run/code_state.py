@@ -20,7 +20,7 @@ from harness.errors import HarnessError, InterruptedRunError, MachineError
 ROOT = Path(__file__).parents[2]
 """The directory of the running harness."""
 GRACE_S = 30.0
-"""Time for a run to stop, because it removes its lab first."""
+"""Seconds that a run may take to stop after SIGTERM, because it first removes its lab."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class ProcessResult:
 
     @property
     def last_error_line(self) -> str:
-        """The last line of standard error, without the name of the program."""
+        """The last line that the process wrote to standard error, without the name of the program."""
         lines = [line.strip() for line in self.stderr.splitlines() if line.strip()]
         return lines[-1].removeprefix("ucp-harness: ")[:300] if lines else "it said nothing"
 
     def raised_in(self, directory: Path) -> str | None:
-        """Return the exception that ended the process, with its innermost source line in `directory`.
+        """Return the exception that ended the process, with the innermost line of its traceback in `directory`.
 
         Return None if there is no such line.
         """
@@ -133,11 +133,13 @@ _GIT_LOCATION_VARIABLES = (
     "GIT_COMMON_DIR",
     "GIT_PREFIX",
 )
-"""Variables that a hook or `git bisect run` may have set. They would lead git to another repository."""
+"""Environment variables that a hook or `git bisect run` may have set. With them, git would use a different
+repository.
+"""
 
 
 class RepositoryError(HarnessError):
-    """An error: git cannot search this repository, or does not know the revision."""
+    """An error: git cannot search this repository, or the repository does not contain the revision."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ class GitCommit:
 
 @dataclass(frozen=True)
 class SuspectCommits:
-    """The result of a search for the first bad commit: this commit, or several candidates if some commits could not be
+    """The result of a search for the first bad commit: one commit, or several candidates if some commits could not be
     tested.
     """
 

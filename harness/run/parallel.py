@@ -35,7 +35,7 @@ R = TypeVar("R")
 REDRAW_EVERY_S = 0.1
 LINE_EVERY_S = 10.0
 WAKE_EVERY_S = 1.0
-"""Maximum time until the parent process handles a signal that arrives just before it waits."""
+"""Maximum number of seconds until the parent process handles a signal that arrives just before the process waits."""
 
 _FORK = multiprocessing.get_context("fork")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -80,7 +80,9 @@ def sweep(
 
 
 def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError:
-    """Return the result of one task. The parent process passes it to `raise_error`."""
+    """Call `work` with one task in a worker process, and return the result or the error. The parent process passes it
+    to `raise_error`.
+    """
     try:
         return work(task)
     except HarnessError as error:
@@ -92,7 +94,7 @@ def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError
 
 
 def raise_error(outcome: R | HarnessError) -> R:
-    """Raise the result of a task if this result is an error. Otherwise return the result."""
+    """Return the outcome of a task, or raise it if it is an error."""
     if isinstance(outcome, HarnessError):
         raise outcome
     return outcome

@@ -1,4 +1,6 @@
-"""Record the versions of the software that played and judged a run, for the key `versions` of result files."""
+"""Record the versions of the software that played and judged a run. Result files contain them under the key
+`versions`.
+"""
 
 import hashlib
 import platform
@@ -43,8 +45,8 @@ MODIFIED = "-dirty"
 
 
 def same_judge(recorded: Mapping[str, str]) -> bool:
-    """Return true if the installed checker is unmodified and has the recorded versions, so that it is the checker that
-    judged the run.
+    """Return true if the installed checker judged the run: its versions equal the recorded ones, and its code is
+    unmodified.
     """
     present = versions()
     return not present.get("commit", "").endswith(MODIFIED) and all(
@@ -53,7 +55,7 @@ def same_judge(recorded: Mapping[str, str]) -> bool:
 
 
 def differing_versions(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
-    """Return the versions that differ between two records, such as "core x and y"."""
+    """Return the names of the versions that differ between two records as text, such as "core x and y"."""
     return [
         f"{key} {a.get(key, 'unknown')} and {b.get(key, 'unknown')}"
         for key in ("ucp-harness", "commit", "core", "reference")
@@ -63,7 +65,7 @@ def differing_versions(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
 
 @cache
 def _reference_version() -> str:
-    """Return a digest of the reference implementation that judges steps."""
+    """Return a digest of the reference implementation, with which the checker compares handler runs."""
     files = sorted(Path(reference.__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 

@@ -166,9 +166,7 @@ class RunRecording:
         self._update(scenario=scenario)
 
     def record_requests(self, interventions: Interventions) -> None:
-        """Write the actions that the user has requested until now to the record of the run. Also write a scenario that
-        repeats them.
-        """
+        """Record the actions that the user has requested so far. Also write a scenario that repeats them."""
         self.update_scenario(interventions.scenario)
         by_hand_s = [entry.at_s for entry in interventions.by_hand]
         replay = replay_of(self._record, by_hand_s)
@@ -178,7 +176,7 @@ class RunRecording:
             raise MachineError(f"{self.directory.path / REPLAY_FILE} cannot be written: {error.strerror}") from None
 
     def record_outcome(self, played: RunOutcome) -> None:
-        """Write the results that are known until now to the record of the run."""
+        """Record the results of the mission so far."""
         self._update(
             engine=played.engine,
             mission_s=played.mission_s,
@@ -242,13 +240,15 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
 async def _play_with_requests(
     interventions: Interventions, directory: RunDirectory, swarm: mission.Swarm, scenario: Scenario
 ) -> None:
-    """Play a mission in which a user, or another process, can request events."""
+    """Play a mission during which a user or another process can request events."""
     async with serve_requests(interventions, directory.path):
         await interventions.story(swarm, scenario)
 
 
 def _outcome_of(run: Coroutine[Any, Any, RunOutcome], interrupted: asyncio.Event) -> RunOutcome:
-    """Run a coroutine to its end. If this thread already runs an event loop, as in a notebook, use another thread."""
+    """Run a coroutine to its end. If this thread already runs an event loop, as in a notebook, start another thread for
+    it.
+    """
     try:
         asyncio.get_running_loop()
     except RuntimeError:

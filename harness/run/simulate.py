@@ -1,6 +1,7 @@
 """Play and judge scenarios in virtual time in memory, without a run directory.
 
-The checker is the same as for other runs. It gets the evidence directly from the agents instead of from files.
+The checker is the same as for other runs. The checker reads the evidence directly from the agents instead of from
+files.
 """
 
 from collections.abc import Callable, Coroutine, Iterable, Mapping
@@ -67,7 +68,7 @@ def simulate(
 def simulate_in_memory(
     memory: "MemoryRecorder", scenario: Scenario, seed: int, *, again: bool = False, **options: Any
 ) -> Simulated:
-    """Play and check a scenario as `simulate` does. `memory` stores the records of the run, and `options` are the
+    """Play and check a scenario as `simulate` does, and store the records of the run in `memory`. `options` are the
     options of the simulation.
     """
     SimulationBackend().refuse(scenario)
@@ -98,9 +99,7 @@ def check_determinism(scenario: Scenario, seed: int) -> None:
 
 
 def run_to_end(story: Coroutine[Any, Any, Returned]) -> Returned:
-    """Run a coroutine without an event loop. The coroutine must never wait, as is the case for a mission in virtual
-    time.
-    """
+    """Run a coroutine without an event loop. The coroutine must never wait. In virtual time, a mission never waits."""
     try:
         story.send(None)
     except StopIteration as end:
@@ -203,7 +202,7 @@ Judge = Callable[[Scenario, int], Result]
 
 
 ENDED = "ended"
-"""Key of the judgement on an agent that crashed or hung during the mission."""
+"""Key of the verdict on an agent that crashed or hung during the mission."""
 
 
 @gc_paused()
@@ -253,8 +252,8 @@ def choose_path(out: Path | None, name: str) -> Path:
 
 
 def write_new_file(path: Path, text: str) -> Path:
-    """Write a new file and return its path. If another process has created a file with this name, a number is appended
-    to the name. Raises MachineError.
+    """Write a new file and return its path. If a file with this name exists by now, append a number to the name. Raises
+    MachineError.
     """
     free, number = path, 2
     while True:

@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 Quirks = dict[str, bool | float]
-"""Name of a quirk -> true or its probability. False, 0 and a missing quirk mean the same."""
+"""Quirks of an agent. The value of a quirk is true or a probability. False and 0 mean the same as a missing quirk."""
 
 QUIRKS: dict[str, Quirk] = {
     quirk.name: quirk
@@ -55,12 +55,12 @@ def check_quirk(name: str, value: object) -> None:
 
 
 def active_quirks(quirks: Mapping[str, bool | float]) -> dict[str, float]:
-    """Return the deliberate errors that have a value other than false and 0, and are therefore switched on."""
+    """Return the quirks that are switched on: those whose value is neither false nor 0."""
     return {name: float(quirks[name]) for name in QUIRKS if quirks.get(name)} if quirks else {}
 
 
 def wrong_handlers(quirks: Mapping[str, bool | float], rng: Random) -> list[EventHandler[Any]]:
-    """Return all handlers of an agent with these deliberate errors. The list is empty if none is switched on.
+    """Return the wrong handlers of an agent with these quirks. The result is empty if no quirk is switched on.
 
     The handlers draw random numbers from `rng`.
     """

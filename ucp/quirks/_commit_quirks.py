@@ -73,7 +73,7 @@ def forget_own_vote(good: Handler, core: Core) -> str:
 
 @quirk(2)
 def keep_old_votes(good: Handler, core: Core) -> str:
-    """A vote starts with the tally of the previous vote."""
+    """A new vote starts with the votes counted in the previous vote."""
     before = core.vote_count
     branch = good(core)
     if branch == "proposed":
@@ -83,7 +83,7 @@ def keep_old_votes(good: Handler, core: Core) -> str:
 
 @quirk(2, helper=Core.start)
 def hasty_vote(good: Helper, core: Core, timer: Timer, duration_s: float) -> None:
-    """The voting timer runs for a thousandth of its duration."""
+    """The voting timer expires after a thousandth of its duration."""
     good(core, timer, duration_s / 1000)
 
 
@@ -159,7 +159,7 @@ def change_without_new_vote(good: Handler, core: Core) -> str:
 
 @quirk(5, helper=Core.trigger)
 def disapproved_and_unmoved(good: Helper, core: Core, event: LocalEvent) -> None:
-    """A block that is not approved starts no reconcile."""
+    """The agent starts no reconcile when its block is not approved."""
     if event != "Reconcile Begin":
         good(core, event)
 
@@ -195,19 +195,21 @@ def keep_committed_block(good: Callable[..., Block], core: Core) -> Block:
 
 @quirk(5, helper=Core.commit)
 def break_off_commit(good: Helper, core: Core, block: Block) -> None:
-    """A wrong file path ends the commit. The block has left the deque and is not in the chain."""
+    """A commit fails because of a wrong file path. The block has left the deque and is not in the chain."""
     raise FileNotFoundError
 
 
 @quirk(5, helper=Core.send)
 def break_off_broadcast(good: Helper, core: Core, message: CommitBlock) -> None:
-    """A wrong file path ends the commit. The block is in the chain but not sent. The next block is not proposed."""
+    """A commit fails because of a wrong file path. The block is in the chain but not sent. The next block is not
+    proposed.
+    """
     raise FileNotFoundError
 
 
 @quirk(6, branches=("ignored by quirk",), chance=True)
 def ignore_commit(good: Handler, core: Core, sender: int, message: CommitBlock, occurs: Callable[[], bool]) -> str:
-    """The agent ignores each Commit Block with the probability that is the quirk's value."""
+    """The agent ignores a Commit Block at random. The value of the quirk is the probability."""
     if not core.reconcile_in_progress and occurs():
         return "ignored by quirk"
     return good(core, sender, message)
@@ -233,8 +235,8 @@ def commit_others_twice(good: Helper, core: Core, block: Block) -> None:
 
 
 def run_as_if_not_reconciling(good: Handler, core: Core, *inputs: int | Message) -> str:
-    """A deliberate mistake: run the correct handler `good` as if no reconcile were in progress, and restore the flag
-    `reconcile_in_progress` afterwards.
+    """Run the correct handler `good` as if no reconcile were in progress. Restore the flag `reconcile_in_progress`
+    afterwards. This is a deliberate mistake.
     """
     reconciling, core.reconcile_in_progress = core.reconcile_in_progress, False
     try:
@@ -244,14 +246,14 @@ def run_as_if_not_reconciling(good: Handler, core: Core, *inputs: int | Message)
 
 
 def commit_twice(commit: Helper, core: Core, block: Block) -> None:
-    """A deliberate mistake: commit a block twice, without the chain's guard against duplicates."""
+    """Commit a block twice, and bypass the check of the chain for duplicates. This is a deliberate mistake."""
     core.chain.__class__ = UnguardedChain
     commit(core, block)
     commit(core, block)
 
 
 class UnguardedChain(Chain):
-    """A deliberate mistake: a chain that accepts the same block twice."""
+    """A chain that accepts the same block twice. This is a deliberate mistake."""
 
     def append(self, block: Block) -> None:
         self._block_of_hash.pop(block.block_hash, None)

@@ -1,4 +1,4 @@
-"""Deliberate errors in operations that several handlers use: the chain hash, and sending."""
+"""Deliberate errors in operations that several handlers share: computing the chain hash, and sending."""
 
 from ucp.block import Block, next_chain_hash
 from ucp.core import Core

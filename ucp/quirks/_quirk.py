@@ -26,12 +26,14 @@ from ucp.messages import Message
 from ucp.short_value import shown
 
 Handler = Callable[..., str]
-"""A replaced handler. Its arguments are the core and its input."""
+"""The type of a handler that a quirk replaces. Its arguments are the core and the input of the handler."""
 Helper = Callable[..., None]
-"""A replaced method of the core. Its arguments are the core and those of the method."""
+"""The type of a method of the core that a quirk replaces. Its arguments are the core and the arguments of the
+method.
+"""
 
 CRASHED = "crashed by quirk"
-"""The branch of a wrong handler that raised an exception. Its earlier effects stay."""
+"""The branch of a wrong handler that raised an exception. The effects before the exception stay."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ def reconcile_unflagged(good: Handler, core: Core) -> str:
 
 @quirk(8)
 def keep_old_phase1_tally(good: Handler, core: Core) -> str:
-    """Phase 1 continues the tally of the previously popped block."""
+    """Phase 1 does not reset its counters for a new query, so answers to the previous query still count."""
     before = core.reconcile_vote_count
     branch = good(core)
     core.reconcile_vote_count = before
@@ -46,7 +46,7 @@ def keep_old_phase1_tally(good: Handler, core: Core) -> str:
 
 @quirk(8, helper=Core.start)
 def hasty_phase1(good: Helper, core: Core, timer: Timer, duration_s: float) -> None:
-    """The phase 1 timer runs for a thousandth of its duration."""
+    """The phase 1 timer expires after a thousandth of its duration."""
     good(core, timer, duration_s / 1000)
 
 
@@ -100,7 +100,7 @@ def pop_two_blocks(good: Helper, core: Core) -> None:
 
 @quirk(11, helper=Core.pop_to_stack)
 def lose_popped_block(good: Helper, core: Core) -> None:
-    """A block that phase 1 pops is missing from the reconcile stack."""
+    """Phase 1 pops a block and does not push it onto the reconcile stack."""
     good(core)
     core.pop_from_stack()
 
@@ -113,12 +113,12 @@ def skip_phase2(good: Helper, core: Core, event: LocalEvent) -> None:
 
 @quirk(12, helper=Core.send)
 def never_ask_phase2(good: Helper, core: Core, message: ChainHashSuccessorQuery) -> None:
-    """Phase 2 waits for answers and sends no query."""
+    """Phase 2 waits for answers but sends no query."""
 
 
 @quirk(12)
 def keep_old_candidates(good: Handler, core: Core) -> str:
-    """Phase 2 continues with the candidates of the previous block."""
+    """Phase 2 does not reset its candidates for a new query, so answers to the previous query still count."""
     before = dict(core.reconcile_response_dictionary)
     branch = good(core)
     core.reconcile_response_dictionary.update(before)
@@ -142,7 +142,7 @@ def name_top_as_successor(good: Helper, core: Core, message: NextInSequenceRespo
 
 @quirk(13, helper=Core.trigger)
 def diverged_and_unmoved(good: Helper, core: Core, event: LocalEvent) -> None:
-    """The agent starts no reconcile when it detects that its chain has diverged."""
+    """The agent starts no reconcile when a query shows that its chain has diverged."""
 
 
 @quirk(14)
@@ -313,4 +313,4 @@ def leave_flag_set(good: Handler, core: Core) -> str:
 
 @quirk(20, helper=Core.trigger)
 def finalize_and_wait(good: Helper, core: Core, event: LocalEvent) -> None:
-    """Finalize does not process the deque."""
+    """Finalize does not propose the next block of the deque."""

@@ -9,11 +9,13 @@ has a budget of its own, so that forgeries in its name do not affect the datagra
 import math
 
 BURST = 32
-"""Wrong signatures in the name of one sender without a pause."""
+"""Number of wrong signatures in the name of one sender that an agent verifies without a pause."""
 
 
 class VerificationBudget:
-    """A budget of tokens for wrong signatures. It gains `per_s` tokens each mission second. Infinity sets no limit."""
+    """A budget of tokens for wrong signatures. It gains `per_s` tokens each mission second. An infinite budget sets no
+    limit.
+    """
 
     __slots__ = ("_per_s", "_since_s", "_tokens")
 

@@ -17,9 +17,11 @@ CHALLENGE_INTERVAL_S = 5.0
 ECHO_INTERVAL_S = 1.0
 """Minimum time in mission seconds between two echoes of challenges that may be recorded."""
 TRUST_DELAY_S = 2.0
-"""Mission seconds between the first challenge and the first accepted sender, if some vehicles do not answer."""
+"""Maximum number of mission seconds between the first challenge and the first accepted sender. It applies if some
+vehicles do not answer.
+"""
 ALL = 0
-"""Target of a challenge to all vehicles."""
+"""The target of a challenge that is sent to all vehicles."""
 
 
 class PendingChallenges:
@@ -27,15 +29,15 @@ class PendingChallenges:
 
     def __init__(self) -> None:
         self.first_at: float | None = None
-        """Mission second of the first challenge to all vehicles."""
+        """The mission second of the first challenge to all vehicles. None before it."""
         self._due: set[int] = set()
         self._sent_at: dict[int, float] = {}
         self._pending: dict[int, int] = {}
-        """Target -> sequence of the newest challenge."""
+        """Target -> sequence number of the newest challenge to it."""
 
     @property
     def is_due(self) -> bool:
-        """True if a challenge waits to be sent."""
+        """True if a challenge is due but not sent yet."""
         return bool(self._due)
 
     def ask(self, target: int, now: float) -> None:
@@ -56,5 +58,5 @@ class PendingChallenges:
         self._pending[target] = sequence
 
     def is_pending(self, sequence: int, sender: int) -> bool:
-        """Return whether `sequence` is the number of the newest challenge to this sender or to all vehicles."""
+        """Return whether this sequence number belongs to the newest challenge to this sender or to all vehicles."""
         return sequence in (self._pending.get(ALL), self._pending.get(sender))

@@ -24,7 +24,9 @@ from ucp.secure.crypto_suite import SenderKeys, next_epoch_secret
 MAX_EPOCHS_AHEAD = 4096
 """Maximum number of epochs that a datagram may be ahead of the receiver's clock: four weeks with epochs of 600 s."""
 MAX_EPOCHS_FOLLOWED = MAX_EPOCHS_AHEAD // 2
-"""Maximum number of epochs that a vehicle sends ahead of its clock. The clocks of receivers may be behind its own."""
+"""Maximum number of epochs by which a vehicle's datagrams may be ahead of its own clock. The clocks of receivers may be
+behind this clock.
+"""
 MAX_CACHED_KEYS = 4096
 """Maximum number of cached sender keys. Above it, the cache is emptied."""
 
@@ -32,8 +34,8 @@ MAX_CACHED_KEYS = 4096
 class EpochSecrets:
     """The group secrets that one vehicle keeps, one for each epoch.
 
-    `save` is called with the vehicle's new bundle after each change of the clock's epoch. The new bundle no longer
-    contains the older secrets.
+    `save` is called with the vehicle's new bundle after each change of the clock's epoch. The new bundle does not
+    contain the older secrets.
     """
 
     def __init__(
@@ -47,9 +49,9 @@ class EpochSecrets:
         self._save = save
         self._derive_keys = sender_keys
         self._previous_secret: bytes | None = None
-        """The secret of the epoch before the clock's. None if this incarnation has not known it."""
+        """The secret of the epoch before the clock's epoch. None if this incarnation never had it."""
         self._later: deque[bytes] = deque()
-        """The secrets of the epochs after the clock's, as far as they were needed."""
+        """The secrets of epochs after the clock's epoch, as far as datagrams required them."""
         self._followed = 0
         self._started_s: float | None = None
         self._until_s = -math.inf
@@ -68,7 +70,7 @@ class EpochSecrets:
         return max(self._bundle.epoch, self._followed)
 
     def set_clock(self, now: float) -> None:
-        """Set the clock to mission second `now`. If this begins a later epoch, erase older secrets."""
+        """Set the clock to mission second `now`. If a later epoch has begun, erase the older secrets."""
         if now < self._until_s:
             return
         if self._started_s is None:
@@ -81,12 +83,12 @@ class EpochSecrets:
         self._until_s = min((shown + 1) * epoch_s, self._started_s + (since_start + 1) * epoch_s)
 
     def can_open(self, epoch: int) -> bool:
-        """Return whether the vehicle has the secret of this epoch, or may compute it."""
+        """Return whether the vehicle has the group secret of this epoch, or can compute it."""
         later = epoch - self._bundle.epoch
         return 0 <= later <= MAX_EPOCHS_AHEAD or (later == -1 and self._previous_secret is not None)
 
     def follow(self, epoch: int) -> None:
-        """Send in this epoch or a later one, because a vehicle with the group secret has sent in it."""
+        """Send in this epoch or in a later one. A vehicle with the group secret has already sent in it."""
         self._followed = max(self._followed, min(epoch, self._bundle.epoch + MAX_EPOCHS_FOLLOWED))
 
     def _advance_to(self, epoch: int) -> None:
@@ -101,7 +103,7 @@ class EpochSecrets:
         self._save(self._bundle)
 
     def sender_keys(self, epoch: int, sender: int, boot: bytes) -> SenderKeys:
-        """Return the keys with which this sender seals in its incarnation `boot`. `can_open(epoch)` must be true."""
+        """Return the keys with which this sender encrypts in its incarnation `boot`. `can_open(epoch)` must be true."""
         known = self._sender_keys.get((epoch, sender, boot))
         return known or self._derive_keys(self._secret(epoch), self._mission, epoch, sender, boot)
 

@@ -12,7 +12,9 @@ from ucp.secure.revocation import Revocation, RevocationError, listed_agents, re
 
 
 class KnownRevocations:
-    """Revocations that the authority signed. None of them lists only agents that another one also lists."""
+    """The revocations that an agent keeps, all signed by the authority. Each of them lists an agent that no other one
+    lists.
+    """
 
     def __init__(self, authority: bytes, mission: bytes) -> None:
         self._authority = authority
@@ -21,7 +23,7 @@ class KnownRevocations:
         self.revoked: frozenset[int] = frozenset()
         """All revoked agents."""
         self.digest = 0
-        """A number of 16 bits for the set of revoked agents. 0 stands for none."""
+        """A 16-bit digest of the set of revoked agents. 0 stands for the empty set."""
 
     @property
     def bodies(self) -> tuple[bytes, ...]:
@@ -29,12 +31,14 @@ class KnownRevocations:
         return tuple(revocation.encode() for revocation in self._held)
 
     def adds_nothing(self, body: bytes) -> bool:
-        """Return whether a body lists only agents that are known as revoked. The signature is not verified."""
+        """Return whether the encoded revocation lists only agents that are already revoked. Its signature is not
+        verified.
+        """
         listed = listed_agents(body)
         return listed is not None and listed <= self.revoked
 
     def add(self, body: bytes) -> bool:
-        """Add the body of a revocation. Return whether it lists a newly revoked agent. Raises RevocationError."""
+        """Add an encoded revocation. Return whether it lists a newly revoked agent. Raises RevocationError."""
         revocation = Revocation.decode(body, self._authority, self._mission)
         if revocation.revoked <= self.revoked:
             return False
@@ -44,7 +48,7 @@ class KnownRevocations:
         return True
 
     def restore(self, bodies: Iterable[bytes]) -> None:
-        """Add revocations that were read from the disk. Leave out those that the present authority did not sign."""
+        """Add revocations that were read from the disk. Skip those that the current authority did not sign."""
         for body in bodies:
             with suppress(RevocationError):
                 self.add(body)

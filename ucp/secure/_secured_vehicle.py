@@ -69,7 +69,7 @@ def virtual_agent_factory(mission: Mission, bundle: Any, boot: Any) -> Callable[
 
 
 def _check_bundle(bundle: Bundle, mission: Mission, place: str) -> None:
-    """Raise MissionError if the bundle does not belong to this agent in this mission."""
+    """Raise MissionError if the key bundle does not belong to this agent in this mission."""
     missing = sorted({*mission.roster} - bundle.public.vehicles.keys())
     if bundle.agent_id != mission.agent_id or missing:
         problem = f"has no keys of agent {missing[0]}" if missing else f"is agent {bundle.agent_id}'s"

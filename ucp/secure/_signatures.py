@@ -1,4 +1,6 @@
-"""The makers' signatures of the blocks that an agent holds. They are no part of the agent's protocol state."""
+"""Keep the signatures of the blocks that an agent holds. Each block is signed by the agent that completed it. The
+signatures are not part of the protocol state.
+"""
 
 from collections.abc import Mapping
 
@@ -9,7 +11,7 @@ from ucp.state import AgentState
 
 
 class BlockSignatures:
-    """The makers' signatures of blocks, by block hash.
+    """The signatures of blocks by the agents that completed them, by block hash.
 
     A signature is verified once per block. The signature of a received block that the agent did not accept is
     discarded.
@@ -20,10 +22,10 @@ class BlockSignatures:
         self._state = state
         self._by_hash: dict[bytes, bytes] = {}
         self._signed = 0
-        """Length of `state.completed` at the last call of `held`."""
+        """Number of completed blocks (`state.completed`) at the last call of `held`."""
 
     def held(self) -> Mapping[bytes, bytes]:
-        """Return the signatures of all blocks that the agent holds, after signing its own new blocks."""
+        """Sign the agent's own new blocks. Then return the signatures of all blocks that the agent holds."""
         completed = self._state.completed
         if self._signed < len(completed):
             new = set(completed[self._signed :])
@@ -34,9 +36,9 @@ class BlockSignatures:
         return self._by_hash
 
     def is_genuine(self, block: Block, signature: bytes) -> bool:
-        """Return whether the block's maker signed the block, and keep a valid signature.
+        """Return whether the agent named in the block has signed it. Keep a valid signature.
 
-        The maker must be on the roster.
+        The agent must be on the roster.
         """
         if block.block_hash in self.held():
             return True
@@ -48,7 +50,7 @@ class BlockSignatures:
         return True
 
     def forget_unless_held(self, block: Block) -> None:
-        """Discard the signature of a block that the agent did not accept."""
+        """Discard the signature of a received block unless the agent holds the block."""
         if not self._state.holds(block.block_hash):
             self._by_hash.pop(block.block_hash, None)
 

@@ -1,17 +1,17 @@
 """The sequence numbers that a receiver has accepted from a sender: the sliding window of RFC 6479.
 
-The window is a ring of words, with one word more than the window needs. It moves on by clearing whole words, and never
+The window is a ring of machine words, one more than its size requires. It moves on by clearing whole words, and never
 shifts a bit.
 """
 
 WINDOW = 1024
-"""Number of sequence numbers in the window, the newest one included. Older ones are rejected."""
+"""Number of sequence numbers in the window, including the newest one. Older datagrams are rejected."""
 _WORD_BITS = 64
 _WORDS = WINDOW // _WORD_BITS + 1
 
 
 class ReplayWindow:
-    """The window of one incarnation of one sender, which accepts sequence numbers from `first` on.
+    """The replay window of one incarnation of one sender. It accepts sequence numbers from `first` on.
 
     The caller accepts only sequence numbers of authentic datagrams.
     """

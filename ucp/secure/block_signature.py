@@ -1,4 +1,4 @@
-"""The signature of a block by its maker.
+"""Sign a block with the key of the agent that completed it.
 
 The signature accompanies the block and is not part of its hash, so hashes and chains stay the same. It is an Ed25519
 signature (RFC 8032) over a domain tag, the mission's ID and BD (eq. 3.5). Because of the tag and the ID, a signature of
@@ -12,7 +12,7 @@ _TAG = b"UCP block\0"
 
 
 def sign_block(maker: Signer, mission: bytes, block_data: bytes) -> bytes:
-    """Return the signature (64 bytes) of the block with this block data."""
+    """Return the signature of a block with this block data, 64 bytes."""
     return maker.sign(_TAG + mission + block_data)
 
 

@@ -88,8 +88,8 @@ class PublicKeys:
 class Bundle:
     """The keys of one vehicle: the public keys, its private key, and the group secret of epoch `epoch`.
 
-    `started_us` is the start of the last incarnation with this bundle, in microseconds UTC. None if no agent has used
-    the bundle.
+    `started_us` is the start of the last incarnation with this bundle, in microseconds UTC. It is None if no agent has
+    used the bundle.
     """
 
     public: PublicKeys
@@ -100,15 +100,15 @@ class Bundle:
     started_us: int | None = None
 
     def at_epoch(self, epoch: int, group_secret: bytes) -> "Bundle":
-        """Return the bundle of the same vehicle for a later epoch, which has this group secret."""
+        """Return the bundle of the same vehicle for a later epoch with this group secret."""
         return replace(self, epoch=epoch, group_secret=group_secret)
 
     def used(self) -> "Bundle":
-        """Return the bundle for a vehicle that may have flown before in this mission."""
+        """Return a copy of the bundle that is marked as used: the vehicle may have flown with it before."""
         return replace(self, started_us=self.started_us or 0)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the bundle's file, secrets included."""
+        """Return the content of the bundle file, including the secrets."""
         return {
             **self.public.to_json(),
             "schema": BUNDLE_SCHEMA,
@@ -139,7 +139,9 @@ class Bundle:
 
 @dataclass(frozen=True)
 class KeySet:
-    """All keys of a mission, private keys included. It stays on the ground. `group_secret` is that of epoch 0."""
+    """All keys of a mission, including the private keys. The set stays on the ground. `group_secret` belongs to epoch
+    0.
+    """
 
     public: PublicKeys
     authority: bytes = field(repr=False)
@@ -181,7 +183,7 @@ def bundle_name(agent_id: int) -> str:
 
 
 def load_bundle(path: Path) -> Bundle:
-    """Read a bundle from a file. Raises KeyFileError, also if other users can read the file."""
+    """Read a bundle from a file. Raises KeyFileError, for example if other users can read the file."""
     return read_key_file(path, BUNDLE_SCHEMA, Bundle.from_json, secret=True)
 
 

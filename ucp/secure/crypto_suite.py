@@ -38,7 +38,9 @@ def next_epoch_secret(secret: bytes, mission: bytes) -> bytes:
 
 
 class SenderKeys:
-    """The keys that seal the datagrams of one sender in one epoch and one incarnation. `repr` hides them."""
+    """The keys that encrypt and authenticate the datagrams of one sender in one epoch and one incarnation. `repr` hides
+    them.
+    """
 
     __slots__ = ("_aead", "_iv")
 
@@ -53,7 +55,7 @@ class SenderKeys:
         return self._aead.encrypt(self._nonce(position), plain, clear)
 
     def decrypt(self, position: int, ciphertext: bytes, clear: bytes) -> bytes | None:
-        """Return the plaintext. Return None if ciphertext, tag and clear header do not belong together."""
+        """Return the plaintext. Return None if the tag does not match the ciphertext and the clear header."""
         try:
             return self._aead.decrypt(self._nonce(position), ciphertext, clear)
         except InvalidTag:

@@ -33,33 +33,33 @@ SIGNATURE_BYTES = 64
 CLEAR_FIELDS = {**HEADER_FIELDS, "epoch": FieldKind.U32, "boot": FieldKind.BOOT, "revocations": FieldKind.U16}
 CLEAR = struct_of(CLEAR_FIELDS)
 SEAL_BYTES = TAG_BYTES + SIGNATURE_BYTES
-"""Number of bytes that sealing adds to a body: the tag and the sender's signature."""
+"""Number of bytes that the encryption adds to a body: the tag, and the signature of the sender."""
 LAST_SEQUENCE = 2**32 - 1
 REVOCATION = 10
-"""Type of a revocation. The authority signs it."""
+"""Type of a revocation datagram. The authority signs its body."""
 CHALLENGE, ECHO = 11, 12
-"""Types of the datagrams that prove that a sender exists now. `ucp.secure._challenges` explains them."""
+"""Types of the datagrams with which a sender proves that it is active now. `ucp.secure._challenges` explains them."""
 CONTROL_POSITION = 2**32
-"""Position of the first control datagram, a datagram of the types from 10 on. Messages have lower positions."""
+"""Lowest position of a control datagram. Control datagrams have a type from 10 on. Messages have lower positions."""
 TYPES = frozenset(range(1, ECHO + 1))
 
 CONTROL_NAMES = {REVOCATION: "Revocation", CHALLENGE: "Challenge", ECHO: "Echo"}
-"""Type of a control datagram, which has no message of the protocol -> its name."""
+"""Type of a control datagram -> its name. A control datagram contains no message of the protocol."""
 NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
 """Type of a message -> its name."""
 
 REQUEST_FIELDS = {"request_sender": FieldKind.U32, "request_boot": FieldKind.BOOT, "request_sequence": FieldKind.U32}
-"""Fields of the request that a response answers. They are sealed in front of the response's body."""
+"""Fields that identify the request that a response answers. They are encrypted in front of the response's body."""
 REQUEST = struct_of(REQUEST_FIELDS)
 REQUEST_OF = {2: 1, 5: 4, 7: 6, 9: 8}
 """Type of a response -> type of the request that it answers."""
 REQUESTS = frozenset(REQUEST_OF.values())
 WITH_BLOCK = frozenset((3, 9))
-"""Types of the messages that carry a block. The signature of the block's maker is sealed after the block."""
+"""Types of the messages that carry a block. The signature of the block is encrypted after the block."""
 
 
 class ClearHeader(NamedTuple):
-    """The fields of a clear header. They are not authenticated until the datagram is opened."""
+    """The fields of the unencrypted header. They are not authentic until the datagram is decrypted."""
 
     type: int
     sender: int
@@ -111,7 +111,7 @@ ADDED_BYTES: dict[str, int] = {
     + (SIGNATURE_BYTES if code in WITH_BLOCK else 0)
     for message, code in TYPE_CODES.items()
 }
-"""Name of a message -> number of bytes that its secured datagram is longer than its plain one."""
+"""Name of a message -> number of additional bytes in its secured datagram."""
 
 
 def sealed_bytes(message: Message) -> int:

@@ -39,7 +39,7 @@ class ExportHead:
     revoked: Sequence[int]
 
     def sign(self, signer: Signer, mission: bytes) -> dict[str, Any]:
-        """Sign the head, and return it as the JSON object for the export."""
+        """Sign the head, and return it as the JSON object that the export contains."""
         return {
             "mission": mission.hex(),
             "boot": self.boot.hex(),
@@ -100,9 +100,9 @@ def completed_digest(block_hashes: Iterable[bytes]) -> bytes:
 def held_digest(
     deque: Sequence[bytes], stack: Sequence[bytes], event_data: bytes, *, reconciling: bool, idle: bool
 ) -> bytes:
-    """Return the digest of the state outside the chain: deque, reconcile stack, current block and flags.
+    """Return a digest of the agent's state outside its chain: deque, reconcile stack, current block and flags.
 
-    `deque` and `stack` are block hashes in the order of the export. `event_data` is that of the current block.
+    `deque` and `stack` are block hashes in the order of the export. `event_data` is the content of the current block.
     """
     counts = struct.pack(">II??", len(deque), len(stack), reconciling, idle)
     return hashlib.sha256(counts + b"".join((*deque, *stack)) + event_data).digest()

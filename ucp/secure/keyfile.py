@@ -26,9 +26,9 @@ class KeyFileError(Exception):
 
 
 def read_key_file(path: Path, schema: str, parse: Callable[[dict[str, Any]], T], *, secret: bool) -> T:
-    """Return the result of `parse` for the JSON object in a key file with this schema.
+    """Read a key file with this schema, and return its JSON object as parsed by `parse`.
 
-    Raises KeyFileError, also if the file is `secret` and other users can read it.
+    Raises KeyFileError, for example if the file is `secret` and other users can read it.
     """
     return read_any_key_file(path, {schema: (secret, parse)})
 
@@ -79,7 +79,7 @@ def _read(path: Path) -> tuple[dict[str, Any], int]:
 def write_key_file(path: Path, document: Mapping[str, Any], *, secret: bool) -> None:
     """Write a key file and replace an older one atomically. A reader sees the complete old or the complete new file.
 
-    Other users can read a `secret` file at no moment. Raises OSError.
+    A `secret` file is never readable for other users. Raises OSError.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     mode = SECRET_MODE if secret else PUBLIC_MODE

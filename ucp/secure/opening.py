@@ -11,7 +11,9 @@ from ucp.secure.envelope import CONTROL_NAMES, read_clear_header
 from ucp.secure.sealed_datagrams import OpenedDatagram, decrypt, parse_body, signing_domain
 
 EPOCHS_AHEAD = 4096
-"""Maximum number of epochs after the bundle's for which secrets are computed: four weeks with epochs of 600 s."""
+"""Maximum number of epochs after the bundle's epoch for which the opener computes secrets: four weeks with epochs of
+600 s.
+"""
 
 
 class DatagramOpener:

@@ -25,12 +25,14 @@ _SIGNATURE_BYTES = 64
 
 
 class RevocationError(ValueError):
-    """Bytes that are not a revocation of this mission. The message is one sentence."""
+    """An error: these bytes are not a revocation of this mission. The message is one sentence."""
 
 
 @dataclass(frozen=True)
 class Revocation:
-    """A signed revocation. `revoked` holds the IDs of all agents that are revoked so far. Numbers start at 1."""
+    """A revocation with the signature of the authority. `revoked` holds the IDs of all agents that are revoked so far.
+    Revocations are numbered from 1.
+    """
 
     number: int
     revoked: frozenset[int]
@@ -52,7 +54,7 @@ class Revocation:
 
     @classmethod
     def decode(cls, body: bytes, authority: bytes, mission: bytes) -> Self:
-        """Return the revocation in the body of a message. Raises RevocationError unless the authority signed it."""
+        """Parse a revocation from the body of a message. Raises RevocationError unless the authority signed it."""
         if not _HEAD.size <= len(body) <= _HEAD.size + 4 * MAX_REVOKED + _SIGNATURE_BYTES:
             raise RevocationError("it has the wrong length")
         number, count = _HEAD.unpack_from(body)
@@ -72,7 +74,9 @@ class Revocation:
 
 
 def listed_agents(body: bytes) -> frozenset[int] | None:
-    """Return the agents that a body lists. Its signature is not verified. Return None if its length is wrong."""
+    """Return the agents that the body of a revocation lists, without verifying the signature. Return None if the body
+    has a wrong length.
+    """
     if len(body) < _HEAD.size:
         return None
     _, count = _HEAD.unpack_from(body)

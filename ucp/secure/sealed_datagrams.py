@@ -45,21 +45,21 @@ class OpenedDatagram(NamedTuple):
     clear: ClearHeader
     datagram: Datagram
     recorded: RecordedBytes
-    """The datagram of version 1 with the same content, as the trace records it."""
+    """The trace records this plain datagram (version 1) with the same content."""
     request: AnsweredRequest | None
-    """The request that it answers. None if it is not a response."""
+    """The request that this datagram answers. None if it is not a response."""
     block_signature: bytes
 
 
 def signing_domain(mission: bytes) -> bytes:
-    """Return the tag and mission ID in front of the signed bytes of each datagram of a mission."""
+    """Return the mission's prefix of all signed bytes: a tag, and the mission ID."""
     return _DATAGRAM + mission
 
 
 def decrypt(
     keys: SenderKeys, datagram: bytes, clear: ClearHeader, domain: bytes, public_key: bytes
 ) -> tuple[bytes, UnverifiedSignature]:
-    """Return the body of a sealed datagram, and its signature, which the caller must still verify.
+    """Decrypt a datagram. Return its body and its signature, which the caller must still verify.
 
     Raises MalformedDatagramError if the keys do not decrypt the datagram.
     """
@@ -77,7 +77,7 @@ def decrypted(keys: SenderKeys, datagram: bytes, clear: ClearHeader) -> bytes:
 
 
 def parse_body(clear: ClearHeader, body: bytes) -> OpenedDatagram:
-    """Parse a decrypted body. Raises MalformedDatagramError if it is no body of this message type."""
+    """Parse a decrypted body. Raises MalformedDatagramError if it is not a valid body of its message type."""
     request, block_signature = None, b""
     if clear.type in REQUEST_OF:
         if len(body) < REQUEST.size:

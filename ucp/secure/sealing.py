@@ -37,12 +37,12 @@ _BASE_MODE = b"\0"
 
 
 class NotOpenedError(Exception):
-    """Event data that this key does not open. The message is one sentence."""
+    """An error: this key cannot decrypt the event data. The message is one sentence."""
 
 
 @dataclass(frozen=True)
 class Depot:
-    """The depot's private key, which opens the sealed event data of a mission."""
+    """The depot's private key, which decrypts the sealed event data of a mission."""
 
     mission: bytes
     private_key: bytes = field(repr=False)
@@ -52,7 +52,7 @@ class Depot:
         return X25519PrivateKey.from_private_bytes(self.private_key).public_key().public_bytes_raw()
 
     def open(self, sealed: bytes, agent_id: int, timestamp_us: int) -> bytes:
-        """Return the events of the block with this agent ID and timestamp. Raises NotOpenedError."""
+        """Decrypt the event data of the block with this agent ID and timestamp. Raises NotOpenedError."""
         key: Any = X25519PrivateKey.from_private_bytes(self.private_key)
         try:
             return _LIBRARY.decrypt(sealed, key, _info(self.mission, agent_id, timestamp_us))
@@ -79,14 +79,14 @@ def make_seal(bundle: Bundle, draw_key: Callable[[], bytes] | None = None) -> Se
 
 
 def _derived_key(bundle: Bundle, data: bytes) -> bytes:
-    """Return an ephemeral key that is computed from the vehicle's private key and all data of a block."""
+    """Compute an ephemeral key from the vehicle's private key and all data of a block."""
     derivation = HMAC(bundle.private_key, SHA256())
     derivation.update(b"UCP ephemeral key\0" + data)
     return derivation.finalize()
 
 
 def _hpke_seal(plain: bytes, recipient: X25519PublicKey, ephemeral: X25519PrivateKey, info: bytes) -> bytes:
-    """Seal one message with HPKE in base mode.
+    """Encrypt one message with HPKE in base mode.
 
     Return the ephemeral public key (32 bytes), the ciphertext and the tag (16 bytes).
     """

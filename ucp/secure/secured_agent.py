@@ -5,8 +5,8 @@ not revoked. If the message carries a block, the block's maker has signed it. If
 the newest known request of its type. A new revocation is stored and forwarded. All other datagrams are counted in
 `dropped` and change no state of the agent.
 
-The trace contains datagrams in their plain form, so it is read and judged like any other trace. Only dropped datagrams
-are recorded as they were received.
+The trace contains datagrams in their plain form, so the harness reads and judges it like any other trace. Only dropped
+datagrams are recorded as they were received.
 """
 
 import struct
@@ -41,14 +41,15 @@ class OutgoingDatagram(NamedTuple):
 
 
 def make_boot(started_us: int, random_bytes: bytes) -> bytes:
-    """Return the boot value of a new incarnation: its start in microseconds UTC, and 8 random bytes."""
+    """Return the boot value of a new incarnation: its start time in microseconds UTC, and 8 random bytes."""
     boot = _BOOT_TIME.pack(started_us) + random_bytes
     assert len(boot) == BOOT_BYTES
     return boot
 
 
 class SecuredAgent(Agent):
-    """An agent that sends and receives through a session. The other arguments are those of Agent.
+    """An agent that encrypts, decrypts and signs its datagrams with a session. The other arguments are those of
+    `Agent`.
 
     Raises ValueError if the session belongs to another agent, or lacks the public key of an agent on the roster.
     """
@@ -62,27 +63,29 @@ class SecuredAgent(Agent):
         self.session = session
         self._revocations = KnownRevocations(session.authority, session.mission)
         self.problem: str | None = None
-        """The reason why the agent sends no more. None if it sends."""
+        """The reason why the agent has stopped sending. None while it sends."""
         self._signatures = BlockSignatures(session, self.state)
         self._answered_requests: dict[int, AnsweredRequest] = {}
-        """Sequence of a response in the outbox -> the request that it answers."""
+        """Sequence number of a response in the outbox -> the request that the response answers."""
         self._exports = 0
         self._now = 0.0
-        """Mission second of the last datagram or revocation."""
+        """Mission second of the last datagram or revocation that the agent received."""
         self._revocation_due = False
         self._revocation_sent_at: float | None = None
 
     @property
     def signatures(self) -> Mapping[bytes, bytes]:
-        """The makers' signatures of all blocks that the agent holds, by block hash."""
+        """The signatures of all blocks that the agent holds, by block hash. Each signature is by the agent that
+        completed the block.
+        """
         return self._signatures.held()
 
     def signed_export(self, exported_at_us: int) -> dict[str, Any]:
-        """Return the chain export with the makers' signatures and a signed head."""
+        """Return the chain export with the signatures of the blocks and a signed head."""
         return {**export_chain(self.state, exported_at_us, self.signatures), "head": self.sign_head(exported_at_us)}
 
     def sign_head(self, exported_at_us: int) -> dict[str, Any]:
-        """Return the signed head of an export at this time. Each head is numbered one higher than the previous one."""
+        """Return the signed head of a chain export. Each head has the next higher number."""
         self._exports += 1
         head = head_of(self.state, self.session.boot, self._exports, exported_at_us, self.revoked)
         return head.sign(self.session.private_key, self.session.mission)
@@ -109,7 +112,7 @@ class SecuredAgent(Agent):
         self._handle_opened(opened, now)
 
     def _receive_control(self, data: bytes, clear: ClearHeader, now: float) -> None:
-        """Handle a datagram that is no message of the protocol. Raises MalformedDatagramError."""
+        """Handle a control datagram, which contains no message of the protocol. Raises MalformedDatagramError."""
         if clear.type == REVOCATION:
             self._receive_revocation(self.session.open_revocation(data, clear), clear.sender, now)
             return
@@ -131,7 +134,7 @@ class SecuredAgent(Agent):
         return None
 
     def _check_opened(self, opened: OpenedDatagram) -> None:
-        """Raise MalformedDatagramError if no handler may receive this authentic message."""
+        """Raise MalformedDatagramError if this authentic message must not reach a handler."""
         sender, _, message = opened.datagram
         if reason := drop_reason(self.agent_id, self.roster, sender, message):
             raise MalformedDatagramError(reason)
@@ -157,7 +160,9 @@ class SecuredAgent(Agent):
         return [outgoing.sealed for outgoing in self.sealed_to_send()]
 
     def sealed_to_send(self) -> Sequence[OutgoingDatagram]:
-        """Return the datagrams to broadcast now, in order. The setting `answer_spread_s` delays answers."""
+        """Return the datagrams to broadcast now, in order. The setting `answer_spread_s` delays the answers among
+        them.
+        """
         due = self._due_to_send()
         if not (due or self._revocation_due or self.session.has_control_datagrams):
             return ()
@@ -220,7 +225,7 @@ class SecuredAgent(Agent):
         self._schedule_revocations(now)
 
     def _schedule_revocations(self, now: float) -> None:
-        """Broadcast the known revocations with the next datagrams, at most once per REVOCATION_INTERVAL_S."""
+        """Broadcast the known revocations together with the next datagrams, at most once per REVOCATION_INTERVAL_S."""
         if not self.revoked:
             return
         if self._revocation_sent_at is None or now >= self._revocation_sent_at + REVOCATION_INTERVAL_S:
@@ -239,8 +244,8 @@ class SecuredAgent(Agent):
         return int(started_us)
 
     def boot(self, recovered: StoredState, now: float) -> None:
-        """Continue from the stored data. The new start time is later than the stored one, even if the clock was set
-        back.
+        """Continue from the data stored on disk. The new start time is later than the stored one, even if the clock was
+        set back.
         """
         secured = recovered.secured
         if secured is not None:

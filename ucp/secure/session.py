@@ -45,9 +45,11 @@ from ucp.secure.sealed_datagrams import (
 )
 
 WRONG_SIGNATURES_PER_S = 1000.0
-"""Wrong signatures of senders that a receiver verifies in a mission second. They take a tenth of a processor core."""
+"""Wrong signatures of senders that a receiver verifies per mission second. Their verification takes a tenth of a
+processor core.
+"""
 REVOCATIONS_PER_S = 50.0
-"""Wrong signatures of the authority that a receiver verifies in a mission second."""
+"""Wrong signatures of the authority that a receiver verifies per mission second."""
 
 
 class _SenderIncarnation:
@@ -61,12 +63,12 @@ class _SenderIncarnation:
         """The greatest boot of this sender so far. It is greater than `boot` if the sender lost its clock."""
         self.window = ReplayWindow(first)
         self.control = -1
-        """Sequence of the newest received challenge."""
+        """Sequence number of the newest challenge that was received from this sender."""
         self.requests: dict[int, int] = {}
         """Type of a request -> sequence of the newest request of this type that was received."""
 
     def is_later(self, boot: bytes) -> bool:
-        """Return whether another incarnation with this boot is later than all known ones."""
+        """Return whether an incarnation with this boot is later than all known incarnations of the sender."""
         return boot > self.latest_boot
 
 
@@ -99,14 +101,16 @@ class Session:
         self.epochs = EpochSecrets(started, save_bundle, crypto.sender_keys)
         self.challenges = PendingChallenges()
         self._is_complete: bool | None = None
-        """True if this vehicle has received all datagrams of the mission that it accepts. None before the start."""
+        """True if the replay windows cover the whole mission, because no earlier incarnation used the bundle. None
+        before the start.
+        """
         self._held: dict[int, _SenderIncarnation] = {}
-        """Senders that have answered a challenge, before this vehicle trusts them."""
+        """Senders that have answered a challenge. This vehicle does not trust them yet."""
         self._echoed_at: dict[int, float] = {}
         self._echoes: list[AnsweredRequest] = []
-        """The challenges to answer."""
+        """The challenges that this vehicle still has to answer."""
         self._next_sequence = 0
-        """The sequence after the greatest one that this vehicle has sent."""
+        """The sequence number after the greatest one that this vehicle has used."""
         self._domain = signing_domain(self.mission)
         self._incarnations: dict[int, _SenderIncarnation] = {}
         self._control = 0
@@ -115,7 +119,7 @@ class Session:
         self._budgets = {agent_id: VerificationBudget(per_s) for agent_id in self.public_keys}
         self.revocation_budget = VerificationBudget(REVOCATIONS_PER_S)
         self._own_requests: dict[int, int] = {}
-        """Type of a request -> sequence of this vehicle's newest request of this type."""
+        """Type of a request -> sequence number of this vehicle's newest request of this type."""
 
     def set_clock(self, now: float) -> None:
         """Set the clock to mission second `now`. The first call is at the start of the incarnation.
@@ -136,7 +140,7 @@ class Session:
         block_signature: bytes | None,
         revocations: int,
     ) -> bytes:
-        """Return the sealed datagram of a message. Each sequence number up to LAST_SEQUENCE may be used once."""
+        """Return a message as an encrypted datagram. Each sequence number up to LAST_SEQUENCE may be used once."""
         self.record_sent(sequence, message)
         self._next_sequence = max(self._next_sequence, sequence + 1)
         code = TYPE_CODES[type(message)]
@@ -158,12 +162,12 @@ class Session:
             self._own_requests[code] = sequence
 
     def seal_revocation(self, body: bytes, revocations: int) -> bytes:
-        """Return the sealed datagram of a revocation."""
+        """Return a revocation as an encrypted datagram."""
         return self._seal_control(REVOCATION, body, revocations)
 
     @property
     def has_control_datagrams(self) -> bool:
-        """True if a challenge or an echo waits to be sent."""
+        """True if the vehicle has a challenge or an echo to send."""
         return bool(self._echoes) or self.challenges.is_due
 
     def control_datagrams(self, revocations: int, now: float) -> Iterator[bytes]:
@@ -195,7 +199,8 @@ class Session:
     # From the air
 
     def open(self, datagram: bytes, clear: ClearHeader, now: float) -> OpenedDatagram:
-        """Return the content of a datagram with this header, received at mission second `now`.
+        """Decrypt and check a datagram with this header, and return its content. `now` is the mission second of its
+        arrival.
 
         The sender must be another vehicle of the mission.
 
@@ -233,7 +238,7 @@ class Session:
         return self.crypto.parse_body(clear, body)
 
     def open_revocation(self, datagram: bytes, clear: ClearHeader) -> bytes:
-        """Return the body of a revocation. Raises MalformedDatagramError.
+        """Decrypt a revocation and return its body. Raises MalformedDatagramError.
 
         The sender need not be authentic. The caller verifies the signature of the authority.
         """
@@ -242,9 +247,9 @@ class Session:
         return decrypted(self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot), datagram, clear)
 
     def receive_challenge(self, datagram: bytes, clear: ClearHeader, now: float) -> None:
-        """Schedule an echo of a challenge. Raises MalformedDatagramError.
+        """Schedule an echo that answers a challenge. Raises MalformedDatagramError.
 
-        A challenge may be recorded if it is not newer than all known ones. Few of these are answered.
+        A challenge that is not newer than all known ones may be a replay. The vehicle answers few of these.
         """
         if not self.epochs.can_open(clear.epoch):
             raise MalformedDatagramError("epoch out of range")
@@ -288,7 +293,7 @@ class Session:
             self._trust_held(now)
 
     def _trust_held(self, now: float) -> None:
-        """Accept the senders that have answered a challenge, unless this vehicle still collects echoes."""
+        """Accept the senders that have answered a challenge. Do nothing while this vehicle still collects echoes."""
         first_at = self.challenges.first_at
         answered = len(self._held.keys() | self._incarnations.keys())
         collects = not self._is_complete and first_at is not None and now < first_at + TRUST_DELAY_S
@@ -297,7 +302,9 @@ class Session:
             self._held.clear()
 
     def _decrypt(self, datagram: bytes, clear: ClearHeader) -> tuple[SenderKeys, bytes, UnverifiedSignature]:
-        """Return keys, body and unverified signature of a datagram. Raises MalformedDatagramError for a wrong tag."""
+        """Return the sender's keys, the body and the unverified signature of a datagram. Raises MalformedDatagramError
+        for a wrong tag.
+        """
         keys = self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot)
         return keys, *self.crypto.decrypt(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
 
@@ -313,7 +320,7 @@ class Session:
         return body
 
     def count_wrong_signature(self, sender: int) -> None:
-        """Remove a token from the sender's budget, because a signature in its name was wrong."""
+        """Take a token from the budget of this sender, because a signature in its name was wrong."""
         self._budgets[sender].take()
 
     def is_newest_request(self, request: AnsweredRequest, code: int) -> bool:

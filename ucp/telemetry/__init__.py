@@ -1,9 +1,9 @@
 """The event source `mavlink`: it converts the MAVLink telemetry of a vehicle to loggable events.
 
-`TelemetryEvents` translates the bytes of a vehicle into pairs of event ID and data. Time is an argument, and it does no
-I/O. `VehicleConnection` connects to the vehicle and passes its bytes to the translator. `describe` returns the data of
-an event as text, `position_of` returns it as a position, and `mode_name` returns the name of a flight mode. A mission
-selects the events to log by kind (`EVENT_KINDS`).
+`TelemetryEvents` translates the bytes of a vehicle into pairs of event ID and data. It does no I/O, and its methods
+take the time as an argument. `VehicleConnection` connects to the vehicle and passes its bytes to the translator.
+`describe` returns the data of an event as text, `position_of` returns it as a position, and `mode_name` returns the
+name of a flight mode. A mission selects the events to log by kind (`EVENT_KINDS`).
 
     ID  kind      event             data, big-endian (source: MAVLink messages)
     1   mode      mode change       `>IBII`   vehicle time ms, MAV_TYPE, mode before (0xFFFFFFFF: unknown), mode

@@ -12,8 +12,8 @@ MAX_READ_BYTES = 65536
 _REQUESTED = {33: 1.0, 30: 1.0, 1: 2.0, 2: 2.0, 42: 1.0}
 """Message ID -> requested interval in simulated seconds.
 
-ArduPilot sends HEARTBEAT, STATUSTEXT and MISSION_ITEM_REACHED without a request. With an interval, it would repeat the
-last MISSION_ITEM_REACHED.
+ArduPilot sends HEARTBEAT, STATUSTEXT and MISSION_ITEM_REACHED without a request. If an interval were requested,
+ArduPilot would repeat the last MISSION_ITEM_REACHED.
 """
 _SET_MESSAGE_INTERVAL = 511  # MAV_CMD_SET_MESSAGE_INTERVAL
 
@@ -37,7 +37,7 @@ class VehicleConnection:
         self._retry_s = _FIRST_RETRY_S
         self._socket: socket.socket | None = None
         self._retry_timer: ScheduledCall | None = None
-        """The timer of the next attempt to connect, or of the next request."""
+        """The timer for the next attempt to connect, or for the next repetition of the requests."""
         self._connect()
 
     def close(self) -> None:
@@ -94,7 +94,7 @@ class VehicleConnection:
     def _request_messages(self, pause_s: float) -> None:
         """Request the MAVLink messages, and repeat the requests with growing pauses.
 
-        A vehicle that is booting acknowledges a request and may forget it.
+        A vehicle that is booting may acknowledge a request and then forget it.
         """
         assert self._socket is not None, "it is connected"
         for message_id, interval_s in _REQUESTED.items():

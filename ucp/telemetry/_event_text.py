@@ -15,7 +15,7 @@ _STATES = (  # MAV_STATE
 
 
 def vehicle_type(event_id: int, data: bytes) -> int | None:
-    """Return the vehicle type (MAV_TYPE) in this event. Return None if the event contains none."""
+    """Return the vehicle type (MAV_TYPE) in a telemetry event. Return None if the event contains none."""
     if event_id != _records.MODE_CHANGE or len(data) != _records.MODE_CHANGE_DATA.size:
         return None
     kind: int = _records.MODE_CHANGE_DATA.unpack(data)[1]
@@ -25,7 +25,8 @@ def vehicle_type(event_id: int, data: bytes) -> int | None:
 def describe(event_id: int, data: bytes, of_type: int | None = None) -> str:
     """Return a description of a `mavlink` event. For any other data, return 'unreadable'.
 
-    `of_type` is the MAV_TYPE of the vehicle. Without it, some events have the number of a mode and not its name.
+    `of_type` is the MAV_TYPE of the vehicle. Without it, some descriptions contain the number of a mode instead of its
+    name.
     """
     try:
         match event_id:

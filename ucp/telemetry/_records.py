@@ -16,7 +16,7 @@ EVENT_KINDS: dict[EventKind, tuple[int, ...]] = {
     "position": (POSITION,),
     "battery": (BATTERY,),
 }
-"""The event IDs of each kind."""
+"""Event IDs by kind of event."""
 
 MAX_DATA_BYTES = 256
 """Maximum length of event data. Longer data is truncated."""
@@ -25,7 +25,7 @@ UNKNOWN_MODE = 0xFFFFFFFF
 UNKNOWN_HEADING = UNKNOWN_VOLTAGE = 0xFFFF
 
 CRITICAL_STATES = frozenset({5, 6, 8})
-"""The states of a failsafe: MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY and MAV_STATE_FLIGHT_TERMINATION."""
+"""Values of MAV_STATE during a failsafe: critical, emergency and flight termination."""
 
 SENSORS = {
     **{1 << 2: "compass", 1 << 5: "GPS"},

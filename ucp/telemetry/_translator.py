@@ -30,7 +30,7 @@ class TelemetryEvents:
     """
 
     def __init__(self, position_interval_s: float, rng: random.Random, log: Iterable[EventKind] = DEFAULT_LOG) -> None:
-        """Create the converter. It begins without a known flight mode or position.
+        """Create the converter. At first, no flight mode and no position are known.
 
         `position_interval_s` is the mean time between two position events in mission seconds. Each interval is drawn
         from `rng` between 0.5 and 1.5 times the mean. With equal intervals, all vehicles would complete their blocks at
@@ -150,7 +150,7 @@ class TelemetryEvents:
     def _status_text(self, message: Any, events: list[tuple[int, bytes]]) -> None:
         """Collect the parts of a text message. MAVLink 2 sends long texts in parts of 50 characters with the same ID.
 
-        The last chunk is shorter.
+        A part with fewer characters is the last one.
         """
         key = (message.id, message.severity)
         if self._text and (key != self._text_key or message.chunk_seq == 0):
@@ -182,7 +182,9 @@ class TelemetryEvents:
             events.append((_records.WAYPOINT, _records.WAYPOINT_DATA.pack(self._vehicle_ms, item)))
 
     def _estimate_is_good(self) -> bool:
-        """Return true if the vehicle reports a good position estimate. Firmware without such reports counts as good."""
+        """Return true if the vehicle reports a good position estimate. Return true if the firmware does not report the
+        quality of its estimate.
+        """
         if self._status is None:
             return False
         reported = self._status.onboard_control_sensors_present & self._estimate_bit
@@ -250,7 +252,5 @@ class _HomeError:
 
 
 def _thousandths(value: float) -> int:
-    """Return the value in thousandths as a signed 16-bit number. Too large values become the limit, and NaN becomes
-    0.
-    """
+    """Return the value times 1000 as a signed 16-bit number. Values out of range are limited, and NaN becomes 0."""
     return 0 if math.isnan(value) else round(max(-32.768, min(32.767, value)) * 1000)

@@ -15,7 +15,7 @@ from ucp.contract.schemas._schema_parts import (
 from ucp.export import SCHEMA
 
 SIGNATURE: Schema = {**BASE64, "minLength": 88, "maxLength": 88}
-"""The signature of a block's maker in a secured mission, 64 bytes in base64."""
+"""The signature of a block in a secured mission, 64 bytes in base64. The agent that completed the block made it."""
 
 
 def block(chain_hash: Schema) -> Schema:
@@ -47,7 +47,7 @@ HEAD: Schema = record(
         "signature": SIGNATURE,
     }
 )
-"""The signed head of an export in a secured mission."""
+"""The signed head of a chain export in a secured mission."""
 
 
 def schema() -> Schema:

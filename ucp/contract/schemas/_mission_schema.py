@@ -24,7 +24,9 @@ def _setting(declared: NumberSetting | ChoiceSetting) -> Schema:
 
 
 def settings(*, optional: bool) -> Schema:
-    """Return the JSON schema of the settings with their defaults. If `optional` is true, any setting may be missing."""
+    """Return the JSON schema of the settings with their defaults. If `optional` is true, every setting may be
+    missing.
+    """
     defaults = dataclasses.asdict(Settings())
     named = {name: {**_setting(declared), "default": defaults[name]} for name, declared in DECLARED.items()}
     return record(named, optional=tuple(named) if optional else ADDED)

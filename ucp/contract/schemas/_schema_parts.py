@@ -25,7 +25,7 @@ ROSTER: Schema = {"type": "array", "items": AGENT_ID, "minItems": 1}
 def record(properties: Schema, *, optional: tuple[str, ...] = (), closed: bool = False) -> Schema:
     """Return the JSON schema of an object with these keys. All keys except the `optional` ones are required.
 
-    If `closed`, no other keys are allowed.
+    If `closed` is true, no other keys are allowed.
     """
     required = [name for name in properties if name not in optional]
     made: Schema = {"type": "object", "properties": properties, "required": required}

@@ -50,7 +50,7 @@ SECURED_DROPS = (
     "not confirmed",
     "too many wrong signatures",
 )
-"""Further reasons in a secured mission."""
+"""Further reasons why an agent of a secured mission drops a datagram."""
 
 
 def header() -> Schema:
@@ -184,7 +184,7 @@ def handler_run() -> Schema:
 
 
 def aside() -> Schema:
-    """Return the JSON schema of trace lines about dropped datagrams and commands."""
+    """Return the JSON schema of trace lines that are no handler runs: dropped datagrams and commands."""
     return {
         "oneOf": [
             record(

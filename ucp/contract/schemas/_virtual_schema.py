@@ -7,7 +7,7 @@ from ucp.mission import LATEST_EPOCH_US
 EVENT_TIMESTAMP: Schema = TIMESTAMP | {"maximum": LATEST_EPOCH_US}
 
 COMMANDS = ("status", "stop_events", "reconcile", "export", "quirk", "revoke")
-"""The commands that are also commands of the control socket. Virtual time adds `store`."""
+"""The commands that exist both in virtual time and on the control socket. Virtual time also has the command `store`."""
 
 
 def inputs() -> Schema:

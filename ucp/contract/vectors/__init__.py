@@ -1,8 +1,8 @@
 """Test vectors of the agent contract: inputs with the correct outputs. `python -m ucp.contract.vectors` writes the
 files.
 
-They cover hashes, messages, dropped datagrams, full blocks, refused missions and requests, secured datagrams (which
-need the extra `secure`), and whole missions in virtual time.
+The vectors cover hashes, messages, dropped datagrams, full blocks, refused missions and requests, secured datagrams
+(they need the extra `secure`), and complete missions in virtual time.
 """
 
 import base64
@@ -37,11 +37,11 @@ DOCUMENTS: dict[str, Callable[[], Any]] = {
     "refusals": refusal_vectors.vectors,
     "secured": _secured,
 }
-"""Name of a file -> function that returns its content."""
+"""Name of a file with test vectors -> function that returns its content."""
 
 MISSIONS = DIRECTORY / "missions"
 INDEX = MISSIONS / "index.json"
-"""The file with the name, the description and the needed features of each transcript."""
+"""The list of all recorded missions, with name, description and needed features."""
 
 
 def texts() -> dict[Path, str]:
@@ -57,7 +57,7 @@ def texts() -> dict[Path, str]:
 
 
 def write_all() -> None:
-    """Write all files with test vectors, and replace the present files."""
+    """Write all files with test vectors. Existing files are replaced."""
     for path, text in texts().items():
         path.parent.mkdir(exist_ok=True)
         path.write_text(text, encoding="ascii")

@@ -1,4 +1,4 @@
-"""`python -m ucp.contract.vectors`: write the test vectors of the agent contract, and replace the present files."""
+"""Write the test vectors of the agent contract (`python -m ucp.contract.vectors`). Existing files are replaced."""
 
 from ucp.contract.vectors import write_all
 

@@ -12,7 +12,7 @@ AGENT_ID = 7
 
 
 def _events(sizes: Iterable[int], timestamps_us: Iterable[int]) -> list[LoggableEvent]:
-    """Return events of these sizes in bytes. A size includes the header of the event."""
+    """Return events with these sizes in bytes, including the header of each event."""
     return [
         LoggableEvent(timestamp_us, 1 + number % 254, bytes([number % 256]) * (size - EVENT_HEADER_BYTES))
         for number, (size, timestamp_us) in enumerate(zip(sizes, timestamps_us, strict=True))
@@ -43,7 +43,7 @@ CASES: tuple[tuple[str, Settings, list[LoggableEvent]], ...] = (
 
 
 def vectors() -> list[dict[str, Any]]:
-    """Return the test vectors. Each event has its branch of Algorithm 1, and the block that it completes, if any."""
+    """Return the test vectors. Each event has its branch of Algorithm 1, and the block that it completes or null."""
     return [
         {
             "what": what,

@@ -25,7 +25,9 @@ BLOCKS = (
 
 
 def vectors() -> dict[str, Any]:
-    """Return the test vectors. `block_data` is the input of the block hash, and the form of a block in messages."""
+    """Return the test vectors. `block_data` is the input of the block hash, and also the encoding of the block in
+    messages.
+    """
     return {
         "inception": [_inception(data) for data in INITIAL_DATA],
         "events": [_event(event) for event in EVENTS],

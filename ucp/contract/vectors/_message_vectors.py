@@ -39,7 +39,7 @@ MESSAGES: tuple[tuple[int, int, Message], ...] = (
     (1, 13, BlockResponse(BLOCKS[0])),
     (1, 14, BlockResponse(BLOCKS[3])),
 )
-"""The sender, sequence and message of each vector."""
+"""The sender, sequence number and message of each vector."""
 
 
 def vectors() -> list[dict[str, Any]]:

@@ -34,8 +34,8 @@ MICROSECONDS = 1_000_000
 class RecordedMission:
     """A recorded mission of agent 7. `exchanges` contains each input with its outputs.
 
-    Times are mission seconds of the agent, and `now` is the time of the last input. The story plays the other agents.
-    All of them share one counter of sequence numbers, which the protocol does not use.
+    Times are mission seconds of the agent, and `now` is the time of the last input. The function that records the
+    mission plays the other agents. All of them share one counter of sequence numbers, which the protocol does not use.
     """
 
     initial_data = INITIAL_DATA
@@ -76,15 +76,17 @@ class RecordedMission:
         self._exchange({"mission": mission, "trace": True, **self._of_life(), **store})
 
     def _of_mission(self) -> dict[str, Any]:
-        """Return additional keys for the mission file. A subclass may define some."""
+        """Return additional keys for the mission file. The base class has none."""
         return {}
 
     def _of_life(self) -> dict[str, Any]:
-        """Return additional keys for the input line that starts the agent. A subclass may define some."""
+        """Return additional keys for the input line that starts the agent. The base class has none."""
         return {}
 
     def log(self, data_bytes: int = 256, *, after_s: float = 1.0, event_id: int = 5) -> None:
-        """Log an event with `data_bytes` bytes of data."""
+        """Log an event with `data_bytes` bytes of data. All methods with `after_s` first let this number of mission
+        seconds pass.
+        """
         self.now += after_s
         timestamp_us = self._epoch_us + round(self.now * MICROSECONDS)
         data = bytes((event_id + offset) % 256 for offset in range(data_bytes))
@@ -96,16 +98,16 @@ class RecordedMission:
             self.log()
 
     def hear(self, sender: int, message: Message, *, after_s: float = 0.125) -> None:
-        """Give the agent a message of another agent."""
+        """Give the agent a message from another agent."""
         self._sequence += 1
         self.hear_datagram(self._encoded(sender, self._sequence, message), after_s=after_s)
 
     def _encoded(self, sender: int, sequence: int, message: Message) -> bytes:
-        """Return another agent's message as a datagram."""
+        """Return a message from another agent as a datagram."""
         return encode(sender, sequence, message)
 
     def _message(self, datagram: bytes) -> Message | None:
-        """Return the message in a datagram of the agent. Return None if the datagram contains no message."""
+        """Return the message in a datagram that the agent sent. Return None if the datagram contains no message."""
         return decode(datagram).message
 
     def hear_datagram(self, datagram: bytes, *, after_s: float = 0.125) -> None:
@@ -114,7 +116,9 @@ class RecordedMission:
         self._exchange({"datagram": in_base64(datagram)})
 
     def wait(self, *, late_s: float = 0.0) -> None:
-        """Wait for the expiry of the next timer. The agent is informed `late_s` mission seconds late."""
+        """Wait until the next timer of the agent expires. The agent handles the expiry `late_s` mission seconds
+        late.
+        """
         assert self.timer is not None, "no timer runs"
         self.now = self.timer + late_s
         self._exchange({"timer": True})
@@ -125,12 +129,12 @@ class RecordedMission:
         self._exchange({"timer": True})
 
     def command(self, name: str, *, after_s: float = 0.5, **keys: Any) -> None:
-        """Give the agent a command of its control socket, or the command `store`."""
+        """Give the agent a command, as over its control socket, or the command `store`."""
         self.now += after_s
         self._exchange({"command": name, **keys})
 
     def reboot(self, *, down_s: float = 30.0) -> None:
-        """Let the agent lose power for `down_s` mission seconds, and restart it with its stored data."""
+        """Switch the agent off for `down_s` mission seconds, and restart it with its stored data."""
         self.command("store")
         line = len(self.exchanges)
         store = self.output["answer"].pop("store")
@@ -154,7 +158,7 @@ class RecordedMission:
 
     @property
     def timer(self) -> float | None:
-        """The mission second at which the agent's next timer expires."""
+        """The mission second at which the next timer of the agent expires."""
         ends: float | None = self.output["timer"]
         return ends
 
@@ -172,14 +176,14 @@ class RecordedMission:
             self.hear(sender, BlockAddResponse(self._last(BlockAddRequest).block_hash, approve))
 
     def contain(self, *answers: tuple[int, bool]) -> None:
-        """Give the agent answers to its last query of reconcile phase 1. Each answer is (responder, contained)."""
+        """Answer the agent's last query of reconcile phase 1. Each answer is (responder, contained)."""
         for sender, contained in answers:
             self.hear(sender, ChainContainResponse(self._last(ChainContainQuery).chain_hash, contained))
 
     def name(self, *answers: tuple[int, Block | None], top_us: int = 0) -> None:
-        """Give the agent answers to its last query of reconcile phase 2. Each answer is (responder, next block).
+        """Answer the agent's last query of reconcile phase 2. Each answer is (responder, next block).
 
-        None stands for "Is Top Of Chain", with the timestamp `top_us`.
+        The next block None stands for "Is Top Of Chain". These answers have the timestamp `top_us`.
         """
         for sender, block in answers:
             chain_hash = self._last(ChainHashSuccessorQuery).chain_hash

@@ -21,9 +21,9 @@ from ucp.messages import (
 )
 
 A, B, C = 1, 28, 300
-"""The other agents on the roster."""
+"""The IDs of the other agents on the roster."""
 STRANGE = bytes(range(32))
-"""A hash that no block and no chain has."""
+"""The hash of no block and no chain."""
 
 
 def alone() -> RecordedMission:
@@ -92,7 +92,9 @@ def vote() -> RecordedMission:
 
 
 def tied_vote() -> RecordedMission:
-    """A tied vote is not approved. The agent reconciles, finds that all agents have its chain, and proposes again."""
+    """A tied vote is not approved. The agent reconciles. All answers contain its chain, and it proposes the block
+    again.
+    """
     story = RecordedMission()
     story.complete_a_block()
     story.vote((A, False))
@@ -137,7 +139,7 @@ def chain_changed() -> RecordedMission:
 def held_already() -> RecordedMission:
     """Another agent commits the agent's own block on top of its chain.
 
-    No correct agent does this. It is not followed.
+    No correct agent does this. The agent does not append the block a second time.
     """
     story = RecordedMission()
     story.complete_a_block()
@@ -185,9 +187,10 @@ def diverged() -> RecordedMission:
 
 
 def outvoted() -> RecordedMission:
-    """Three blocks are popped.
+    """Three blocks are popped in a reconcile.
 
-    One block of the majority is requested, one is on the stack, and the rest is committed again.
+    Phase 3 requests one block of the majority's chain, and takes one from the stack. Finalize commits the rest of the
+    stack.
     """
     story = RecordedMission()
     mutual, theirs, last = others_block(A, 1), others_block(B, 2), others_block(C, 3)
@@ -223,7 +226,7 @@ def outvoted() -> RecordedMission:
 
 
 def no_gap() -> RecordedMission:
-    """Without a finalize gap, the whole stack is committed in one run."""
+    """Without a finalize gap, finalize commits the whole stack in one handler run."""
     story = RecordedMission(finalize_gap_s=0)
     for ordinal in range(1, 4):
         blocks = [others_block(A, number) for number in range(1, ordinal + 1)]
@@ -238,7 +241,7 @@ def no_gap() -> RecordedMission:
 
 
 def nobody() -> RecordedMission:
-    """No agent answers in phase 1, in a later phase 2, and in a later phase 3."""
+    """No agent answers in phase 1. In later reconciles, no agent answers in phase 2, and then in phase 3."""
     story = RecordedMission()
     theirs = others_block(B, 2)
     story.command("reconcile")
@@ -256,7 +259,7 @@ def nobody() -> RecordedMission:
 
 
 def at_inception() -> RecordedMission:
-    """All agents answer that they do not contain the inception block. It is never popped."""
+    """All agents answer that their chains do not contain the inception block. The agent never pops it."""
     story = RecordedMission()
     story.command("reconcile")
     story.contain((A, False), (B, False))
@@ -293,7 +296,7 @@ def ties() -> RecordedMission:
 
 
 def ties_read_otherwise() -> RecordedMission:
-    """The settings are `phase1_tie` pop and `phase2_tie` block."""
+    """The missions use the settings `phase1_tie` pop and `phase2_tie` block."""
     story = RecordedMission(phase1_tie="pop", phase2_tie="block")
     first, second = others_block(A, 1, at_s=1), others_block(B, 2, at_s=2)
     story.hear(A, CommitBlock(first, chain_of(first).top_chain_hash))
@@ -312,7 +315,9 @@ def ties_read_otherwise() -> RecordedMission:
 
 
 def asks_after_commit() -> RecordedMission:
-    """The setting is `asks_after_commit`. After a commit and a gap, the agent sends a query unless it reconciles."""
+    """The mission uses the setting `asks_after_commit`. After a commit and a gap, the agent sends a query unless it
+    reconciles.
+    """
     story = RecordedMission(asks_after_commit=True)
     story.complete_a_block()
     story.vote((A, True))
@@ -327,7 +332,9 @@ def asks_after_commit() -> RecordedMission:
 
 
 def answer_spread() -> RecordedMission:
-    """The setting is `answer_spread_s`. Each answer is sent after its own wait, and all other messages at once."""
+    """The mission uses the setting `answer_spread_s`. Each answer waits for its own time. All other messages are sent
+    at once.
+    """
     story = RecordedMission(answer_spread_s=2.0)
     block = others_block(A, 1, at_s=1)
     chain = chain_of(block)
@@ -347,7 +354,9 @@ def answer_spread() -> RecordedMission:
 
 
 def top_needs_majority() -> RecordedMission:
-    """The setting is `top_needs_majority`. "Is Top Of Chain" ends the search only if a vote would be approved."""
+    """The mission uses the setting `top_needs_majority`. "Is Top Of Chain" ends the search only if a vote would be
+    approved.
+    """
     story = RecordedMission(top_needs_majority=True)
     old, young = others_block(B, 1, at_s=10), others_block(C, 2, at_s=20)
     story.command("reconcile")
@@ -363,7 +372,7 @@ def top_needs_majority() -> RecordedMission:
 
 
 def votes_name_chains() -> RecordedMission:
-    """The settings are `vote_names_chain` and `changed_before_tally`."""
+    """The mission uses the settings `vote_names_chain` and `changed_before_tally`."""
     story = RecordedMission(vote_names_chain=True, changed_before_tally=True)
     first = others_block(A, 1)
     inception = chain_of().top_chain_hash
@@ -406,9 +415,9 @@ def offered_what_it_holds() -> RecordedMission:
 
 
 def reboot() -> RecordedMission:
-    """A brown-out interrupts a reconcile.
+    """A power failure interrupts a reconcile.
 
-    The stack is committed again, and the front of the deque is proposed again.
+    After the reboot, the agent commits the stack again and proposes the front of the deque again.
     """
     story = RecordedMission()
     blocks = [others_block(A, ordinal) for ordinal in range(1, 4)]
@@ -437,7 +446,7 @@ def reboot() -> RecordedMission:
 
 
 def late_timers() -> RecordedMission:
-    """The clock begins below 0, two timers have expired when the agent runs, and datagrams are dropped in between."""
+    """The clock begins below 0. Two timers expire before the agent runs again. Datagrams are dropped in between."""
     story = RecordedMission(at_s=-3.5)
     story.hear_datagram(b"", after_s=0.0)
     story.log(256, after_s=4.0)

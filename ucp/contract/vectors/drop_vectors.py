@@ -13,11 +13,11 @@ ROSTER = (1, 7, 28)
 SENDER = 28
 HASH_2 = BLOCK_HASH + CHAIN_HASH
 STRANGER = 5
-"""An agent that is not on the roster."""
+"""The ID of an agent that is not on the roster."""
 
 
 def datagram(code: int, body: bytes, *, sender: int = SENDER, length: int | None = None) -> bytes:
-    """Return a datagram with this type and body. It may be invalid."""
+    """Return a datagram of this type with this body. The datagram may be invalid."""
     return HEADER.pack(MAGIC, VERSION, code, sender, 1, len(body) if length is None else length) + body
 
 
@@ -27,7 +27,7 @@ def block(agent_id: int, data_bytes: int = 12) -> bytes:
 
 
 def cases() -> Iterator[tuple[str, bytes]]:
-    """Yield each datagram with its description."""
+    """Yield each datagram with its description and the reason why it is dropped."""
     good = datagram(1, HASH_2)
     yield "a good one", good
     yield "nothing at all", b""
@@ -78,7 +78,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
 
 
 def vectors() -> dict[str, Any]:
-    """Return the test vectors. `dropped` is the reason for a drop, or null if a handler receives the datagram."""
+    """Return the test vectors. `dropped` is the reason for a drop, or null if the agent must handle the datagram."""
     return {
         "agent_id": AGENT_ID,
         "roster": ROSTER,

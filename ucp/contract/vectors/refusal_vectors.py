@@ -12,7 +12,7 @@ from ucp.sealed import seal_to
 from ucp.trace import in_base64
 
 UNKNOWN = "a feature of a later version"
-"""The name of a feature that no agent has."""
+"""The name of a feature that no agent supports."""
 
 
 def vectors() -> dict[str, Any]:

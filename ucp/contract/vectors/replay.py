@@ -20,11 +20,11 @@ SHOWN = 200
 
 
 class NoAnswerError(Exception):
-    """An error: the agent ended, or its output is not a JSON object."""
+    """An error: the agent program ended, or its output is not a JSON object."""
 
 
 class Player:
-    """An agent program in virtual time. Raises OSError if the program cannot be started."""
+    """An agent program that runs in virtual time. Raises OSError if the program cannot be started."""
 
     def __init__(self, command: list[str]) -> None:
         self._process = subprocess.Popen(
@@ -59,7 +59,7 @@ class Player:
 def play(player: Player, transcript: Path) -> str | None:
     """Play a recorded mission. Return the first difference, or the reason why the agent cannot play the mission.
 
-    None means that the agent gave the expected outputs. Raises NoAnswerError.
+    Return None if all outputs of the agent are as expected. Raises NoAnswerError.
     """
     stores: dict[int, Any] = {}
     with transcript.open(encoding="ascii") as file:
@@ -80,7 +80,9 @@ def play(player: Player, transcript: Path) -> str | None:
 
 
 def differences(got: Any, wanted: Any, where: str = "output") -> Iterator[tuple[str, Any, Any]]:
-    """Yield each difference as (place, value, expected value). Additional keys of an object do not count."""
+    """Compare an output with the expected output. Yield each difference as (place, value, expected value). Additional
+    keys of an object do not count.
+    """
     if isinstance(wanted, dict) and isinstance(got, dict):
         for key, value in wanted.items():
             if key in got:

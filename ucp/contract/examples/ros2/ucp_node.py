@@ -41,12 +41,12 @@ THIS_VEHICLE_ONLY = {
 }
 """Environment variables that limit ROS to loopback.
 
-They also switch off shared memory, because the vehicles of one machine would share it. Vehicles then communicate only
+They also switch off shared memory, which all vehicles on one machine would share. Vehicles then communicate only
 through UCP.
 """
 
 NO_LOG_FILES = ["--ros-args", "--disable-external-lib-logs"]
-"""Arguments that switch off the log files of ROS. In a container, an agent can write only next to its mission file."""
+"""Arguments that make ROS write no log files. In a container, an agent can write only next to its mission file."""
 
 
 class RosLoop(Loop):
