@@ -38,7 +38,7 @@ _NAMES_OF = {
     "netem.medium": ("Medium",),
     "netem.radio": ("HardRange", "LogDistance", "Place"),
 }
-"""Module -> its public names, to import at their first use."""
+"""Module -> its public names. The module is imported when one of these names is first used."""
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 
 if not TYPE_CHECKING:  # a type checker would accept any name

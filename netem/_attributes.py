@@ -1,7 +1,7 @@
 """Encode and decode netlink attributes (RFC 3549; linux/netlink.h).
 
-The package has its own small codec for speed. A lab of 100 vehicles with a condition for each pair needs 20,000
-requests, and 10,000 answers when it is read back.
+The package has its own small codec for speed. A lab of 100 vehicles with different conditions for each pair needs
+20,000 requests to set the conditions, and 10,000 answers to read them back.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def nested(kind: int, *attributes: bytes) -> bytes:
 
 
 def number(kind: int, value: int) -> bytes:
-    """Return an attribute with a 32-bit number."""
+    """Return a netlink attribute with a 32-bit number."""
     return attribute(kind, struct.pack("=I", value))
 
 
@@ -32,7 +32,9 @@ def text(kind: int, value: str) -> bytes:
 
 
 def parse(data: bytes) -> dict[int, bytes]:
-    """Return the contents of the attributes by attribute type. If a type occurs twice, the last attribute counts."""
+    """Parse netlink attributes. Return their contents by attribute type. If a type occurs twice, the last attribute
+    counts.
+    """
     payloads = {}
     offset = 0
     while offset + _HEADER.size <= len(data):

@@ -15,8 +15,8 @@ def choose(preference: str | None, fabric: VirtualSwitch, needs: Sequence[str] =
     """Install the first suitable engine that works on this machine. Return the engine, and the reason for the choice.
 
     Without a preference, tc netem comes first, because it supports more. `needs` lists conditions other than loss and
-    partition. Only the installation of an engine shows whether the kernel supports it. Raises EngineError with the
-    reason of each engine if none works.
+    partition. An engine is tested by installing it, because nothing else shows whether the kernel supports it. Raises
+    EngineError with the reason of each engine if none works.
     """
     engines: dict[str, type[Engine]] = {kind.name: kind for kind in (NetemEngine, NftablesEngine)}
     if preference is not None and preference not in engines:

@@ -2,9 +2,9 @@
 
 A vehicle has the interface `eth0` with its address and a default route (ArduPilot built with CAN needs a route for its
 multicast). The other end, `v<ID>`, is a port of the bridge in the lab's own namespace. There the engines handle each
-packet on its way to the vehicle. The vehicles' namespaces have no names. They exist as long as this process holds them
-open or a process runs in them. An existing namespace, such as that of a container, can also belong to a vehicle. The
-cable then ends in it.
+packet on its way to the vehicle. The namespaces of the vehicles have no names. They exist as long as this process holds
+them open or a process runs in them. An existing namespace, such as that of a container, can also belong to a vehicle.
+The cable then ends in it.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ class VirtualSwitch:
         return _FIRST_PORT_INDEX + self.vehicles.index(vehicle)
 
     def inside(self, vehicle: int | None) -> AbstractContextManager[None]:
-        """Run code in the network of a vehicle. For None, run it in the network of the switch."""
+        """Run code in the network of a vehicle inside the context. If `vehicle` is None, run it in the network of the
+        switch.
+        """
         return _namespaces.inside(self.home if vehicle is None else self._namespaces[vehicle], self.home)
 
     def inodes(self) -> dict[int, int]:
@@ -85,7 +87,7 @@ class VirtualSwitch:
         )
 
     def _wait_for_carrier(self) -> None:
-        """Wait until the bridge forwards packets on each port. The kernel detects a new cable after a short time."""
+        """Wait until the bridge forwards packets on each port. The kernel takes a short time to detect a new cable."""
         deadline = time.monotonic() + _CARRIER_DEADLINE_S
         while True:
             ready = forwarding(self.netlink)
@@ -99,18 +101,18 @@ class VirtualSwitch:
 
 
 def _disable_ipv6() -> None:
-    """Disable IPv6 on new links, because IPv6 would send packets that no program has sent."""
+    """Disable IPv6 on new links. Otherwise the kernel would send IPv6 packets that no program requested."""
     _sysctl("ipv6/conf/default/disable_ipv6", b"1")
 
 
 def _bypass_firewall() -> None:
-    """Prevent br_netfilter, which Docker often loads, from filtering packets of the bridge."""
+    """Prevent br_netfilter from filtering the packets of the bridge. Docker often loads this kernel module."""
     for protocol in ("iptables", "ip6tables", "arptables"):
         _sysctl(f"bridge/bridge-nf-call-{protocol}", b"0")
 
 
 def _sysctl(name: str, value: bytes) -> None:
-    """Set a kernel parameter of the current network namespace, if the kernel has it."""
+    """Set a kernel parameter of the current network namespace. Do nothing if the kernel lacks the parameter."""
     try:
         fd = os.open(f"/proc/sys/net/{name}", os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:

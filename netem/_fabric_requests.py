@@ -82,8 +82,8 @@ def address(what: str, index: int, own: str, prefix_length: int, broadcast: str)
 
 
 def default_route(what: str, index: int) -> NetlinkRequest:
-    """Return a request for a default route without a gateway, so that all addresses count as neighbours on this
-    link.
+    """Return a request for a default route without a gateway. With it, the kernel treats all addresses as neighbours on
+    this link.
     """
     kind = (_RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST)
     return NetlinkRequest(

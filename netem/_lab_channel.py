@@ -1,5 +1,5 @@
-"""Send requests to the process inside the virtual network, and receive its answers and its reports of ended
-programs.
+"""Send requests to the process inside the virtual network, and receive its answers and its reports about programs that
+have ended.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class LabConnection:
         return await asyncio.shield(self._inside)
 
     async def ask(self, what: str, **arguments: Any) -> Answer:
-        """Send a request. Return its result, and the socket that the answer contains, if any."""
+        """Send a request. Return the result in the answer, and the socket that the answer contains or None."""
         if self._end is not None:
             raise LabError(self._end)
         number = next(self._numbers)

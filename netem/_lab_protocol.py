@@ -1,8 +1,8 @@
 """Define the messages between the harness and its virtual network: JSON objects with length prefixes on a Unix stream
 socket.
 
-Sockets accompany a message as SCM_RIGHTS (unix(7)). Such a message has their number in its key `descriptors`. Both
-sides keep the order.
+Sockets accompany a message as SCM_RIGHTS (unix(7)). The key `descriptors` of such a message contains the number of its
+sockets. Both sides keep the order.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ class MessageReceiver:
         self.descriptors: deque[int] = deque()
 
     def read(self, source: socket.socket) -> bool:
-        """Read available data. Return False at the end of the stream. Raises BlockingIOError if there are no data."""
+        """Read available data. Return False at the end of the stream. Raises BlockingIOError if no data are
+        available.
+        """
         room = socket.CMSG_SPACE(_MAX_DESCRIPTORS * array.array("i").itemsize)
         data, ancillary, _, _ = source.recvmsg(1 << 16, room, socket.MSG_CMSG_CLOEXEC)
         for level, kind, payload in ancillary:

@@ -1,8 +1,9 @@
 """Create private networks for processes, with unshare(1) for the first process and setns(2) inside it.
 
 The first process is PID 1 of its own PID namespace. Its end therefore ends each process of the lab, and afterwards the
-kernel removes namespaces, links and rules. Three mechanisms end it: the orchestrator closes the control socket or dies,
-the death signal that setpriv(1) requests, and `--kill-child`, which ties it to the unshare process.
+kernel removes namespaces, links and rules. Three mechanisms end the first process. It ends when the harness closes the
+control socket or dies. setpriv(1) requests a death signal. And the option `--kill-child` of unshare(1) kills it when
+the unshare process ends.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def unshare_network() -> None:
-    """Move this thread into a new network namespace (unshare(2), because `os.unshare` needs Python 3.12)."""
+    """Move this thread into a new network namespace. The function calls unshare(2) itself, because `os.unshare` needs
+    Python 3.12.
+    """
     _check(_libc.unshare(CLONE_NEWNET))
 
 
@@ -32,7 +35,9 @@ def open_network() -> int:
 
 
 def enter_network(namespace: int) -> None:
-    """Move this thread into a network namespace (setns(2), because `os.setns` needs Python 3.12)."""
+    """Move this thread into a network namespace. The function calls setns(2) itself, because `os.setns` needs Python
+    3.12.
+    """
     _check(_libc.setns(namespace, CLONE_NEWNET))
 
 
@@ -57,9 +62,9 @@ def _check(result: int) -> None:
 def command(argv: Sequence[str], *, user_namespace: bool, die_with_parent: bool = True) -> list[str]:
     """Return the command that runs `argv` as the first process of a private network (unshare(1)).
 
-    With `user_namespace`, it needs no rights, and has all rights over the objects that it creates. The death signal
-    follows the *thread* that started the command (PR_SET_PDEATHSIG in prctl(2)). Set `die_with_parent` to false if this
-    thread may end before the lab.
+    With `user_namespace`, the command needs no rights, and has all rights over the objects that it creates. The death
+    signal follows the *thread* that started the command (PR_SET_PDEATHSIG in prctl(2)). Set `die_with_parent` to false
+    if this thread may end before the lab.
     """
     setpriv = ["setpriv", "--pdeathsig", "KILL"] if die_with_parent else []
     user = ["--user", "--map-root-user"] if user_namespace else []
@@ -101,7 +106,9 @@ def not_executed(message: str) -> tuple[str, str] | None:
 
 
 def user() -> str:
-    """Return the user who executes programs, such as "user mail". In a user namespace, root is the user outside."""
+    """Return the user who executes programs, such as "user mail". In a user namespace, a process of root has the rights
+    of this user outside.
+    """
     uid = os.geteuid()
     for line in Path("/proc/self/uid_map").read_text().splitlines():
         inside, outside, count = map(int, line.split())

@@ -1,7 +1,7 @@
-"""Send requests to the kernel in batches through a netlink socket (rtnetlink(7)), which is fast.
+"""Send requests to the kernel in batches through a netlink socket (rtnetlink(7)).
 
-A lab of 100 vehicles needs about 900 requests. One system call and one wait for each of them would take most of its
-start time. The socket belongs to the namespace in which it was opened.
+A lab of 100 vehicles needs about 900 requests. A system call and a wait for each single request would take most of the
+start time of the lab. The socket belongs to the namespace in which it was opened.
 """
 
 from __future__ import annotations
@@ -68,7 +68,8 @@ class NetlinkSocket:
     def send(self, requests: Sequence[NetlinkRequest]) -> None:
         """Send the requests in order, and wait until the kernel has processed all of them.
 
-        Raises NetlinkError for the first refused request. Later requests of the same batch were tried, too.
+        Raises NetlinkError for the first refused request. The kernel has tried the later requests of the same batch,
+        too.
         """
         batch: list[NetlinkRequest] = []
         encoded = bytearray()

@@ -1,8 +1,8 @@
 """The engine "nftables": it applies loss and partitions with rules in `table bridge air`, on kernels without netem.
 
 The rules are in the forward hook of the bridge. It handles each packet of any protocol once per receiver, because the
-switch has already copied broadcasts. Each receiver therefore has its own random draws. A packet is first marked with
-the group of its incoming port, and then judged in its receiver's chain:
+switch has already copied broadcasts. Losses are therefore drawn separately for each receiver. A rule first marks the
+packet with the group of its incoming port. The rules in the chain of its receiver then pass or drop it:
 
     chain forward { meta mark set iifname map @group
                     oifname vmap { "v7" : jump cut_v7, ... }
@@ -13,11 +13,10 @@ the group of its incoming port, and then judged in its receiver's chain:
     chain to_v7_0 { numgen random mod 1000000000 < 150000000 counter name "lost_v7" drop
                     counter name "passed_v7" }
 
-The cost of a packet therefore does not grow with the number of vehicles. Chain 0 applies to all senders except those
-with a different loss. Each different loss has a further chain. A change is one nft transaction, so no packet meets a
-partial change. Only a change of thousands of links exceeds the amount that an ordinary user may send at once. It is
-made receiver by receiver. The counters are separate objects and survive changes of rules. See nft(8) and
-libnftables-json(5).
+The cost of a packet therefore does not grow with the number of vehicles. Chain 0 of a receiver applies to most senders.
+Each other loss rate has a further chain. A change is one nft transaction, so no packet meets a partial change. Only a
+change of thousands of links exceeds the amount that an ordinary user may send at once. Such a change is made receiver
+by receiver. The counters are separate objects and survive changes of rules. See nft(8) and libnftables-json(5).
 """
 
 from __future__ import annotations
@@ -47,13 +46,15 @@ _STDIN = ["-f", "/proc/self/fd/0"]  # nft translates "-" to /dev/stdin, which so
 _DEADLINE_S = 20.0
 _TOO_LONG = "Message too long"
 _COMMANDS_AT_ONCE = 500
-"""Number of commands in about 200 KB, which is the limit of net.core.wmem_max for an ordinary user."""
+"""Maximum number of commands in one transaction. They take about 200 KB, which is the limit of net.core.wmem_max for an
+ordinary user.
+"""
 
 
 class NftablesEngine(Engine):
     """An engine for independent loss per sender and receiver, and for partitions.
 
-    Conditions that need a queue or a memory are not supported.
+    The engine does not support conditions that need a queue or a memory of earlier packets.
     """
 
     name = "nftables"
@@ -112,7 +113,7 @@ class NftablesEngine(Engine):
         return commands
 
     def _loss(self, conditions: NetworkConditions) -> list[list[dict[str, Any]]]:
-        """Return the commands that set the loss for each receiver."""
+        """Return the nftables commands that set the loss for each receiver."""
         differing: dict[int, dict[float, list[int]]] = {}
         for sender, receiver, link in conditions.differing_links():
             differing.setdefault(receiver, {}).setdefault(link.independent_loss, []).append(sender)
@@ -245,13 +246,15 @@ def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
 
 
 def _only_mark(rules: list[list[dict[str, Any]]]) -> int | None:
-    """Return the mark of the only group from which the receiver accepts packets. Return None if it accepts all."""
+    """Return the only group from which these rules accept packets, as a packet mark. Return None if they accept all
+    packets.
+    """
     marks = [e["match"]["right"] for expressions in rules for e in expressions if "match" in e]
     return marks[0] if marks else None
 
 
 def _loss(rules: list[list[dict[str, Any]]]) -> float:
-    """Return the loss rate that these nftables rules cause."""
+    """Return the probability with which these nftables rules drop a packet."""
     for expressions in rules:
         if any("drop" in expression for expression in expressions):
             matches = [expression["match"] for expression in expressions if "match" in expression]

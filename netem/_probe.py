@@ -4,10 +4,10 @@ path.
     _probe.py receive PORT      receive the UDP datagrams of a port until SIGTERM
     _probe.py broadcast PORT COUNT FIRST BROADCAST_ADDRESS [BYTES [PAUSE_S]]
 
-`broadcast` numbers its datagrams from FIRST, writes the sending time into each, and pauses after every 20. At its end
-it prints by how many seconds each pause was too long. `receive` prints "ready", and its results on SIGTERM. Each output
-is one JSON object. Times are those of the real-time clock, which all processes of a kernel share. Arrival times come
-from the kernel (SO_TIMESTAMPNS, socket(7)).
+`broadcast` numbers its datagrams from FIRST, writes the sending time into each, and pauses after every 20. At the end,
+it prints the number of seconds by which each pause was too long. `receive` prints "ready", and its results on SIGTERM.
+Each output is one JSON object. Times are those of the real-time clock, which all processes of a kernel share. Arrival
+times come from the kernel (SO_TIMESTAMPNS, socket(7)).
 """
 
 from __future__ import annotations
@@ -44,10 +44,11 @@ def print_json(what: object) -> None:
 
 
 def collect(source: socket.socket, size: int) -> list[tuple[bytes, int]]:
-    """Return all packets until SIGTERM and a short silence after it, each with its time of arrival in nanoseconds.
+    """Receive packets until SIGTERM and a short silence after it. Return each packet with its time of arrival in
+    nanoseconds.
 
-    The packets stay in the socket's buffer as long as it has room, and the process has the lowest priority. Otherwise
-    its own use of the processor would delay the packets that it measures.
+    The process has the lowest priority, and leaves packets in the socket's buffer as long as the buffer has room.
+    Otherwise the process would use processor time and delay the packets that it measures.
     """
     os.nice(_LOWEST_PRIORITY)
     source.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)

@@ -1,12 +1,12 @@
 """Capture all frames of one switch port, through a buffer that is shared with the kernel (AF_PACKET, TPACKET_V3).
 
-The kernel fills the blocks of the ring. It hands over a block when it is full or 100 ms old. A late reader finds all
-blocks that fit into the ring. The kernel counts the frames of the port and the frames that did not fit, so losses are
-always known. See packet(7), and packet_mmap in the kernel's documentation.
+The kernel fills the blocks of the ring. It hands over a block when it is full or 100 ms old. A reader that is late
+still finds all blocks that fit into the ring. The kernel counts the frames of the port and the frames that did not fit,
+so losses are always known. See packet(7), and packet_mmap in the kernel's documentation.
 
-Frames that leave the port have passed netem and nftables, and reach the vehicle. Frames that enter it have not passed
-them yet. The kernel does not compute checksums of packets on veth pairs. It marks such packets, and the checksums are
-added here.
+Frames that leave the port have passed netem and nftables, and reach the vehicle. Frames that enter the port have not
+passed netem and nftables yet. The kernel does not compute checksums of packets on veth pairs. It marks such packets,
+and this module adds their checksums.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ _MACS = 12  # bytes of both addresses, before a VLAN tag
 BLOCK_BYTES = 1 << 17  # larger than any frame, including those that veth pairs carry before TCP segmentation
 _SLOT_BYTES = 2048  # without meaning in TPACKET_V3, but it must divide a block
 RETIRE_MS = 100
-"""Age at which the kernel hands over a block that is not full."""
+"""Milliseconds after which the kernel hands over a block that is not full."""
 
 
 class CaptureRing:
-    """A ring buffer of `blocks` blocks with the frames that cross the port from now on.
+    """A ring buffer of `blocks` blocks. It contains the frames that cross the port from its creation on.
 
     Raises OSError if the kernel lacks AF_PACKET, the port or the memory.
     """
@@ -71,8 +71,8 @@ class CaptureRing:
         return self._socket.fileno()
 
     def take(self) -> Iterator[tuple[int, bytes, bool]]:
-        """Yield the available frames as (time in Unix ns, frame, true if it leaves the port). One call yields at most
-        the content of one full ring buffer.
+        """Yield the available frames as (Unix time in ns, frame, true if the frame leaves the port). One call yields at
+        most the content of one full ring buffer.
         """
         memory = self._memory
         for _ in range(self._blocks):
@@ -102,7 +102,7 @@ class CaptureRing:
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(nothing), address))
 
     def count(self) -> int:
-        """Update the counters from the kernel, and return the number of frames that can still be taken."""
+        """Update the counters from the kernel. Return the number of frames that `take` can still yield."""
         counts = self._socket.getsockopt(_SOL_PACKET, _STATISTICS, _COUNTS.size)
         received, dropped, _ = _COUNTS.unpack(counts)  # since the last call
         self.received += received
@@ -111,5 +111,7 @@ class CaptureRing:
 
 
 def _with_checksum(frame: bytes, start: int, at: int) -> bytes:
-    """Fill in a checksum as the hardware would. The field contains the sum of the data before `start`."""
+    """Compute a checksum as the hardware would, and write it into the frame. The checksum field already contains a
+    partial sum, and the data begins at `start`.
+    """
     return frame[:at] + checksum(frame[start:]).to_bytes(2, "big") + frame[at + 2 :]

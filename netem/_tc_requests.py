@@ -1,10 +1,11 @@
 """Build the netlink requests of the engine "netem" for one switch port.
 
-Numbers come from linux/pkt_sched.h, pkt_cls.h and tc_act/. HTB is used only for its classes. Their rate is the highest
-without the 64-bit attribute (34 Gbit/s), which is more than a veth pair carries.
+Numbers come from linux/pkt_sched.h, pkt_cls.h and tc_act/. HTB is used only for its classes. Their rate is 34 Gbit/s,
+the highest value without the 64-bit attribute. A veth pair carries less.
 
-If a change leaves out an option, netem keeps some (corruption, rate, reordering, distribution table) and forgets others
-(loss model). Therefore each change contains all options. netem reports all options except for the table.
+If a change omits an option, netem keeps the old value of some options (corruption, rate, reordering, distribution
+table) and resets others (loss model). Therefore each change contains all options. netem reports all options except for
+the table.
 """
 
 from __future__ import annotations
@@ -35,10 +36,12 @@ from netem._netlink import (
 from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkConditions
 
 MAX_KIND = 0x7FFF
-"""Highest class number for which a number remains for its netem."""
+"""Highest number of a traffic class. Above it, no number would remain for the netem of the class."""
 
 RELAYED = 0x10000
-"""Mark of frames that `netem.relay` delivers. It is no number of a group, and these frames have no class."""
+"""Mark of frames that `netem.relay` delivers. It differs from all group numbers. These frames belong to no traffic
+class.
+"""
 
 _SET = NLM_F_CREATE | 0x100  # NLM_F_REPLACE: create or replace
 _ROOT = 0xFFFFFFFF
@@ -82,7 +85,7 @@ class TrafficClass:
 
 
 class TrafficControl:
-    """Builds the requests for one switch port, which is given by its interface number."""
+    """A builder of requests for one switch port, which is identified by its interface number."""
 
     def __init__(self, index: int) -> None:
         self.index = index
@@ -99,7 +102,7 @@ class TrafficControl:
     def guard(self) -> list[NetlinkRequest]:
         """Return the requests for filters that drop all packets at this port until `accept_group` allows a group.
 
-        Frames with the mark of a relay pass.
+        The filters let frames with the mark RELAYED pass.
         """
         drop = nested(1, text(1, "gact"), nested(2, attribute(2, struct.pack("=IIiii", 0, 0, _ACT_SHOT, 0, 0))))
         message = self._filter("basic", _EGRESS, _DROP_PRIORITY, _ONLY, nested(3, drop))
@@ -176,7 +179,7 @@ class TrafficControl:
 
     @staticmethod
     def classes(netlink: NetlinkSocket) -> dict[int, dict[int, TrafficClass]]:
-        """Return the traffic classes of all ports by interface number, from a single request."""
+        """Return the traffic classes of all ports by interface number. One request to the kernel is enough."""
         classes: dict[int, dict[int, TrafficClass]] = {}
         for entry in netlink.dump("list qdiscs", RTM_GETQDISC, bytes(_TCMSG.size)):
             _, _, _, index, _, parent, _ = _TCMSG.unpack_from(entry)
@@ -202,8 +205,8 @@ class TrafficControl:
 
 
 def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
-    """Return the attributes inside nested attributes, found by the attribute types along `path`. Return none if the
-    path does not exist.
+    """Return the attributes inside nested attributes, found by the attribute types along `path`. Return an empty result
+    if the path does not exist.
     """
     for kind in path:
         attributes = parse(attributes.get(kind, b""))

@@ -1,6 +1,4 @@
-"""Read the counters of UDP datagrams in a network namespace, from /proc/net/snmp and /proc/net/netstat
-(proc_net(5)).
-"""
+"""Read the UDP counters of a network namespace from /proc/net/snmp and /proc/net/netstat (proc_net(5))."""
 
 from __future__ import annotations
 
@@ -14,10 +12,10 @@ _NET = Path("/proc/thread-self/net")
 class UdpCounters:
     """The counts of UDP datagrams in the network of one vehicle, including those of closed sockets.
 
-    `broadcasts` counts the broadcasts that arrived, also the vehicle's own ones. `read` counts the datagrams that
-    programs have read. `overflowed` counts those that the kernel discarded because the buffer of their socket was full,
-    and `unreachable` those that it discarded because no socket was open. `others` counts the datagrams that arrived and
-    are no broadcasts, for example of a program that talks to itself over loopback.
+    `broadcasts` counts the broadcasts that arrived, including those of the vehicle itself. `read` counts the datagrams
+    that programs have read. `overflowed` counts those that the kernel discarded because the buffer of their socket was
+    full, and `unreachable` those that it discarded because no socket was open. `others` counts the other datagrams that
+    arrived, for example on loopback.
     """
 
     broadcasts: int

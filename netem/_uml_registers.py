@@ -1,14 +1,16 @@
 """Preserve the floating point and vector registers of programs in User Mode Linux on any x86-64 processor.
 
-A kernel older than 6.13 (Debian 12 has 6.1) supports registers up to AVX. On newer processors it fails in two ways:
+A User Mode Linux kernel older than 6.13 (Debian 12 has 6.1) supports registers up to AVX. On newer processors this
+kernel fails in two ways:
 
 - It has 2,696 bytes for the registers of a process. With AMX (Intel since Sapphire Rapids) they take 11,008 bytes, and
   the host transfers them only as a whole. The kernel panics at its start.
 - It stores 832 bytes of the registers in the frame of a signal. After a signal, the additional registers of AVX-512
-  have the values of its handler. The C library uses them to copy memory, also in handlers, so copies become corrupt.
+  have the values of the signal handler. The C library uses them to copy memory, also in handlers, so copies become
+  corrupt.
 
-On these processors a library is preloaded, uml_registers.c, which replaces ptrace(2). It is compiled for each guest in
-a tenth of a second, because machines differ and no files should remain.
+On these processors the harness preloads a library, uml_registers.c, which replaces ptrace(2). It compiles the library
+for each guest, because machines differ and no files should remain. This takes a tenth of a second.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ from netem.errors import UmlError
 
 SOURCE = Path(__file__).with_name("uml_registers.c")
 FORCE = "UCP_UML_REGISTERS"
-"""If this variable is set, the library is preloaded on any processor. It then has no visible effect."""
+"""Environment variable that makes the harness preload the library on any processor. The library then has no visible
+effect.
+"""
 
 _FIXED_IN = (6, 13)
 _FLAGS = {"avx512f", "amx_tile"}

@@ -1,8 +1,8 @@
-"""The addresses of vehicles. IP address, MAC address and the name of the switch port follow from the vehicle's ID.
+"""The addresses of vehicles. IP address, MAC address and name of the switch port are computed from the vehicle's ID.
 
-IDs may be 1 to 65535. A /16 network cannot hold all of them, because ID 65535 would be its broadcast address. The last
-two bytes of 10.77.x.y are therefore the ID, and the network is the larger 10.76.0.0/14. No ID reaches its network and
-broadcast addresses (10.76.0.0 and 10.79.255.255).
+IDs may be 1 to 65535. A /16 network is too small, because ID 65535 would be its broadcast address. The last two bytes
+of 10.77.x.y are therefore the ID, and the network is the larger 10.76.0.0/14. The network and broadcast addresses
+10.76.0.0 and 10.79.255.255 belong to no ID.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ def address(vehicle: int) -> str:
 
 
 def mac(vehicle: int) -> str:
-    """Return the Ethernet address of a vehicle: locally administered, "UCP" in ASCII, then the ID."""
+    """Return the Ethernet address of a vehicle. It is locally administered, and consists of "UCP" in ASCII and the
+    ID.
+    """
     return f"02:55:43:50:{vehicle >> 8:02x}:{vehicle & 0xFF:02x}"
 
 

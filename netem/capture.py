@@ -50,7 +50,7 @@ class LiveCapture:
         self._folder = folder
         self._process = process
         self.processor_s = 0.0
-        """Used processor time in seconds, after `stop`."""
+        """Processor time that the capture took, in seconds. It is known after `stop`."""
 
     @classmethod
     async def start(cls, lab: Lab, folder: Path, vehicles: Sequence[int] | None = None) -> LiveCapture:
@@ -90,10 +90,8 @@ class LiveCapture:
         raise self._ended(await self._process.wait())
 
     async def stop(self) -> dict[int, dict[str, int]]:
-        """Finish the capture files. Return for each vehicle the number of frames, and the number of frames missing in
-        its file.
-
-        Dropped frames are in no file. Raises LiveCaptureError if the capture failed.
+        """Finish the capture files. Return for each vehicle the number of frames, and the number of frames that are
+        missing in its file. Raises LiveCaptureError if the capture failed.
         """
         returncode = await self._process.terminate(_STOP_S)
         if returncode != 0:

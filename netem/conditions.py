@@ -1,9 +1,10 @@
 """Represent network conditions (conditions of links, and partitions) independently of the mechanism that applies them.
 
-As in the thesis, conditions belong to the receiver: each receiver of a broadcast draws separately. In addition, the
-link from one sender to one receiver can have conditions of its own, in one direction. `netem.link` defines the
-conditions of a link. A partition is a tuple of groups. A packet reaches only vehicles in the group of its sender.
-Vehicles in no group form a further group, so that a single group is cut off from all other vehicles.
+As in the thesis, conditions belong to the receiver: each receiver of a broadcast loses it or receives it independently
+of the other receivers. In addition, a link can have its own conditions. A link leads from one sender to one receiver,
+in this direction only. `netem.link` defines the conditions of a link. A partition is a tuple of groups. A packet
+reaches only vehicles in the group of its sender. Vehicles in no group form a further group. A partition with a single
+group therefore separates it from all other vehicles.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ __all__ = ["Delay", "Distribution", "GilbertElliott", "LinkConditions", "Network
 class NetworkConditions:
     """The network conditions of all links at one time.
 
-    For a packet, the first match counts as a whole: `links` (by sender and receiver), then `receivers` (by receiving
-    vehicle), then `default`. `partition` holds disjoint groups of vehicle IDs that cannot reach each other; empty
-    means no partition.
+    The conditions of a packet are the first match among `links` (by sender and receiver), `receivers` (by receiving
+    vehicle), and `default`. They are not combined. `partition` holds disjoint groups of vehicle IDs that cannot reach
+    each other; an empty tuple means no partition.
     """
 
     default: LinkConditions = field(default_factory=LinkConditions)
@@ -61,7 +62,7 @@ class NetworkConditions:
         object.__setattr__(self, "partition", groups)
 
     def link(self, sender: int, receiver: int) -> LinkConditions:
-        """Return the network conditions for packets from `sender` to `receiver`, without regard to the partition."""
+        """Return the network conditions for packets from `sender` to `receiver`, without considering the partition."""
         return self.links.get((sender, receiver)) or self.receivers.get(receiver, self.default)
 
     def is_cut(self, sender: int, receiver: int) -> bool:
@@ -77,7 +78,8 @@ class NetworkConditions:
     def needs(self) -> tuple[str, ...]:
         """Return the names of all network conditions in use, other than independent loss and partition.
 
-        Each occurs once, with its first place: "delay", "receivers 3 reorder", "links 1>2 delay".
+        Each condition occurs once, with the first place at which it is used, for example "delay", "receivers 3 reorder"
+        or "links 1>2 delay".
         """
         asked = {key: key for key in self.default.needs()}
         for vehicle, link in self.receivers.items():
@@ -95,8 +97,8 @@ class NetworkConditions:
                 yield sender, receiver, link
 
     def groups(self, vehicles: Iterable[int]) -> tuple[frozenset[int], ...]:
-        """Return the groups of these vehicles. Vehicles in no group form the last one. Without a partition, return one
-        group.
+        """Return the groups of these vehicles. Vehicles in no group form the last group. Without a partition, return
+        one group.
         """
         members: dict[int, set[int]] = {}
         for vehicle in vehicles:
@@ -104,15 +106,16 @@ class NetworkConditions:
         return tuple(frozenset(members[index]) for index in sorted(members))
 
     def with_partition(self, groups: Iterable[Iterable[int]]) -> NetworkConditions:
-        """Return these network conditions with this partition."""
+        """Return a copy of these network conditions with this partition."""
         return replace(self, partition=tuple(frozenset(group) for group in groups))
 
     def healed(self) -> NetworkConditions:
-        """Return these network conditions without a partition."""
+        """Return a copy of these network conditions without a partition."""
         return replace(self, partition=())
 
     def with_listener(self, listener: int, vehicles: Iterable[int]) -> NetworkConditions:
-        """Return these network conditions with one more vehicle, whose links to and from `vehicles` are perfect.
+        """Return these network conditions with an additional vehicle `listener`, whose links to and from `vehicles` are
+        perfect.
 
         The listener must reach all groups. Therefore links with a loss of 1 replace the partition.
         """

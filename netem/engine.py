@@ -4,7 +4,7 @@ result.
 There are two engines: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). For each receiver, both report the kernel's
 counts of passed, lost and cut packets. The counts start with the lab and are not reset by a change. After each change,
 the engine reads the state of the kernel. A difference from the requested conditions is an error, and the previous
-conditions are restored. Packets that are on their way at a change arrive under the old conditions.
+conditions are restored. A packet that is in transit during a change arrives under the old conditions.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from netem.errors import EngineError
 from netem.link import GilbertElliott, LinkConditions
 
 RESOLUTION = 1.5e-9
-"""Engines store probabilities as fractions of 2^32-1 or 10^9, and delays in ns. Smaller differences are not guaranteed.
+"""Precision of an engine for probabilities and delays. Engines store probabilities as fractions of 2^32-1 or 10^9, and
+delays in nanoseconds.
 """
 RATE_RESOLUTION = 4.01
-"""Bits per second. Rates are stored in whole bytes per second."""
+"""Precision of an engine for rates, in bits per second. Engines store rates in whole bytes per second."""
 
 _COUNTS = ("passed", "lost", "cut")
 _MAX_WORDS = 600  # characters of conditions in an error message
@@ -36,8 +37,9 @@ class ReceiverFigures:
     """The network conditions and packet counters that the kernel reports for one receiver.
 
     `link` applies to all senders except those in `links`. `cut_from` lists the senders that a partition separates.
-    `passed`, `lost` (by chance or a full queue) and `cut` count packets since the start of the lab. A broadcast counts
-    once for each receiver, a duplicate counts again, and a packet on its way does not count yet.
+    `passed`, `lost` (by chance or because of a full queue) and `cut` (by a partition) count packets since the start of
+    the lab. A broadcast counts once for each receiver. A duplicate counts again. A packet in transit does not count
+    yet.
     """
 
     link: LinkConditions
@@ -50,7 +52,7 @@ class ReceiverFigures:
     @classmethod
     def of(cls, held: Mapping[int, LinkConditions], cut_from: tuple[int, ...], *counts: int) -> ReceiverFigures:
         """Return the object for one receiver. `held` contains the network conditions of each sender. The most frequent
-        ones become `link`.
+        conditions become `link`.
         """
         ((usual, _),) = Counter(held.values()).most_common(1) or [(LinkConditions(), 0)]
         differing = {sender: link for sender, link in held.items() if link != usual}
@@ -58,11 +60,11 @@ class ReceiverFigures:
 
     @property
     def loss(self) -> float | GilbertElliott:
-        """The loss that `link` contains: a probability, or a model of loss in bursts."""
+        """The loss of `link`: a probability, or a model of loss in bursts."""
         return self.link.loss
 
     def from_sender(self, sender: int) -> LinkConditions:
-        """Return the network conditions for packets of this sender, without regard to the partition."""
+        """Return the network conditions for packets of this sender, without considering the partition."""
         return self.links.get(sender, self.link)
 
     def to_json(self) -> dict[str, Any]:
@@ -72,7 +74,7 @@ class ReceiverFigures:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ReceiverFigures:
-        """Return the object that is described by this JSON object, which has the format of `to_json`."""
+        """Return the object in this JSON object, which has the format of `to_json`."""
         own = {field.name for field in fields(cls)}
         return cls(
             LinkConditions.from_json({key: figure for key, figure in value.items() if key not in own}),
@@ -95,7 +97,7 @@ class AppliedConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> AppliedConditions:
-        """Return the object that is described by this JSON object, which has the format of `to_json`."""
+        """Return the object in this JSON object, which has the format of `to_json`."""
         figures = {int(vehicle): ReceiverFigures.from_json(entry) for vehicle, entry in value["receivers"].items()}
         return cls(value["engine"], figures)
 
@@ -108,8 +110,8 @@ class Engine(ABC):
     """True if the engine supports all conditions. Otherwise it supports only independent loss and partitions."""
 
     def __init__(self, fabric: VirtualSwitch) -> None:
-        """Install the engine, at first without loss and delay. Raises EngineError if the kernel does not support the
-        engine.
+        """Install the engine. At first it applies neither loss nor delay. Raises EngineError if the kernel does not
+        support the engine.
         """
         self._fabric = fabric
         self._vehicles = fabric.vehicles
@@ -117,7 +119,9 @@ class Engine(ABC):
 
     @abstractmethod
     def change(self, conditions: NetworkConditions) -> None:
-        """Request network conditions from the kernel. Raises EngineError with the kernel's message if refused."""
+        """Request network conditions from the kernel. Raises EngineError with the kernel's message if the kernel
+        refuses them.
+        """
 
     @abstractmethod
     def read(self) -> AppliedConditions:
@@ -127,8 +131,8 @@ class Engine(ABC):
         """Change the network conditions. Return the state that the kernel reports afterwards.
 
         Raises ConditionsError for an unknown vehicle. Raises EngineError if the engine does not support the conditions,
-        if the kernel refuses them, or if its state differs from them. Then the previous conditions are restored, or the
-        error names the present ones.
+        if the kernel refuses them, or if its state differs from them. In these cases the previous conditions are
+        restored, or the error names the conditions in effect.
         """
         conditions.validate(self._vehicles)
         if not self.has_queues and (needs := conditions.needs()):

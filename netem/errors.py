@@ -38,7 +38,7 @@ class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
 
 
 class SpawnError(LabError):
-    """An error: a program could not be started in the virtual network. The text includes the message of the operating
+    """An error: a program could not be started in the virtual network. The error includes the message of the operating
     system.
     """
 

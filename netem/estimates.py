@@ -1,15 +1,15 @@
 """Estimate properties of a received stream of packets, with 99.9 % confidence intervals.
 
-Shares have Wilson's interval. Means and deviations have the normal interval. Losses in bursts are not independent, so
-such a stream counts as a smaller number of independent packets, according to its correlation. Rate and limit are not
-random. Their intervals contain all values that the arrival times allow.
+The intervals of shares are Wilson's, and the intervals of means and deviations are normal. Losses in bursts are not
+independent. Such a stream therefore counts as a smaller number of independent packets, according to its correlation.
+Rate and limit are not random. Their intervals contain all values that are consistent with the arrival times.
 
-Each time contains the lateness of the machine, which has two parts. *Way*: even without conditions, a packet takes some
-time from the sender's timestamp to the receiver's. A receiver without conditions receives the same packets at the same
-time, and its times are subtracted packet by packet. *Timers*: a delayed packet leaves when a timer of the kernel
-expires, which is also late. The sender sleeps between its packets, and notes how late it wakes up. This lateness cannot
-be separated from a delay. Therefore the upper limit of the noted lateness is subtracted from the lower limit of a
-delay. On a slow machine the intervals are wide, and no kernel is found wrong.
+Each measured time contains delays of the machine. They have two causes. *Transit*: even on a perfect link, a packet
+takes some time from the sender to the receiver. A reference vehicle with perfect links receives the same packets, and
+its times are subtracted packet by packet. *Timers*: a delayed packet leaves when a timer of the kernel expires, and
+timers expire late. The sender sleeps between its packets, and records how late it wakes up. This lateness cannot be
+separated from a delay. The upper limit of the recorded lateness is therefore subtracted from the lower limit of a
+delay. On a slow machine the intervals become wide, but a correct kernel is never reported as wrong.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class MachineLateness:
-    """The delays that the machine itself adds, in seconds: to packets of a stream, and to timers."""
+    """Delays of the machine itself in seconds: of packets in transit, and of timers."""
 
     way_s: Sequence[float]
     timers_s: Sequence[float]
@@ -45,9 +45,9 @@ class MachineLateness:
 
 @dataclass(frozen=True)
 class ReceivedStream:
-    """The packets of one sender that one receiver received. The packets are numbered from 0.
+    """The packets of one sender that arrived at one receiver. The packets are numbered from 0.
 
-    `sent_s` are the sending times. `arrivals` are (number, time) of each received copy, in order of time.
+    `sent_s` contains the sending times. `arrivals` contains (number, time) of each received copy, in order of time.
     """
 
     sent_s: Sequence[float]
@@ -59,18 +59,18 @@ _NOTHING = Estimate(0.0, 0.0, 0.0, 0)
 
 
 def lost(received: ReceivedStream) -> Estimate:
-    """Estimate the share of lost packets, under the assumption that losses are independent."""
+    """Estimate the share of lost packets, if losses are independent."""
     return share(sum(_losses(received)), len(received.sent_s))
 
 
 def lost_in_bursts(received: ReceivedStream) -> Estimate:
-    """Estimate the share of lost packets, under the assumption that losses follow a Markov chain with two states."""
+    """Estimate the share of lost packets, if losses follow a Markov chain with two states."""
     losses = _losses(received)
     return share(sum(losses), len(losses), worth=_independence(losses))
 
 
 def burst_length(received: ReceivedStream) -> Estimate:
-    """Return the mean number of successive lost packets. A burst at the end of the stream does not count."""
+    """Return the mean number of successive lost packets. A series of losses at the end of the stream does not count."""
     runs = [(gone, sum(1 for _ in run)) for gone, run in groupby(_losses(received))]
     lengths = [length for gone, length in runs[:-1] if gone]
     return mean(lengths, packets=len(received.sent_s))
@@ -109,9 +109,9 @@ def delay_deviation(received: ReceivedStream) -> Estimate:
 
 
 def rate(received: ReceivedStream, packet_bits: int) -> Estimate:
-    """Return the data rate in bits per second, from the longest run of packets that arrived without a pause.
+    """Return the data rate in bits per second, from the longest series of packets that arrived without a pause.
 
-    The limits assume that both ends of the run may be as late as the latest packet.
+    The limits assume that the first and the last packet of the series may be as late as the latest packet.
     """
     run: list[float] = []
     longest: list[float] = []
@@ -130,8 +130,8 @@ def rate(received: ReceivedStream, packet_bits: int) -> Estimate:
 def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
     """Estimate the limit of the delay queue: the number of packets that waited in it when a packet was lost.
 
-    For each lost packet, some packets must still have waited, because their delay was not over. Others may have waited,
-    because they had not arrived yet. The medians of both numbers are the limits.
+    When a packet was lost, the packets whose delay was not over must still have waited. The packets that had not
+    arrived yet may have waited. The limits of the estimate are the medians of these two numbers over all lost packets.
     """
     received_packets = dict(received.arrivals)
     must: list[int] = []
@@ -151,7 +151,9 @@ def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
 
 
 def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
-    """Return the share of `hits` in `count` draws. Each draw counts as `worth` independent draws (Wilson, 1927)."""
+    """Estimate a probability from `hits` in `count` draws. Each draw counts as `worth` independent draws (Wilson,
+    1927).
+    """
     if count == 0:
         return _NOTHING
     ratio, draws = hits / count, count * worth
@@ -185,7 +187,7 @@ def _losses(received: ReceivedStream) -> list[bool]:
 
 
 def _independence(losses: Sequence[bool]) -> float:
-    """Return how many independent draws are worth one draw of a correlated sequence: (1 - c) / (1 + c)."""
+    """Return the number of independent draws that one draw of a correlated sequence is worth: (1 - c) / (1 + c)."""
     loss = fmean(losses)
     if not 0 < loss < 1:
         return 1.0

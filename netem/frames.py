@@ -18,7 +18,7 @@ _TTL = 64
 def checksum(data: bytes) -> int:
     """Return the Internet checksum (RFC 1071) as in UDP, with 0xFFFF in place of 0.
 
-    The sum of 16-bit words with end-around carry equals the remainder of a division by 0xFFFF.
+    The code uses that the sum of 16-bit words with end-around carry equals the remainder of a division by 0xFFFF.
     """
     return 0xFFFF - (int.from_bytes(data, "big") << 8 * (len(data) % 2)) % 0xFFFF
 

@@ -1,9 +1,9 @@
 """The first process inside the virtual network. It builds the network, and then executes requests of the harness.
 
-It is started as `python -m netem.init FD` inside fresh namespaces (see `netem._namespaces`), where it is PID 1. `FD` is
-its end of the control socket. It has one thread and one loop, because setns(2) moves a thread, and each child must
-start in the right network. It waits for nothing but the kernel: TCP connections are made without blocking, and the end
-of a child is reported when it happens.
+The harness starts it as `python -m netem.init FD` inside new namespaces (see `netem._namespaces`), where it is PID 1.
+`FD` is its end of the control socket. The process has one thread, because setns(2) moves a thread to another network,
+and each child must start in the right network. Its loop never blocks on one task: it opens TCP connections in the
+background, and reports the end of a child when it happens.
 """
 
 from __future__ import annotations
@@ -46,13 +46,15 @@ class _OpeningConnection:
 
 
 def _limit_files(most_bytes: int) -> None:
-    """Limit the files of this process. SIGXFSZ is ignored, so that a write beyond the limit fails with EFBIG."""
+    """Limit the size of the files that this process writes. SIGXFSZ is ignored, so a write beyond the limit fails with
+    EFBIG.
+    """
     resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
 
 class LabServer:
-    """Executes requests of the harness. The requests are trusted, but invalid ones are refused."""
+    """A server that executes requests of the harness. It trusts the requests, but refuses invalid ones."""
 
     def __init__(self, control: socket.socket) -> None:
         control.setblocking(False)

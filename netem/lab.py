@@ -4,13 +4,13 @@
         agent = await lab.spawn(1, ["my-agent"], cwd=..., env=..., stdout=..., stderr=...)
         await lab.apply(NetworkConditions(LinkConditions(loss=0.15)))
 
-The lab is not visible from outside: the caller's network has no interface, rule or name of it. Files and Unix sockets
+The lab is not visible from outside: it adds no interface, rule or name to the caller's network. Files and Unix sockets
 are shared with the caller. The lab ends with `close`, or with the caller's process. Process IDs belong to the lab, so
 `LabProcess.pid` has no meaning outside.
 
 Open a lab in the main thread. The death signal that guards the lab (see `netem._namespaces`) follows the thread that
-opened it. In another thread the signal is left out. Then only the end of the control socket ends the lab, and a stopped
-(SIGSTOP) lab would not notice it.
+opened it. A lab that is opened in another thread has no death signal. Then only the end of the control socket ends the
+lab, and a lab that is suspended with SIGSTOP does not detect it.
 """
 
 from __future__ import annotations
@@ -65,17 +65,17 @@ class LabProcess:
 
     @property
     def end(self) -> str:
-        """A description of how the program ended: the name of a signal, or its exit status."""
+        """The way in which the program ended, as text: the name of a signal, or the exit status."""
         return in_words(self._ended.result())
 
     async def wait(self) -> int:
-        """Wait until the program ends, and return the return code. It is -SIGKILL if the program ended with the
-        network.
+        """Wait until the program ends, and return the return code. The return code is -SIGKILL if the program ended
+        because the network was closed.
         """
         return await asyncio.shield(self._ended)
 
     async def send_signal(self, number: int) -> None:
-        """Send a signal to the program and its child processes. After the end of the program, do nothing."""
+        """Send a signal to the program and its child processes. Do nothing if the program has ended."""
         if not self._ended.done():
             await self._channel.ask("signal", pid=self.pid, signal=int(number))
 
@@ -221,7 +221,9 @@ class Lab:
 
     @property
     def network(self) -> Self:
-        """This virtual network. In a network of containers, the same property returns the virtual network under it."""
+        """This virtual network. The class for containers has the same property, which returns the virtual network below
+        it.
+        """
         return self
 
     async def spawn(
@@ -241,8 +243,8 @@ class Lab:
         With `vehicle` None, the program runs in the lab's own network, which no vehicle reaches.
 
         `env` is its whole environment. Its output is appended to the files `stdout` and `stderr`. Its input is empty.
-        `role` names the program in errors. A file of the program that reaches `max_file_bytes` takes no further bytes:
-        the call that writes them fails with EFBIG. Raises SpawnError with the message of the operating system.
+        `role` names the program in errors. The program cannot make a file larger than `max_file_bytes`: a write beyond
+        this size fails with EFBIG. Raises SpawnError with the message of the operating system.
         """
         self._check_vehicle(vehicle)
         where = {"cwd": str(cwd), "stdout": str(stdout), "stderr": str(stderr), "max_file_bytes": max_file_bytes}
@@ -327,7 +329,7 @@ def _checked(vehicles: Sequence[int]) -> tuple[int, ...]:
 
 
 def in_words(returncode: int) -> str:
-    """Return a description of how a process ended, such as "SIGKILL" or "status 3"."""
+    """Describe how a process ended, such as "SIGKILL" or "status 3"."""
     if returncode >= 0:
         return f"status {returncode}"
     number = -returncode

@@ -1,7 +1,7 @@
 """Find out whether this machine can run a virtual network.
 
-Each fact comes from a real lab of two vehicles that is removed afterwards. Configuration files and lists of modules
-show only what might work.
+The module opens a real lab of two vehicles, tests it, and removes it afterwards. Configuration files and lists of
+kernel modules would not prove that a lab works.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from netem.lab import Lab, LabError
 class LabRequirement:
     """A requirement of the virtual network: its state, an observation, and the remedy if it is not met.
 
-    Without a `needed` requirement there is no lab. One engine is sufficient.
+    If a `needed` requirement is not met, this machine cannot open a lab. Of the engines, one is sufficient.
     """
 
     name: str
@@ -33,8 +33,8 @@ class LabRequirement:
 
 
 def examine() -> list[LabRequirement]:
-    """Return all requirements of a virtual network. A requirement follows those on which it depends. This takes about
-    half a second.
+    """Return all requirements of a virtual network. The list has a requirement after those on which it depends. This
+    takes about half a second.
     """
     ok, message = _namespaces.probe()
     requirements = [LabRequirement("namespaces", ok, message, "" if ok else _namespaces.way_out(message))]
@@ -64,8 +64,8 @@ def examine() -> list[LabRequirement]:
 
 
 def _shared_channel(log: Path) -> LabRequirement:
-    """Find out whether a process can take over broadcasts from the kernel, which a shared radio channel in real time
-    needs.
+    """Test whether a process can take over broadcasts from the kernel. A shared radio channel in real time needs
+    this.
     """
 
     async def attempt() -> str | None:
@@ -85,7 +85,7 @@ def _shared_channel(log: Path) -> LabRequirement:
 
 
 def _try(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:
-    """Return the engine of a test network, or the reason why it could not be opened."""
+    """Return the engine that a test network uses, or the reason why the network could not be opened."""
 
     async def attempt() -> str:
         async with await Lab.open((1, 2), engine=engine, log=log) as lab:

@@ -1,8 +1,8 @@
 """Represent the network conditions of packets from one vehicle to another: loss, delay, duplicates, reordering, and
 more.
 
-Names and meanings are those of tc-netem(8). The random draws of each packet are independent. JSON omits default values,
-so that a plain loss reads {"loss": 0.1}.
+Names and meanings are those of tc-netem(8). The random draws of each packet are independent. JSON omits default values:
+a link with loss only is {"loss": 0.1}.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ MAX_DELAY_S = 60.0
 ns ticks)."""
 
 MAX_LIMIT = 100_000
-"""Maximum number of waiting packets. Without a limit in the conditions, the kernel has room for one packet more, so
-that a flood does not fill its memory."""
+"""Maximum number of waiting packets that `limit` can set. Without `limit`, the kernel has room for one packet more, so
+a flood cannot fill its memory.
+"""
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class GilbertElliott:
 
     @property
     def mean(self) -> float:
-        """The mean share of lost packets, 0 to 1, over a long time."""
+        """The mean share of lost packets over a long time, from 0 to 1."""
         change = self.p + self.r
         return self.loss_good + (self.loss_bad - self.loss_good) * (self.p / change) if change else self.loss_good
 
@@ -107,19 +108,19 @@ class LinkConditions:
 
     `loss` is the probability, 0 to 1, that a packet is lost, drawn for each packet, or a model of bursts. `duplicate`
     is the probability that a packet arrives twice. It is drawn together with the loss: if a packet is both lost and
-    duplicated, one copy remains. Otherwise the second copy has its own draws, among them loss, and is not duplicated
-    again. `reorder` is the probability that a packet overtakes: it is sent at once, without delay. It needs a delay
-    above 0.
+    duplicated, one copy remains. Otherwise loss and the other conditions are drawn separately for the second copy,
+    which is not duplicated again. `reorder` is the probability that a packet overtakes: it is sent at once, without
+    delay. It needs a delay above 0.
 
     `corrupt` is the probability that one bit of a packet flips. The receiver's UDP checksum finds the error, so the
     message is lost. (netem flips bits of the whole Ethernet frame. No checksum of a veth pair covers the 12 bytes of
     addresses, and a broadcast mostly arrives in spite of such an error.)
 
     `rate` is in bits per second of Ethernet frames, which are 42 bytes longer than the data of a UDP datagram. Each
-    link from one sender to one receiver has the whole rate. A packet leaves after its delay and after the packet
-    before it, and then takes its time at the rate, so packets keep their order. `limit` is the number of packets that
-    may wait on a link for delay or rate, at least 1. A packet that arrives at a full link is lost. Packets that
-    overtake do not wait, and corrupted packets take their place like any other.
+    link from one sender to one receiver has this rate for itself. A packet waits for its delay and for the packet
+    before it. The time that it then takes depends on its size and the rate. Packets therefore keep their order. `limit`
+    is the number of packets that may wait on a link for delay or rate, at least 1. A packet that arrives at a full link
+    is lost. Packets that overtake do not wait. Corrupted packets wait like all others.
     """
 
     loss: float | GilbertElliott = 0.0
@@ -162,7 +163,9 @@ class LinkConditions:
 
     @property
     def remembers(self) -> bool:
-        """True if the fate of a packet depends on earlier packets from the same sender to the same receiver."""
+        """True if earlier packets from the same sender to the same receiver affect whether and when a packet
+        arrives.
+        """
         return isinstance(self.loss, GilbertElliott) or self.rate is not None or self.limit is not None
 
     @property
@@ -228,7 +231,9 @@ def probability(key: str, value: object) -> float:
 
 
 def keywords(cls: type[Any], value: Mapping[str, Any], at: str = "", required: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the fields of a dataclass from a JSON object. Raises ConditionsError for an unknown or missing key."""
+    """Check the fields of a JSON object for a dataclass, and return them. Raises ConditionsError for an unknown or
+    missing key.
+    """
     prefix = f"{at}." if at else ""
     allowed = [field.name for field in fields(cls)]
     for key in value:

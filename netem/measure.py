@@ -1,17 +1,18 @@
 """Measure how a network treats packets, and compare the results with the requested network conditions.
 
-A *study* consists of a network, broadcasts in it, and questions about figures of the packets from one sender to one
-receiver. Each receiver has its own conditions, so one stream answers many questions. `measure` gives studies to an
-observer (`netem.observers`: real packets, or packets in virtual time). An answer is right if the 99.9 % interval of the
-measurement (`netem.estimates`) contains the requested value.
+A *study* consists of a network, broadcasts in it, and comparisons of measured values with requested ones. A value
+describes the packets from one sender to one receiver. Each receiver has its own conditions, so one stream of packets is
+enough for many comparisons. `measure` passes studies to an observer (`netem.observers`), which sends real packets or
+simulates packets in virtual time. A measurement is right if its 99.9 % interval (`netem.estimates`) contains the
+requested value.
 
-One of a thousand right answers lies outside such an interval. With thirty rows, this happens in one of about thirty
-measurements. An answer outside is therefore measured again with a new stream. The second answer counts, and the first
-is shown beside it. A right kernel fails a measurement of thirty rows once in 30,000 cases, and a wrong one fails twice
-in a row.
+Even with a right kernel, one of a thousand intervals does not contain the requested value. With thirty comparisons,
+this happens in one of about thirty measurements. Such a comparison is therefore repeated with a new stream. The second
+result counts, and the first one is shown beside it. A right kernel then fails a measurement of thirty comparisons once
+in 30,000 cases. A wrong kernel fails twice in a row.
 
-The requested value is exactly that of the engine: for a delay, mean and deviation of netem's table
-(`netem._distributions`), and for corruption, the share that checksums can detect.
+The requested value is the value that the engine can reach. For a delay, it is the mean and deviation of netem's table
+(`netem._distributions`). For corruption, it is the share of corrupted packets that checksums can detect.
 """
 
 from __future__ import annotations
@@ -32,14 +33,15 @@ from netem.link import Delay, Distribution, GilbertElliott, LinkConditions
 
 PACKETS = 10_000
 DATA_BYTES = 12
-"""Size of each datagram."""
+"""Number of data bytes in each datagram of a measurement."""
 REFERENCE = 3
-"""The vehicle that receives all packets in each study."""
+"""The reference vehicle, which receives all packets in each study over perfect links."""
 
 _FRAME_BITS = (DATA_BYTES + 42) * 8
 _UNPROTECTED_BITS = 95
-"""Bits of a frame without a checksum: the Ethernet addresses, without the group bit, whose corruption loses a
-broadcast."""
+"""Bits of a frame without a checksum: the Ethernet addresses, without the group bit, whose corruption makes a receiver
+ignore a broadcast.
+"""
 _TABLE_SIZE = 4094  # size of the kernel's tables
 _SENDER, _OTHER_SENDER = 1, 2
 _FIRST_FREE = 4
@@ -47,7 +49,9 @@ _FIRST_FREE = 4
 
 @dataclass(frozen=True)
 class MeasuredQuantity:
-    """A comparison to make: the value that is estimated from the packets between two vehicles should equal `asked`."""
+    """A comparison to make: the value that is estimated from the packets between two vehicles should equal the
+    requested value `asked`.
+    """
 
     sender: int
     receiver: int
@@ -82,12 +86,14 @@ class NetworkStudy:
 
 
 Observer = Callable[[NetworkStudy, int], Mapping[tuple[int, int], ReceivedStream]]
-"""Lets each sender broadcast a number of packets. Returns the received packets by (sender, receiver)."""
+"""A function that lets each sender of a study broadcast a number of packets. It returns the received packets by
+(sender, receiver).
+"""
 
 
 @dataclass(frozen=True)
 class AnswerRow:
-    """A comparison and its result. If the first result was wrong, the measurement was repeated, and `before` is the
+    """A comparison and its result. If the first result was wrong, the measurement was repeated. `before` is then the
     first result.
     """
 
@@ -124,7 +130,8 @@ class EngineMeasurement:
     def to_json(self) -> dict[str, Any]:
         """Return a JSON object.
 
-        `lateness` has median and 99th percentile in seconds, for packets on their way and for timers.
+        `lateness` has the median and the 99th percentile of the machine's delays in seconds, for packets in transit and
+        for timers.
         """
         late = {"way": self.lateness.way_s, "timers": self.lateness.timers_s}
         lateness = {key: {"median_s": median(each), "p99_s": quantiles(each, n=100)[-1]} for key, each in late.items()}
@@ -165,7 +172,8 @@ def studies(engine: str) -> tuple[NetworkStudy, ...]:
     """Return the measurements for an engine: loss and partitions for "nftables", all network conditions for the other
     engines.
 
-    Duplicates have their own study, because some kernels do not allow them beside other conditions (see `netem.tc`).
+    Duplicates have their own measurement, because some kernels do not allow them together with other conditions (see
+    `netem.tc`).
     """
     if engine == "nftables":
         return (_receivers(_losses()), _pairs())
@@ -243,7 +251,7 @@ def _duplicates() -> list[_LinkCase]:
 
 
 def _receivers(cases: Sequence[_LinkCase]) -> NetworkStudy:
-    """Return a measurement with one sender. It has one receiver for each of these network conditions."""
+    """Return a measurement with one sender. It has one receiver for each case."""
     numbered = dict(enumerate(cases, _FIRST_FREE))
     questions = [
         MeasuredQuantity(_SENDER, receiver, case.condition, *figure)
@@ -255,8 +263,8 @@ def _receivers(cases: Sequence[_LinkCase]) -> NetworkStudy:
 
 
 def _pairs() -> NetworkStudy:
-    """Return a measurement with two simultaneous senders. Some single links have their own loss, and one vehicle is
-    separated.
+    """Return a measurement with two simultaneous senders. Some links have their own loss, and a partition separates one
+    vehicle.
     """
     there, back, rest = 0.4, 0.1, 0.2
     conditions = NetworkConditions(

@@ -1,18 +1,20 @@
 """Deliver broadcasts in virtual time. Seeded random numbers decide about losses and delays.
 
 The medium is the third engine beside tc netem and nftables. It applies the same conditions without a kernel and without
-packets. Each receiver of a broadcast draws separately. With neither a delay nor a rate in the conditions, the latency
-is uniform from 2 to 50 ms, as over a radio. With only a rate, the rate determines it.
+packets. Losses and delays are drawn separately for each receiver of a broadcast. If the conditions have neither a delay
+nor a rate, the latency is uniform from 2 to 50 ms, as over a radio. If they have only a rate, the rate determines the
+latency.
 
 A packet passes the steps of netem_enqueue in Linux (net/sched/sch_netem.c): draws for duplication and loss together, a
-draw for corruption, the limit, the second copy with its own draws, the delay, and the rate. The partition comes first.
+draw for corruption, the limit, the second copy with its own draws, the delay, and the rate. Before these steps, a
+partition may drop the packet.
 
-Each sender has one random stream per concern: loss, latency, duplication, and so on. A further fault, or more messages
-of one sender, therefore do not change the draws of other senders. A draw is a word of 32 bits and is compared with
-integers only, so that a seed gives the same results on every machine.
+Each sender has a random stream for each purpose: loss, latency, duplication, and so on. A further fault, or more
+messages of one sender, therefore do not change the draws of other senders. A draw is a word of 32 bits and is compared
+with integers only, so that a seed gives the same results on every machine.
 
-In a swarm of 200 agents most draws are never used, because an answer concerns one agent. The medium therefore draws
-words in large blocks. A broadcast stores the position of its words and reads them on demand.
+In a swarm of 200 agents most draws are never used, because an answer matters only to one agent. The medium therefore
+draws words in large blocks. A broadcast stores the position of its words and reads them on demand.
 """
 
 from __future__ import annotations
@@ -58,7 +60,9 @@ class Medium:
 
     def __init__(self, vehicles: Sequence[int], seed: int, latency: Delay = LATENCY) -> None:
         self.latency = latency
-        """Latency of messages if the conditions have neither a delay nor a rate, from the next call of `apply` on."""
+        """Latency of messages if the conditions have neither a delay nor a rate. A new value takes effect at the next
+        call of `apply`.
+        """
         self._vehicles = tuple(vehicles)
         self._seed = seed
         self._words = [
@@ -68,15 +72,16 @@ class Medium:
         self._links: list[list[_Link]] = [[] for _ in vehicles]  # of each sender, to all; none where the air is plain
         self.soonest = latency.mean_s
         self.latest = latency.mean_s
-        """Bounds, in seconds, of the delays of all copies so far and under the current conditions: `soonest` and
-        `latest`."""
+        """Upper bound in seconds of the delays of all copies, so far and under the current conditions. `soonest` is the
+        lower bound.
+        """
         self.apply(NetworkConditions())
 
     def apply(self, conditions: NetworkConditions) -> None:
         """Apply these network conditions to broadcasts from now on. Raises ConditionsError for an unknown vehicle.
 
-        Messages under way are not affected. A link keeps its queue if the old and the new conditions both need one. As
-        in a kernel, loss in bursts starts in the good state after each change of the link's conditions.
+        Messages in transit are not affected. A link keeps its queue if the old and the new conditions both need a
+        queue. As in a kernel, loss in bursts starts in the good state after each change of the link's conditions.
         """
         conditions.validate(self._vehicles)
         group = {
@@ -122,19 +127,20 @@ class Medium:
 
 
 class _SenderLinks(Protocol):
-    """The links of one sender while the network conditions stay the same."""
+    """The links of one sender under unchanged network conditions."""
 
     soonest_of_all: float
     latest: float
     certain: bool
-    """True if each receiver gets one copy of each broadcast, or never any."""
+    """True if nothing is random: each receiver gets either one copy of each broadcast, or none."""
 
     def draw(self, now: float, data_bytes: int) -> RandomDraws: ...
 
 
 _Way = tuple[int, float, float]
-"""A link: the draw below which a packet is lost, the least delay in seconds, and the additional delay per unit of the
-draw."""
+"""A link as three numbers: the draw below which a packet is lost, the least delay in seconds, and the additional delay
+in seconds per unit of the draw.
+"""
 
 _NO_WAY: _Way = (_WORD, 0.0, 0.0)
 
@@ -173,7 +179,7 @@ class _PlainSenderLinks:
 
 
 class _PlainDraws:
-    """The random results of one broadcast, as a position in the arrays of random numbers."""
+    """The random results of one broadcast, stored as a position in the arrays of random numbers."""
 
     __slots__ = ("_air", "_at", "_latency", "_loss", "latest")
 
@@ -201,7 +207,9 @@ class _PlainDraws:
 
 
 class _RandomWords:
-    """Two streams of 32-bit random numbers, which are drawn in blocks. Numbers from `next` on are unused."""
+    """Two streams of 32-bit random numbers, which are drawn in blocks. The numbers from position `next` on are
+    unused.
+    """
 
     def __init__(self, loss: Random, latency: Random) -> None:
         self.loss = array("I")
@@ -212,7 +220,7 @@ class _RandomWords:
     def take(self, count: int) -> int:
         """Return the position of the next `count` random numbers in the arrays `loss` and `latency`.
 
-        The arrays never change. `refill` replaces them by new ones.
+        An array never changes. `refill` creates new arrays.
         """
         at = self.next
         if at + count > len(self.loss):
@@ -236,7 +244,9 @@ def _draw(stream: Random, count: int) -> array[int]:
 
 
 class _GeneralSenderLinks:
-    """Links with any network conditions. The random numbers of each receiver are independent of the other receivers."""
+    """Links with any network conditions. The random numbers of each receiver are independent of those of the other
+    receivers.
+    """
 
     soonest_of_all = 0.0
     latest = inf
@@ -269,14 +279,16 @@ class _GeneralSenderLinks:
 
 
 _Copy = tuple[float, float, float, float, float]
-"""The draws of one copy of a packet, each uniform in 0..1 (exclusive): loss, change of the loss model's state,
-corruption, reordering, latency."""
+"""The random numbers for one copy of a packet, each uniform between 0 and 1: loss, change of the loss model's state,
+corruption, reordering, latency.
+"""
 
 
 class _Link:
     """The link from one sender to one receiver, with its state between packets.
 
-    `before` is the link under the previous conditions. Its queue continues if both conditions need one.
+    `before` is the link under the previous conditions. Its queue is kept if the old and the new conditions both need a
+    queue.
     """
 
     def __init__(self, conditions: LinkConditions, before: _Link | None, latency: Delay = LATENCY) -> None:
@@ -290,8 +302,8 @@ class _Link:
             self._last, self._departures = before._last, before._departures
 
     def enqueue(self, now: float, bits: int, lots: _Copy, second: _Copy | None = None) -> tuple[float, ...]:
-        """Send a packet at the time `now`. Return the delay of each copy that arrives: of the packet, and of its
-        duplicate if there is one.
+        """Send a packet at the time `now`. Return the delays in seconds of the copies that arrive: of the packet, and
+        of its duplicate if it has one.
         """
         conditions = self.conditions
         loss, turn, corruption, reordering, latency = lots

@@ -23,7 +23,7 @@ from netem.measure import DATA_BYTES, REFERENCE, NetworkStudy, Observer
 from netem.medium import Medium
 
 PAUSES_S = (0.005, 0.01, 0.02)
-"""Pauses of a sender after every 20 packets. Longer ones are used if the machine is too slow."""
+"""Seconds that a sender pauses after every 20 packets. The next longer pause is used if the machine is too slow."""
 SPACING_S = 0.0003
 """Seconds between packets in virtual time."""
 
@@ -34,8 +34,8 @@ _TRY_AGAIN = "this machine is too busy to measure just now: try again when it is
 
 
 def in_medium(seed: int) -> Observer:
-    """Return a function that measures simulated packets, which have no delays of the machine. All its results depend on
-    the seed.
+    """Return a function that measures simulated packets, which have no delays of the machine. The seed determines all
+    results.
     """
     streams = itertools.count()
 
@@ -63,8 +63,8 @@ def in_lab(engine: EngineName) -> Observer:
     """Return a function that measures real packets, each time in a new virtual network.
 
     If the kernel's engine passed more packets than arrived, the machine lost them, because a receive buffer or a
-    processor's backlog was full. Such a stream says nothing about the engine, and is sent again more slowly. Raises
-    LabError if this does not help or the lab fails, and LabUnavailable if this machine cannot run the lab.
+    processor's backlog was full. Such a stream is useless for the measurement. It is sent again more slowly. Raises
+    LabError if packets are still lost or the lab fails, and LabUnavailable if this machine cannot run the lab.
     """
 
     def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
@@ -84,7 +84,7 @@ def in_lab(engine: EngineName) -> Observer:
 
 
 class DisturbedError(LabError):
-    """An error: the machine itself lost packets, so the measurement has no meaning."""
+    """An error: the machine itself lost packets, so the measurement is invalid."""
 
 
 async def _observe(
@@ -134,7 +134,9 @@ def check(
     received_packets: Mapping[tuple[int, int], Sequence[PacketArrival]],
     counted: AppliedConditions,
 ) -> None:
-    """Raise DisturbedError if the machine lost packets. If packets were corrupted, the cause of a loss is unknown."""
+    """Raise DisturbedError if the machine lost packets. Do not check streams with corrupted packets, because the cause
+    of a loss is unknown there.
+    """
     for vehicle, report in reports.items():
         links = [link for link in received_packets if link[1] == vehicle]
         if report["overflow"]:
@@ -145,7 +147,7 @@ def check(
 
 
 class PacketArrival(NamedTuple):
-    """A received copy of a packet, which has a number from 0. Times are in seconds."""
+    """A received copy of a packet. Packets are numbered from 0. Times are in seconds."""
 
     number: int
     sent_s: float
@@ -153,13 +155,15 @@ class PacketArrival(NamedTuple):
 
 
 def _arrivals(report: Mapping[str, Any], own: range) -> list[PacketArrival]:
-    """Return the received packets whose numbers are in `own`, the numbers of one sender. Renumber them from 0."""
+    """Return the received packets of one sender, renumbered from 0. `own` contains the numbers of this sender's
+    packets.
+    """
     each = zip(report["numbers"], report["at_s"], report["delays_s"], strict=True)
     return [PacketArrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
 
 
 async def _wait_until_quiet(lab: Lab) -> AppliedConditions:
-    """Wait until no packet is on its way. Return the counters of the kernel."""
+    """Wait until no packet is in transit. Return the counters of the kernel."""
     before = None
     while before != (now := await lab.read()):
         before = now
@@ -188,7 +192,7 @@ class _ProbeProgram:
             await asyncio.sleep(0.01)
 
     async def stop(self) -> Any:
-        """End the program, and return its results."""
+        """Let the program end, and return its results."""
         await self._process.send_signal(signal.SIGTERM)
         return await self.end()
 

@@ -43,7 +43,7 @@ _PACKET_BYTES = _PACKET_HEAD.size + len(_DIRECTIONS[True]) + _BLOCK_LENGTH.size 
 
 
 def header(interface: str, comment: str) -> bytes:
-    """Return the beginning of a file: a section with this comment, and a description of its only interface."""
+    """Return the beginning of a pcapng file: a section with this comment, and a description of the only interface."""
     section = struct.pack("<IHHq", _BYTE_ORDER_MAGIC, 1, 0, _UNKNOWN_LENGTH)
     about = _option(_COMMENT, comment.encode()) + _option(_USERAPPL, WRITER.encode())
     named = _option(_IF_NAME, interface.encode()) + _option(_IF_TSRESOL, _NANOSECONDS)
@@ -92,7 +92,7 @@ class PcapngFile:
             self.flush()
 
     def flush(self) -> None:
-        """Write all blocks that wait in memory, or none of them."""
+        """Write all blocks that wait in memory. If writing fails, write none of them."""
         if not self._pending:
             return
         data = memoryview(b"".join(self._pending))

@@ -16,10 +16,12 @@ from netem.errors import ConditionsError
 from netem.link import GilbertElliott, LinkConditions
 
 MIN_DISTANCE_M = 1.0
-"""Reference distance of the path loss models in metres. A shorter distance counts as this one."""
+"""Reference distance of the path loss models, in metres. Shorter distances are treated as equal to it."""
 
 STEPS = 100
-"""Steps of the loss. Two hovering vehicles cause no change of conditions."""
+"""Number of steps to which a loss rate is rounded. Because of the rounding, two hovering vehicles cause no change of
+conditions.
+"""
 
 
 @dataclass(frozen=True)
@@ -70,15 +72,15 @@ class LogDistance:
     and 4.9.2).
 
     At d metres the mean received power is power_dbm - PL(1 m) - 10 exponent log10(d), where PL(1 m) is the free-space
-    loss of Friis over the first metre. Shadowing is a normal deviation from it with standard deviation `shadowing_db`.
-    A message is lost when the received power is below `sensitivity_dbm`, with probability Q(margin / shadowing_db).
-    Each message is drawn independently.
+    loss of Friis over the first metre. The shadowing is a normally distributed deviation from this mean, with standard
+    deviation `shadowing_db`. A message is lost when the received power is below `sensitivity_dbm`, with probability
+    Q(margin / shadowing_db). Each message is drawn independently.
 
-    The defaults: 100 mW, the limit for 2.4 GHz in Europe (ETSI EN 300 328); the sensitivity that IEEE 802.11-2020
+    The defaults are: 100 mW, the limit for 2.4 GHz in Europe (ETSI EN 300 328); the sensitivity that IEEE 802.11-2020
     demands at 6 Mb/s, the lowest OFDM rate (Table 17-18); exponent 2.32 and 3 dB of shadowing. The last two are from
     the middle of the values measured with small UAVs, 2.0 to 2.6 and 2.6 to 5.3 dB (collected by Khawaja et al., A
     Survey of Air-to-Ground Propagation Channel Modeling for Unmanned Aerial Vehicles, IEEE Communications Surveys &
-    Tutorials 21(3), 2019). Then 1 % of the messages are lost at 231 m, 50 % at 462 m, and 99 % at 924 m.
+    Tutorials 21(3), 2019). With the defaults, 1 % of the messages are lost at 231 m, 50 % at 462 m, and 99 % at 924 m.
     """
 
     exponent: float = 2.32
@@ -118,7 +120,7 @@ def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], flo
 
 
 def over_the_air(conditions: NetworkConditions, losses: Mapping[frozenset[int], float]) -> NetworkConditions:
-    """Return network conditions that include the additional, independent loss of the radio."""
+    """Return network conditions to which the additional, independent loss of the radio is added."""
     if not losses:
         return conditions
     pairs = dict(conditions.links)
@@ -129,9 +131,10 @@ def over_the_air(conditions: NetworkConditions, losses: Mapping[frozenset[int], 
 
 
 def components(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> tuple[frozenset[int], ...]:
-    """Return the groups of vehicles that can reach each other in both directions. The largest is first.
+    """Return the groups of vehicles that can reach each other in both directions. The largest group is first.
 
-    Vehicles may reach each other through others. A link with a loss of 1 does not connect.
+    Two vehicles of a group may reach each other only through other vehicles. A link with a loss of 1 does not connect
+    its vehicles.
     """
     left = list(vehicles)
     groups: list[frozenset[int]] = []

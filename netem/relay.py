@@ -5,16 +5,16 @@
     for heard in relay.take(): ...  each broadcast of a vehicle, with the time at which the kernel got it
     relay.deliver(2, heard.frame)
 
-`python -m netem.relay 1 2 3` opens and closes a relay, to examine whether the kernel supports it.
+`python -m netem.relay 1 2 3` opens and closes a relay, to test whether the kernel supports it.
 
 A radio channel decides when each vehicle gets a broadcast, and which vehicles lose it. A queue of the kernel at one
 port cannot do this. The relay uses two features that every bridge has. A port flag (`bcast_flood`, bridge(8)) keeps
 broadcasts away from the vehicles. A packet socket (packet(7)) gets each broadcast before the bridge handles it, and
-other packet sockets send it to single ports. Vehicles notice nothing, and the switch handles all other packets as
-before. Captures at the ports have both the sent and the delivered frames.
+other packet sockets send it to single ports. The vehicles detect no difference, and the switch handles all other
+packets as before. Captures at the ports have both the sent and the delivered frames.
 
-Frames keep the header of `PACKET_VNET_HDR`, which says that their checksum is still missing. The kernel therefore
-never computes it. Delivered frames have a mark that each engine lets pass.
+Frames keep the header of `PACKET_VNET_HDR`, which marks their checksum as missing. The kernel therefore never computes
+the checksum. Delivered frames have a packet mark, and every engine lets frames with this mark pass.
 """
 
 from __future__ import annotations
@@ -91,13 +91,13 @@ class Relay:
     """A relay that takes the broadcasts to these vehicles out of the switch between `open` and `close`. Raises OSError
     if packet sockets are not available.
 
-    `others` are further vehicles of the lab. The relay takes their broadcasts too, but the switch still floods the
-    broadcasts of all vehicles to them.
+    `others` are further vehicles of the lab. The relay takes their broadcasts too. The switch still delivers the
+    broadcasts of all vehicles to these other vehicles.
     """
 
     def __init__(self, vehicles: Sequence[int], others: Sequence[int] = ()) -> None:
         self.missed = 0
-        """Broadcasts that did not fit into the buffer, at the last call of `count_missed`."""
+        """Number of broadcasts that did not fit into the buffer, as of the last call of `count_missed`."""
         self._ports = {socket.if_nametoindex(addresses.port(vehicle)): vehicle for vehicle in (*vehicles, *others)}
         self._next = 0
         self._input = _socket(_ETH_P_ALL)

@@ -1,10 +1,11 @@
 """Capture packets in a separate process: `python -m netem.tap FOLDER VEHICLE...`, started in the virtual network.
 
-It prints "ready" when all ports are captured. Frames then wait in memory until SIGUSR1. At that time, the files
-FOLDER/<ID>.pcapng exist, and frames are appended to them. SIGTERM ends the capture. The remaining frames are written,
-then the counters: at the end of each file, and for all files as one JSON object on standard output. A process that was
-stopped may receive SIGTERM before SIGUSR1. Then the existence of the files shows that the mission began. Directions at
-a port are those of the switch, and directions in a file are those of the vehicle.
+The program prints "ready" when it captures all ports. It then keeps frames in memory until SIGUSR1. By then, the caller
+has created the files FOLDER/<ID>.pcapng, and the program appends frames to them. SIGTERM ends the capture. The program
+then writes the remaining frames and the counters. The counters are at the end of each file, and for all files in one
+JSON object on standard output. A suspended process may receive SIGTERM before SIGUSR1. In this case the existence of
+the files shows that the mission began. Directions at a port are those of the switch, and directions in a file are those
+of the vehicle.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ from netem._ring import BLOCK_BYTES, RETIRE_MS, CaptureRing
 from netem.pcapng import PcapngFile
 
 _MEMORY = 256 << 20
-"""Maximum size of all rings together in bytes. All ports share the speed of one machine."""
+"""Maximum size of all ring buffers together, in bytes."""
 _RING_MEMORY = 16 << 20
-"""Maximum size of one ring in bytes: 10,000 of the largest frames, which is one second."""
+"""Maximum size of one ring buffer in bytes. It holds 10,000 of the largest frames, which is about one second of
+traffic.
+"""
 _FEWEST_BLOCKS = 8  # for each ring, even above the total maximum
 _DRAIN_S = 10.0
-"""Maximum time for the last frames. The kernel hands over each block after `RETIRE_MS`."""
+"""Maximum number of seconds to wait for the last frames. The kernel hands over each block after at most `RETIRE_MS`."""
 
 
 class PortTap:
@@ -40,7 +43,7 @@ class PortTap:
         self.ring = CaptureRing(addresses.port(vehicle), blocks)
 
     def open(self, folder: Path) -> bool:
-        """Open the file if it exists. Return true if it does. Raises OSError."""
+        """Open the capture file if it exists. Return whether it exists. Raises OSError."""
         path = folder / f"{self.vehicle}.pcapng"
         exists = path.exists()
         if exists:

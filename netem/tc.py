@@ -1,8 +1,9 @@
 """The engine "netem": it applies all network conditions with the kernel's netem at the switch ports.
 
 A packet gets two numbers at its sender's port: the group of its sender in a partition, and the *kind* of its sender.
-All receivers treat senders of one kind alike. At the receiver's port it passes two stages. Packets of other groups are
-dropped. Then an HTB chooses the class of the packet's kind, which contains one netem:
+Every receiver has the same conditions for all senders of one kind. At the receiver's port the packet passes two stages.
+The first stage drops packets of other groups. In the second, an HTB chooses the class of the packet's kind, which
+contains one netem:
 
     v7 ingress  basic   skbedit priority 1:2 mark 1       vehicle 7 has kind 2 and group 1
     v7 egress   fw 1    pass                              vehicle 7 receives group 1
@@ -11,19 +12,20 @@ dropped. Then an HTB chooses the class of the packet's kind, which contains one 
                   class 1:1     netem loss 15 %           packets of kind 1 to vehicle 7
                   class 1:3     netem delay 100 ms        packets of kind 3 to vehicle 7
 
-A switch handles a packet once per receiver, so each receiver has its own random draws. On links with memory (bursts,
-rate, limit), each sender is its own kind, because only its own packets count.
+A switch handles a packet once per receiver, so random losses and delays are drawn separately for each receiver. On
+links with memory (bursts, rate, limit), each sender is its own kind, because only its own packets count.
 
-A change of figures changes the netem in place. Its queue stays, and other netems are not affected. A change of kinds
-first adds new classes and then moves the senders one by one. An old class is removed after its last packet has left. A
-partition affects no class. The receivers first accept the new groups too, then the senders move one by one, then the
-receivers stop accepting the old groups. Each pair is therefore treated as before or as after at any time. The time of a
-change grows with the number of vehicles, not of pairs.
+If only values change, netem is changed in place. It keeps its queue, and other netems are not affected. If the kinds
+change, the engine first adds new classes and then moves the senders one by one. An old class is removed after its last
+packet has left. A partition does not change the classes. First, the receivers accept the new groups in addition to the
+old ones. Then the senders move to their new groups one by one. At last, the receivers stop accepting the old groups. At
+any time, each pair therefore has either the old or the new conditions. The duration of a change grows with the number
+of vehicles, not with the number of pairs.
 
 Since 2025 (6.1.148, 6.6.102, 6.12.42, 6.16.1), Linux requires that a netem with duplication is the only one at its
 port. Duplication is then refused if a receiver does not treat all senders alike, or on links with memory. Newer kernels
-also limit the jitter to 2.1 s. `may_refuse` returns whether a network needs a test before the run. See tc-netem(8),
-tc-htb(8), tc-skbedit(8), tc-fw(8).
+also limit the jitter to 2.1 s. `may_refuse` returns whether some kernels refuse a network, so that it must be tested
+before the run. See tc-netem(8), tc-htb(8), tc-skbedit(8), tc-fw(8).
 """
 
 from __future__ import annotations
@@ -43,11 +45,13 @@ from netem.link import Distribution, LinkConditions
 _Numbers = dict[frozenset[int], int]
 
 _SURE_JITTER_S = (2**31 - 1) / 1e9
-"""Jitter that each kernel with netem supports."""
+"""Maximum jitter in seconds that every kernel with netem supports."""
 
 
 def may_refuse(conditions: NetworkConditions) -> bool:
-    """Return true if some kernels with netem refuse these network conditions. The module's docstring explains why."""
+    """Return true if some kernels with netem refuse these network conditions. The docstring of this module gives the
+    reason.
+    """
     links = (conditions.default, *conditions.receivers.values(), *conditions.links.values())
     return any(link.duplicate or (link.delay and link.delay.jitter_s > _SURE_JITTER_S) for link in links)
 
@@ -63,7 +67,7 @@ class _RemovedClassTotals:
 @dataclass
 class _ClassState:
     """The network conditions that were last set for a traffic class, or None if the kernel refused them. `distribution`
-    is that of the delay.
+    is the distribution of the delay.
     """
 
     link: LinkConditions | None
@@ -145,7 +149,9 @@ class NetemEngine(Engine):
         self._loss_conditions = figures
 
     def _set(self, receiver: int, links: dict[int, LinkConditions]) -> None:
-        """Set the network conditions at the receiver's port. Only differences are sent to the kernel."""
+        """Set the network conditions at the receiver's port. Send only the differences from the current state to the
+        kernel.
+        """
         port, held = self._ports[receiver], self._classes[receiver]
         requests: list[NetlinkRequest] = []
         changed: dict[int, _ClassState] = {}
@@ -209,7 +215,7 @@ class NetemEngine(Engine):
         return {vehicle: classes.get(port.index, {}) for vehicle, port in self._ports.items()}
 
     def _filters(self) -> tuple[dict[int, tuple[int, int] | None], dict[int, tuple[set[int], int]]]:
-        """Return the marks and the accepted groups at each port."""
+        """Return the sender's mark and the accepted groups at each port."""
         marks = {vehicle: port.read_mark(self._netlink) for vehicle, port in self._ports.items()}
         return marks, {vehicle: port.accepted_groups(self._netlink) for vehicle, port in self._ports.items()}
 
@@ -261,7 +267,7 @@ class NetemEngine(Engine):
 
 def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[frozenset[int]]:
     """Divide senders into groups that have the same network conditions at every receiver. A sender on a link with
-    memory is alone.
+    memory forms its own group.
     """
     shared = (conditions.default, *conditions.receivers.values())
     own: dict[int, list[object]] = {vehicle: [] for vehicle in vehicles}
@@ -280,7 +286,7 @@ def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[fro
 def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> dict[int, LinkConditions]:
     """Return one receiver's network conditions for each group of senders.
 
-    A single vehicle has conditions for itself.
+    A vehicle that is alone in its group also has conditions for itself.
     """
     senders = {number: next((v for v in kind if v != receiver), None) for kind, number in kinds.items()}
     links = {n: conditions.link(sender, receiver) for n, sender in senders.items() if sender is not None}
@@ -288,7 +294,7 @@ def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> d
 
 
 def _number(sets: Iterable[frozenset[int]], before: _Numbers, taken: Iterable[int]) -> _Numbers:
-    """Assign numbers to sets of vehicles. A set that had a number before keeps it."""
+    """Assign numbers to sets of vehicles. A set that already had a number keeps it."""
     used = {*taken, *before.values()}
     free = (number for number in range(1, MAX_KIND) if number not in used)
     return {members: before[members] if members in before else next(free) for members in sets}

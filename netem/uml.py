@@ -3,20 +3,20 @@
     status = uml.run(["my-command", "--flag"], cwd=Path.cwd(), env=os.environ)
 
 linux.uml (Debian: user-mode-linux) boots from the host's own files (hostfs). The command finds all programs and
-directories at their usual paths, and writes with the caller's rights. It needs no other rights, and is root inside.
-Only /run, with TMPDIR in it, belongs to the guest. The guest has one processor, and a system call takes about twenty
-times as long as on the host.
+directories at their usual paths, and writes with the caller's rights. It needs no other rights. Inside the guest it is
+root. Only /run, with TMPDIR in it, is separate from the host. The guest has one processor, and a system call takes
+about twenty times as long as on the host.
 
-The output of the command is copied as it comes. Its terminal is a console of the guest. Ctrl-C and SIGTERM are typed
-there as Ctrl-C, and there is no other input. Another console is for shells (`netem.uml_shell`). On a further console,
+The output of the command is copied at once. The terminal of the command is a console of the guest. Ctrl-C and SIGTERM
+reach it as Ctrl-C, and it has no other input. Another console is for shells (`netem.uml_shell`). On a further console,
 the guest prints an empty line every few seconds, and finally the exit status of the command. Without this status, `run`
 raises an error.
 
 Programs inside keep their floating point and vector registers, also on processors that the kernel does not support
 (`netem._uml_registers`).
 
-Nothing remains after the caller ends. User Mode Linux is one process group of the host, led by a shell. The shell kills
-the group and removes its directory as soon as the caller closes its end of a pipe, or dies.
+Nothing remains after the caller ends. The processes of User Mode Linux form one process group on the host, led by a
+shell. The shell kills the group and removes its directory when the caller closes its end of a pipe or dies.
 """
 
 from __future__ import annotations
@@ -42,11 +42,12 @@ from netem.errors import UmlError
 MODULES = Path("/usr/lib/uml/modules")
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 MEMORY = "2G"
-"""Maximum memory. The host provides only the memory that is used."""
+"""Maximum memory of the guest. The host provides only the memory that the guest uses."""
 
 BEAT_S = 5
 SILENCE_LIMIT_S = 90.0
-"""Seconds without output after which a guest counts as hung. It boots within a few seconds, and then prints regularly.
+"""Seconds without output after which a guest counts as hung. A guest boots within a few seconds, and then prints
+regularly.
 """
 
 POLL_S = 0.05
@@ -137,11 +138,12 @@ def examine() -> str:
 
 
 def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
-    """Run a command in its own kernel. Return its exit status, which is 128 plus the number of a signal that killed it.
+    """Run a command in its own kernel. Return its exit status. If a signal killed the command, the status is 128 plus
+    the number of the signal.
 
-    `env` is its environment, except for TMPDIR. In the main thread, Ctrl-C and SIGTERM go to the command. Before the
-    guest has booted, they end everything with status 130. Raises UmlError if User Mode Linux is missing, does not boot,
-    hangs or panics.
+    `env` is the environment of the command, except for TMPDIR. In the main thread, Ctrl-C and SIGTERM go to the
+    command. Before the guest has booted, they end the guest, and the status is 130. Raises UmlError if User Mode Linux
+    is missing, does not boot, hangs or panics.
     """
     kernel = find()
     with tempfile.TemporaryDirectory(prefix="uml-", ignore_cleanup_errors=True) as name:
@@ -277,14 +279,14 @@ def _write(target: BinaryIO, data: bytes) -> None:
 
 
 def _exit_status(received: bytes) -> int | None:
-    """Return the exit status. Return None if the line with the status is not complete yet."""
+    """Return the exit status in the received text. Return None if the line with the status is not complete yet."""
     *lines, _ = received.split(b"\n")
     return next((int(line) for line in lines if line.strip()), None)
 
 
 @contextlib.contextmanager
 def _forwarding_interrupts(guest: _RunningKernel) -> Iterator[None]:
-    """Forward Ctrl-C and SIGTERM to the virtual machine as a typed Ctrl-C. Only the main thread can do this."""
+    """Forward Ctrl-C and SIGTERM to the virtual machine as a typed Ctrl-C. This works only in the main thread."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if not guest.up:

@@ -4,9 +4,9 @@
         status = uml_shell.enter(folder, ["ip", "address"], cwd=Path.cwd(), env=os.environ)
 
 Input goes into a named pipe in the guest's folder. The output of the console is a growing file there. At this console,
-the guest waits for the name of a script in its folder, and runs the script with the console as its terminal. A zero
-byte and the name mark the start of the output. The same with the exit status marks its end. Only one program can run at
-a time.
+the guest reads the name of a script in its folder, and runs the script with the console as its terminal. A zero byte
+and the name mark the start of the output. A zero byte, the name and the exit status mark its end. Only one program can
+run at a time.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from netem.uml import CTRL_C, POLL_S, SHELLS_KEYS, SHELLS_SCREEN
 
 READ_BYTES = 4096
 RETRY_S = 2.0
-"""Seconds between requests. A booting guest has no console yet, and loses earlier input."""
+"""Seconds between repeated requests. A guest that is booting has no console yet, and loses earlier input."""
 END_MARK_BYTES = 32
 _LOCK = "shell"
 
@@ -131,14 +131,14 @@ def _copy_until_end(folder: Path, token: bytes, keys: int, screen: io.FileIO) ->
 
 
 def _certain_length(output: bytes) -> int:
-    """Return the length of the output that cannot be a part of the end mark."""
+    """Return the number of output bytes that cannot belong to the end mark."""
     at = output.rfind(b"\0", -END_MARK_BYTES)
     return at if at >= 0 else len(output)
 
 
 @contextlib.contextmanager
 def _raw_terminal() -> Iterator[None]:
-    """Pass all keys to the virtual machine, including Ctrl-C."""
+    """Pass all keys of the terminal to the virtual machine inside the context, including Ctrl-C."""
     if not sys.stdin.isatty():
         yield
         return

@@ -1,6 +1,6 @@
 """Define the rules by which a radio decides when to send: in its own time slot, or as its duty cycle allows.
 
-`netem.channel._contention` has the rule of IEEE 802.11.
+The rule of IEEE 802.11 is in `netem.channel._contention`.
 """
 
 from __future__ import annotations
@@ -13,36 +13,36 @@ from netem.channel._frame import RadioFrame
 from netem.channel._parameters import LoraRadio, TimeSlotRadio, nanoseconds
 
 NEVER = 1 << 62
-"""A time in nanoseconds that no run reaches."""
+"""A time in nanoseconds that stands for "never". Every run ends earlier."""
 
 
 class ChannelAccess(Protocol):
     """A rule for access to the channel. Stations are numbered from 0, and times are nanoseconds."""
 
     next_due: int
-    """When the next station sends, if nothing changes; NEVER without frames."""
+    """The time at which the next station will send if nothing changes. It is NEVER if no station has a frame."""
 
     def take_due(self) -> list[int]:
-        """Remove the stations that send at the time `next_due`, and return them."""
+        """Return the stations that send at the time `next_due`, and remove them from the waiting stations."""
 
     def wait(self, frame: RadioFrame, now: int, active: Collection[RadioFrame]) -> None:
-        """Choose the time at which the sender of `frame` sends it. `active` contains the frames that are being sent."""
+        """Choose the sending time of `frame`. `active` contains the frames on the air."""
 
     def begun(self, frames: list[RadioFrame], now: int) -> None:
-        """Process the beginning of frames that `take_due` returned before."""
+        """Update the waiting stations when frames begin. `take_due` returned the senders of these frames before."""
 
     def ended(self, frame: RadioFrame, waiting: RadioFrame | None, now: int, active: Collection[RadioFrame]) -> None:
-        """Process the end of `frame`. `waiting` is the next frame of its sender."""
+        """Update the waiting stations when `frame` ends. `waiting` is the next frame of its sender."""
 
     def too_long(self, airtime_ns: int) -> bool:
-        """Return true if a frame with this airtime can never be sent."""
+        """Return true if the rule never allows a frame with this airtime."""
 
 
 class DutyCycle:
-    """The access rule of a station that sends at once, unless it has used up its share of the time.
+    """The access rule of a station that sends at once, unless it has used up its duty cycle.
 
-    After a frame of T seconds a station is silent until T / duty after the beginning of this frame (ETSI EN 300 220, as
-    LoRaWAN devices apply it).
+    A frame of T seconds lets its station send again T / duty seconds after the beginning of this frame (ETSI EN 300
+    220, as LoRaWAN devices apply it).
     """
 
     def __init__(self, count: int, radio: LoraRadio | TimeSlotRadio) -> None:
@@ -78,8 +78,8 @@ class DutyCycle:
 
 
 class TimeSlots(DutyCycle):
-    """The access rule of a station that sends only in its own time slot. A frame that no longer fits waits for the next
-    slot.
+    """The access rule of a station that sends only in its own time slot. A frame that does not fit into the rest of the
+    slot waits for the station's next slot.
     """
 
     def __init__(self, count: int, radio: TimeSlotRadio) -> None:

@@ -1,15 +1,15 @@
 """Simulate a radio channel that all vehicles share: sending times, carrier sense, collisions, hidden stations and
 capture.
 
-The model does no I/O and reads no clock. It plays events, which are the beginnings and the ends of frames, up to the
-time that the caller gives it. The same calls with the same seed give the same result on every machine: times are
+The model does no I/O and reads no clock. The events of the model are the beginnings and the ends of frames. The caller
+advances the model to a given time. The same calls with the same seed give the same result on every machine: times are
 integers of nanoseconds, powers come from tables, and each station has a random stream of its own for its backoff.
 
-A receiver begins to receive a frame if it does not send and receives no other frame, if the power is at least
-`sensitivity_dbm`, and if the frame is `preamble_db` stronger than noise and all other frames together. The last
-condition must hold during `capture_window_s`. Within this time the receiver changes to a stronger frame, which is the
-capture effect. It receives the frame if the ratio of the power to noise and all other frames never falls below
-`sinr_db`, and if it does not begin to send.
+A receiver begins to receive a frame if it does not send and receives no other frame, if the power of the frame is at
+least `sensitivity_dbm`, and if the frame is `preamble_db` stronger than noise and all other frames together. The last
+condition must hold during `capture_window_s`. Within this time the receiver changes to a stronger frame (capture
+effect). The frame is received if the ratio of its power to noise and all other frames never falls below `sinr_db`, and
+if the receiver does not begin to send.
 
 Two stations that do not hear each other do not wait for each other: they are hidden from each other, and their frames
 collide at a receiver between them. A station that receives no frame senses the sum of all powers, and waits until this
@@ -40,7 +40,8 @@ from netem.radio import Place
 class Channel:
     """The radio channel between `vehicles`, which are numbered from 0 in this order.
 
-    Times are seconds, and no call may go back in time. All vehicles are at one place until the first call of `move`.
+    Times are seconds, and must not decrease from call to call. All vehicles are at the same place until the first call
+    of `move`.
     """
 
     def __init__(self, vehicles: Sequence[int], radio: Radio, seed: int) -> None:
@@ -52,11 +53,13 @@ class Channel:
         self._active: list[RadioFrame] = []
         self._next_end = NEVER
         self._sending = 0
-        """Stations that send, as bits."""
+        """The stations that are sending, one bit for each station."""
         self._finished: list[EndedTransmission] = []
         self._numbers = count()
         self._airtimes: dict[int, int | None] = {}
-        """Data bytes -> nanoseconds; None if the radio cannot send a message of this length."""
+        """Data bytes of a message -> nanoseconds on the air, or None if the radio cannot send a message of this
+        length.
+        """
         self._silence = [linear(round(100 * radio.noise_dbm))] * len(vehicles)
         self._energy = self._silence[0] + linear(round(100 * energy_dbm)) if isinstance(radio, WifiRadio) else math.inf
         self._begins = 1 + linear(round(-100 * radio.preamble_db)) / linear(0)
@@ -92,7 +95,7 @@ class Channel:
         return None if next_ns == NEVER else next_ns / NANOSECONDS
 
     def advance(self, now: float) -> list[EndedTransmission]:
-        """Play all events up to the time `now`. Return the transmissions that have ended since the previous call, in
+        """Advance the channel to the time `now`. Return the transmissions that have ended since the previous call, in
         order.
         """
         self._play(nanoseconds(now))
@@ -100,7 +103,7 @@ class Channel:
         return finished
 
     def move(self, places: Sequence[Place], now: float) -> None:
-        """Set the positions of the vehicles. Frames that are being sent keep the power with which they began."""
+        """Set the positions of the vehicles. Frames on the air keep the received powers with which they began."""
         self._play(nanoseconds(now))
         self._links.move(places)
 
@@ -150,9 +153,9 @@ class Channel:
         """Decide which receivers begin to receive these frames. For each frame, mark the receivers at which other
         frames disturb it.
 
-        Return the frames that further stations sense from now on.
+        Return the frames that additional stations sense from now on.
 
-        A power p suffices if p >= ratio (total - p), which is p (1 + 1 / ratio) >= total.
+        A power p is sufficient if p >= ratio (total - p), which is p (1 + 1 / ratio) >= total.
         """
         for frame in self._active:
             frame.deaf |= frame.reach.heard & self._sending
@@ -176,9 +179,9 @@ class Channel:
         return self._sum_energy(air, totals)
 
     def _sum_energy(self, air: list[RadioFrame], totals: Sequence[float]) -> list[RadioFrame]:
-        """Make stations sense the total power of all frames, until it falls below their detection level.
+        """Let stations sense the sum of the powers of all frames, until this sum falls below their detection level.
 
-        Return the frames that further stations sense from now on.
+        Return the frames that additional stations sense from now on.
         """
         level = self._energy
         by_end = sorted(air, key=lambda frame: frame.ends_ns, reverse=True)
@@ -209,7 +212,9 @@ class Channel:
 
 
 def _sufficient(frame: RadioFrame, totals: Sequence[float], ratio: float) -> int:
-    """Return the receivers (as bits) at which the power of the frame times `ratio` is at least the total power."""
+    """Return the receivers, as bits, at which the power of the frame times `ratio` is at least the total power of all
+    frames.
+    """
     receivers = 0
     for number in [number for number, power in enumerate(frame.reach.powers) if power * ratio >= totals[number]]:
         receivers |= 1 << number

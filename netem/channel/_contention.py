@@ -1,9 +1,10 @@
 """Simulate carrier sense and the random waiting time (backoff) of IEEE 802.11 broadcasts (IEEE 802.11-2020, 10.3.4).
 
 A station with a frame sends at once if the channel has been idle for DIFS. If the channel is busy, the station draws a
-number of slots from 0 to the contention window. It counts a slot down whenever the channel was idle for its duration,
-begins to count after DIFS, and sends at 0. After a frame it draws again, also if no further frame waits. A broadcast is
-never acknowledged, so the window never grows. After a frame with an error a station waits for EIFS in place of DIFS.
+number of slots from 0 to the contention window. It begins to count after DIFS, counts down one slot whenever the
+channel was idle for the duration of a slot, and sends at 0. After a frame it draws again, even if no further frame
+waits. A broadcast is never acknowledged, so the window never grows. After a frame with an error, a station waits for
+the longer interval EIFS instead of DIFS.
 
 Two stations whose counters end in the same slot both send, because neither can sense the other in time: a frame that
 began less than `sense_s` ago is not sensed yet.
@@ -30,7 +31,7 @@ class CarrierSense:
     def __init__(self, radio: WifiRadio, draws: Sequence[Random]) -> None:
         self.next_due = NEVER
         self._due: dict[int, int] = {}
-        """Station with a frame -> when it will send this frame, if nothing changes."""
+        """Station with a waiting frame -> the time at which it will send this frame if nothing changes."""
         self._draws = draws
         self._choices = radio.contention_window + 1
         self._slot = nanoseconds(radio.slot_s)
@@ -38,11 +39,11 @@ class CarrierSense:
         self._eifs = nanoseconds(radio.eifs_s)
         self._sense = nanoseconds(radio.sense_s)
         self._left = [0] * len(draws)
-        """Slots to count down, as of `_from`."""
+        """Number of slots that each station still has to count down, at the time `_from`."""
         self._from = [0] * len(draws)
-        """When the station begins to count, or began."""
+        """The time at which each station begins or began to count down."""
         self._resting: dict[int, int] = {}
-        """Station that counts down after its last frame, without a further one -> when it has counted."""
+        """Station without a further frame that counts down after its last one -> the time at which it has finished."""
         self._over: deque[RadioFrame] = deque()
         """Frames that ended less than EIFS ago."""
 
@@ -66,9 +67,8 @@ class CarrierSense:
         self.next_due = min(self.next_due, due)
 
     def begun(self, frames: list[RadioFrame], now: int) -> None:
-        """Make each station that senses these frames wait. A station whose sending time is earlier sends nevertheless.
-
-        This runs for each frame and each waiting station, so it counts the slots itself.
+        """Make each station that senses these frames wait. A station with an earlier sending time sends
+        nevertheless.
         """
         all_due, all_from, all_left, slot, notices = self._due, self._from, self._left, self._slot, now + self._sense
         resting = self._resting
@@ -141,7 +141,7 @@ class CarrierSense:
         self.next_due = min(self._due.values(), default=NEVER)
 
     def _counted(self, station: int, now: int) -> int:
-        """Count down the slots that have passed, and return the number of remaining slots."""
+        """Subtract the slots that have passed, and return the number of remaining slots of this station."""
         left = self._left[station]
         if left and now > self._from[station]:
             passed = (now - self._from[station]) // self._slot

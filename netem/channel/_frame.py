@@ -11,15 +11,15 @@ from netem.channel._parameters import NANOSECONDS
 
 
 class FrameFate(StrEnum):
-    """The result of a frame at one receiver. A frame with one of the last two results was never sent."""
+    """The result of a frame at one receiver. A frame with one of the last two results was never on the air."""
 
     RECEIVED = "received"
     COLLISION = "collision"
-    """The receiver heard other frames at the same time, or it was receiving another one."""
+    """Frames collided: the receiver sensed other frames at the same time, or it was receiving another one."""
     HALF_DUPLEX = "half_duplex"
-    """The receiver was sending a frame itself."""
+    """The receiver was sending a frame itself at this time."""
     FADE = "fade"
-    """The shadowing took too much power."""
+    """The shadowing reduced the received power too much."""
     RANGE = "range"
     """The receiver is too far away, even without shadowing."""
     PARTITION = "partition"
@@ -44,19 +44,19 @@ class RadioFrame:
     begins_ns: int = 0
     ends_ns: int = 0
     reach: FrameReach = field(init=False)
-    """Known when the frame begins."""
+    """The reception of the frame at each receiver. It is computed when the frame begins."""
     receiving: int = 0
-    """Receivers that receive this frame and no other."""
+    """Receivers that are receiving this frame."""
     disturbed: int = 0
     """Receivers at which other frames were too strong."""
     deaf: int = 0
-    """Receivers in range that sent a frame themselves."""
+    """Receivers in range that were sending a frame themselves."""
     summed: int = 0
-    """Receivers that sense the sum of overlapping frames until this frame ends."""
+    """Receivers that sense the total power of overlapping frames until this frame ends."""
 
     @property
     def sensed(self) -> int:
-        """The stations for which this frame makes the channel busy."""
+        """Stations that sense the channel as busy because of this frame."""
         return self.receiving | self.disturbed | self.reach.energetic | self.summed
 
     @property
@@ -91,7 +91,7 @@ class EndedTransmission:
 
     @property
     def queued_at(self) -> float:
-        """The time in seconds at which `Channel.send` was called."""
+        """The time in seconds at which `Channel.send` queued the message."""
         return self._frame.queued_ns / NANOSECONDS
 
     @property
@@ -108,7 +108,7 @@ class EndedTransmission:
         return self._frame.received
 
     def lost(self) -> dict[FrameFate, int]:
-        """Return the receivers that lost the frame, as bits, by the reason."""
+        """Return the receivers that lost the frame, as bits, for each reason."""
         frame, reach = self._frame, self._frame.reach
         lost = {
             FrameFate.COLLISION: frame.collided,
@@ -120,7 +120,7 @@ class EndedTransmission:
         return {fate: receivers for fate, receivers in lost.items() if receivers}
 
     def fate(self, receiver: int) -> FrameFate:
-        """Return the result of the frame at this receiver, which must not be the sender."""
+        """Return the result of the frame at this receiver. The receiver must not be the sender."""
         bit = 1 << receiver
         return next((fate for fate, receivers in self.lost().items() if receivers & bit), FrameFate.RECEIVED)
 

@@ -2,13 +2,13 @@
 
 Shadowing is a normal deviation in decibels, equal in both directions of a link. It is correlated: after a vehicle has
 moved, or after some time, a part of the old deviation remains (Gudmundson, Correlation Model for Shadow Fading in
-Mobile Radio Systems, Electronics Letters 27(23), 1991). If both ends of a link move, both distances count (Wang,
-Tameh, Nix, Joint Shadowing Process in Urban Peer-to-Peer Radio Channels, IEEE Transactions on Vehicular Technology
-57(1), 2008). Links are independent of each other, also if two vehicles fly side by side: the model has no map of
-obstacles.
+Mobile Radio Systems, Electronics Letters 27(23), 1991). If both ends of a link move, both movements change the
+shadowing (Wang, Tameh, Nix, Joint Shadowing Process in Urban Peer-to-Peer Radio Channels, IEEE Transactions on
+Vehicular Technology 57(1), 2008). Links are independent of each other, even if two vehicles fly side by side, because
+the model has no map of obstacles.
 
-Powers are integers of 0.01 dB, and sums of powers use the entries of a table. Rounded values do not depend on the
-mathematical library of the machine.
+Powers are integers of 0.01 dB, and sums of powers use the entries of a table. The rounded values are equal on all
+machines.
 """
 
 from __future__ import annotations
@@ -27,10 +27,14 @@ from netem.channel._parameters import NANOSECONDS, Radio, nanoseconds
 from netem.radio import MIN_DISTANCE_M, Place
 
 STEP = 0.1
-"""Change of the shadowing after which it is drawn again: its correlation has then fallen to exp(-STEP), about 0.9."""
+"""Amount of time and movement after which the shadowing is drawn again. Its correlation with the old shadowing has then
+fallen to exp(-STEP), about 0.9.
+"""
 
 _SILENT = -1_000_000
-"""Level in 0.01 dB at a receiver that a frame does not reach. No shadowing makes it audible."""
+"""Level in 0.01 dB at a receiver that a frame does not reach. It is so low that no shadowing makes the frame
+audible.
+"""
 
 _TABLE_SIZE = 4096
 _KEPT_STEPS = 1 << 16
@@ -40,7 +44,7 @@ _LIGHT_M_PER_S = 299_792_458.0
 
 @cache
 def linear(centibels: int) -> float:
-    """Convert a level in 0.01 dB to a power. A level of 0 gives the power 10^6."""
+    """Convert a level in 0.01 dB to a linear power. A level of 0 gives the power 10^6."""
     if centibels < _SILENT // 2:
         return 0.0
     tens, step = divmod(centibels, 1000)
@@ -49,24 +53,24 @@ def linear(centibels: int) -> float:
 
 @cache
 def _deviations(shadowing_db: float) -> list[int]:
-    """Return values of a normal distribution in 0.01 dB, all of which are equally probable."""
+    """Return values in 0.01 dB that approximate a normal distribution. Each value is equally probable."""
     return [round(100 * shadowing_db * quantile / SCALE) for quantile in table("normal", _TABLE_SIZE)]
 
 
 @dataclass(slots=True)
 class FrameReach:
-    """The reception of one sender's frames at each receiver. Sets of receivers are bits. Receiver 0 is the lowest
-    bit.
+    """The reception of one sender's frames at all receivers. A set of receivers has one bit per receiver. Receiver 0 is
+    the lowest bit.
     """
 
     levels: list[int]
-    """Powers in 0.01 dB."""
+    """Received power at each receiver in 0.01 dB."""
     heard: int
-    """Receivers that can receive the frame if nothing disturbs it."""
+    """Receivers that can receive the frame if no other frame disturbs it."""
     energetic: int
     """Receivers that sense the carrier by its energy alone."""
     faded: int
-    """Receivers that the shadowing cuts off."""
+    """Receivers that do not receive the frame because of the shadowing."""
     far: int
     """Receivers that are out of range even without shadowing."""
     cut: int
@@ -75,7 +79,7 @@ class FrameReach:
 
     @property
     def powers(self) -> list[float]:
-        """The received power at each receiver, computed only if frames overlap."""
+        """The linear received power at each receiver. It is computed only if frames overlap."""
         if self._powers is None:
             self._powers = [linear(level) for level in self.levels]
         return self._powers
@@ -112,9 +116,9 @@ class RadioLinks:
         self._places = [Place(0.0, 0.0, 0.0)] * count
         self._first_metre_db = 20 * math.log10(4 * math.pi * MIN_DISTANCE_M * radio.frequency_hz / _LIGHT_M_PER_S)
         self._means: list[_MeanReach | None] = [None] * count
-        """Computed when the sender sends."""
+        """The reception without shadowing for each sender. It is computed when the vehicle first sends."""
         self._moved_m = [0.0] * count
-        """Metres since the last change of the shadowing."""
+        """Metres that each vehicle has moved since the last change of the shadowing."""
         self._shadow = [[0] * count for _ in range(count)]
         self._shadowed_at = 0
         self._ages_at = 0
@@ -136,7 +140,7 @@ class RadioLinks:
         self._forget()
 
     def tune(self, groups: Sequence[int]) -> None:
-        """Let only vehicles with the same number in `groups` affect each other."""
+        """Set the group of each vehicle. Only vehicles of the same group affect each other."""
         self._group = list(groups)
         self._forget()
 
@@ -186,9 +190,10 @@ class RadioLinks:
         return _MeanReach(levels, near, far, cut)
 
     def _path_loss(self, one: Place, other: Place) -> int:
-        """Return the path loss between two places: by the log-distance model or over flat ground, the greater of both.
+        """Return the path loss between two places: the greater of the log-distance model and the model of two rays over
+        flat ground.
 
-        Two rays: Rappaport, Wireless Communications, 2nd ed., eq. 4.52, far from the antennas.
+        The model of two rays is from Rappaport, Wireless Communications, 2nd ed., eq. 4.52, far from the antennas.
         """
         radio = self._radio
         metres = max(one.distance_m(other), MIN_DISTANCE_M)
@@ -201,7 +206,7 @@ class RadioLinks:
         return _centibels(loss_db)
 
     def _age(self, now_ns: int) -> None:
-        """Change the shadowing according to the time and the movement since its last change."""
+        """Let the shadowing change according to the time and the movement since its last change."""
         elapsed_s = (now_ns - self._shadowed_at) / NANOSECONDS
         self._shadowed_at = now_ns
         self._ages_at = now_ns + nanoseconds(STEP * self._radio.shadowing_s)

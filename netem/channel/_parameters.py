@@ -1,8 +1,8 @@
 """Define the properties of radios: power, reception, the form of frames, and the rule for access to the channel.
 
 Each kind of radio is a class. Its fields are the keys of `network.channel` in a scenario, with the unit in the name.
-Times are seconds here. The model counts nanoseconds, because equal times must compare as equal: two stations collide
-exactly if they start in the same slot.
+Times are seconds here. In this module times are seconds. The model of the channel counts whole nanoseconds, because it
+must recognise equal times: two stations collide if they start in the same slot.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Ground = Literal["none", "two_ray"]
 NANOSECONDS = 1_000_000_000
 MAX_S = 3600.0
 MAX_BYTES = 65_507
-"""Largest data of a UDP datagram."""
+"""Maximum number of data bytes in a UDP datagram."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class Radio:
 
 @dataclass(frozen=True, kw_only=True)
 class WifiRadio(Radio):
-    """An IEEE 802.11 radio for broadcasts, with carrier sense and random waiting times, without acknowledgements or
+    """An IEEE 802.11 radio for broadcasts. It has carrier sense and random waiting times, and no acknowledgements or
     retries.
     """
 
@@ -106,7 +106,7 @@ class TimeSlotRadio(Radio):
 
 @dataclass(frozen=True, kw_only=True)
 class LoraRadio(Radio):
-    """A LoRa radio. It sends at once, without carrier sense, as often as its duty cycle allows."""
+    """A LoRa radio. It sends at once and without carrier sense, unless its duty cycle forbids it."""
 
     spreading_factor: int
     bandwidth_hz: float
@@ -164,7 +164,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "symbol_s": (1e-9, MAX_S),
     "turn_s": (1e-9, MAX_S),
 }
-"""Key -> the least and the greatest allowed value. Other times are 0 to MAX_S seconds."""
+"""Key -> the least and the greatest allowed value. For times that are not listed, these are 0 and MAX_S seconds."""
 
 
 def _check(key: str, value: object) -> None:

@@ -1,4 +1,4 @@
-"""Define radios with properties from standards and data sheets."""
+"""Define the presets: radios with properties from standards and data sheets."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from netem.channel._parameters import LoraRadio, Radio, TimeSlotRadio, WifiRadio
 
 _UDP_OVER_80211 = 24 + 4 + 8 + 20 + 8
-"""Bytes of MAC header, frame check sequence, LLC and SNAP, IPv4, and UDP."""
+"""Bytes that a frame has in addition to the data: MAC header and frame check sequence, LLC and SNAP, IPv4, and UDP."""
 
 _THERMAL_DBM_PER_HZ = -174.0
 
@@ -21,8 +21,8 @@ def _dsss(rate_bps: float, sinr_db: float) -> WifiRadio:
 
     The long preamble and PLCP header take 192 us at 1 Mbit/s (16.2.2.2). A frame takes whole microseconds (16.2.3.5).
     Slot 20 us, SIFS 10 us, CWmin 31, CCA time 15 us (Table 16-4), so DIFS is 50 us, and EIFS adds SIFS and an
-    acknowledgement of 304 us at 1 Mbit/s (10.3.7). Energy detection: -76 dBm for 50 to 100 mW (16.3.8.5). The ratio of
-    signal to interference is where half of the frames of 111 bytes arrive in ns-3's DsssErrorRateModel.
+    acknowledgement of 304 us at 1 Mbit/s (10.3.7). Energy detection: -76 dBm for 50 to 100 mW (16.3.8.5). `sinr_db` is
+    the ratio at which half of the frames of 111 bytes arrive in ns-3's DsssErrorRateModel.
     """
     return WifiRadio(
         power_dbm=20.0,
@@ -53,8 +53,8 @@ def _ofdm(rate_bps: float, sinr_db: float) -> WifiRadio:
     Preamble and SIGNAL field take 20 us, a symbol 4 us, and SERVICE and tail are 22 bits (17.3). At 2.4 GHz there is a
     signal extension of 6 us (18.3.2.4) and in an ad hoc network the slot is 20 us (18.4.5). SIFS 10 us, CWmin 15, CCA
     time below 4 us (Table 18-5), so DIFS is 50 us, and EIFS adds SIFS and an acknowledgement of 50 us. Energy
-    detection: -62 dBm (17.3.10.6). The ratio of signal to interference is where half of the frames of 111 bytes arrive
-    in ns-3's TableBasedErrorRateModel.
+    detection: -62 dBm (17.3.10.6). `sinr_db` is the ratio at which half of the frames of 111 bytes arrive in ns-3's
+    TableBasedErrorRateModel.
     """
     return WifiRadio(
         power_dbm=20.0,
@@ -110,10 +110,10 @@ def _lora(factor: int, sensitivity_dbm: float) -> LoraRadio:
     """Return a LoRa radio at 868 MHz with a bandwidth of 125 kHz and coding rate 4/5.
 
     Sensitivities: SX1276 data sheet, rev. 7, Table 10. Power 14 dBm and a duty cycle of 1 % are the limits of ETSI EN
-    300 220-2 (band M). A frame survives if it is 6 dB stronger than the others with the same spreading factor
-    (Goursaud and Gorce, EAI Endorsed Transactions on Internet of Things 15(1), 2015). A receiver changes to a stronger
-    frame until the last five symbols of the preamble (Bor et al., Do LoRa Low-Power Wide-Area Networks Scale?, MSWiM
-    2016). The noise is what remains of it after despreading. A frame has at most 255 bytes.
+    300 220-2 (band M). A frame survives if it is 6 dB stronger than the others with the same spreading factor (Goursaud
+    and Gorce, EAI Endorsed Transactions on Internet of Things 15(1), 2015). A receiver changes to a stronger frame
+    until the last five symbols of the preamble (Bor et al., Do LoRa Low-Power Wide-Area Networks Scale?, MSWiM 2016).
+    The noise level is the noise that remains after despreading. A frame has at most 255 bytes.
     """
     bandwidth_hz, preamble_symbols = 125e3, 8
     return LoraRadio(
@@ -144,4 +144,4 @@ PRESETS: dict[str, Radio] = {
         for factor, sensitivity_dbm in zip(range(7, 13), (-123.0, -126.0, -129.0, -132.0, -133.0, -136.0), strict=True)
     },
 }
-"""Name -> radio, as `network.channel.preset` names it."""
+"""Name of a preset, as in the key `network.channel.preset` -> its radio."""
