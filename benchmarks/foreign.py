@@ -18,7 +18,7 @@ from collections import Counter
 from pathlib import Path
 
 from harness.errors import UnsupportedError
-from harness.play.simulation.foreign._virtual_program import SHARED
+from harness.play.simulation.foreign._program_pool import SHARED
 from harness.run.parallel import FailedTask, sweep
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import Scenario, load, load_scenario

@@ -377,7 +377,7 @@ class VectorSuite:
 
 
 def _kind_of_end(ended: str) -> str:
-    """Return a short phrase about the end of an agent, such as "it hangs" or "it ended with status 1"."""
+    """Return a short phrase about the end of an agent, such as "it hangs" or "it ended by itself with status 1"."""
     return ended.partition(":")[0]
 
 

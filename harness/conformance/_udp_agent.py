@@ -128,7 +128,7 @@ class UdpAgent(AgentUnderTest):
 
     async def close(self) -> None:
         self.peer_socket.close()
-        await self.process.kill()
+        await self.process.program.kill()
         shutil.rmtree(self.process.directory, ignore_errors=True)
         self._closed()
 

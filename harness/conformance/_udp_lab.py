@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -22,29 +23,26 @@ from harness.conformance import _ports
 from harness.conformance._agent_under_test import NO_KEYS, mission
 from harness.conformance._state_space import SettingsVariant
 from harness.errors import HarnessError, MachineError, UnsupportedError
-from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
-from harness.play.child_processes import ChildProcesses
+from harness.play.agent_control import AgentRefusedError, AgentSilentError, last_line_in
+from harness.play.process.controlled_program import ControlledProgram, ProgramEndedError
 from netem.errors import LabUnavailable, NetemError, SpawnError
-from netem.lab import Lab, LabProcess
+from netem.lab import Lab
 from ucp.features import UNSUPPORTED
 
 AGENTS_VEHICLE, PEERS_VEHICLE = 1, 2
 """Vehicles of the lab: that of all agents under test, and that of their peers."""
 FIRST_PORT = 14600
 MAX_READ_BYTES = 65536
-START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
-POLL_S = 0.01
 MAX_REPEATED_REQUESTS, REPEATED_REQUEST_LIMIT_S = 10, 1.0
 """Number of further requests to an agent that did not answer one within ANSWER_LIMIT_S, and their time limit. An agent
 that answers none of them hangs. A pause of the harness uses up one of them only."""
-END_REPORT_LIMIT_S = 0.5
-"""Maximum wall time between the end of a process and the report of that end."""
-MAX_OUTPUT_BYTES = 16 * 1024 * 1024
-"""Maximum output of an agent that is not ready yet."""
 _SO_TIMESTAMPNS = 35
 """Socket option of Linux. Python has no name for it."""
 _TIMESPEC = struct.Struct("@qq")
 ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
+
+
+SILENT = "it said nothing"
 
 
 class NoAgentError(HarnessError):
@@ -125,7 +123,7 @@ class UdpLab:
                 ending.cancel()
                 if not accepting.done():
                     accepting.cancel()
-                    raise MachineError(f"no sockets in the lab: {last_line(self.place / 'ports.log')}")
+                    raise self._no_sockets()
                 connection, _ = accepting.result()
         finally:
             os.close(directory)
@@ -135,12 +133,15 @@ class UdpLab:
             while len(descriptors) < len(self._ports):
                 _, some, _, _ = socket.recv_fds(connection, 1, _ports.MAX_DESCRIPTORS)
                 if not some:
-                    raise MachineError(f"no sockets in the lab: {last_line(self.place / 'ports.log')}")
+                    raise self._no_sockets()
                 descriptors += some
         sockets = [socket.socket(fileno=descriptor) for descriptor in descriptors]
         for air in sockets:
             air.setblocking(False)
         return sockets
+
+    def _no_sockets(self) -> MachineError:
+        return MachineError(f"no sockets in the lab: {last_line_in(self.place / 'ports.log') or SILENT}")
 
     def mission(
         self, variant: SettingsVariant, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS
@@ -221,16 +222,10 @@ class PeerSocket:
 class ProcessUnderTest:
     """The process of an agent under test, with its control socket and its files."""
 
-    def __init__(
-        self, air: UdpLab, directory: Path, agent_id: int, process: LabProcess, processes: ChildProcesses
-    ) -> None:
-        self._air = air
+    def __init__(self, directory: Path, agent_id: int, program: ControlledProgram) -> None:
         self.directory = directory
         self.agent_id = agent_id
-        self.process = process
-        self.processes = processes
-        self.control = AgentControl(directory / f"{agent_id}.control")
-        self.output = directory / f"{agent_id}.out"
+        self.program = program
         self.signalled = False
         """True if the harness sent a signal, after which the agent may not answer."""
 
@@ -242,48 +237,35 @@ class ProcessUnderTest:
         name = f"{agent_id}.mission.json"
         text = mission if isinstance(mission, bytes) else json.dumps(mission).encode()
         (directory / name).write_bytes(text)
-        output = directory / f"{agent_id}.out"
-        processes = ChildProcesses()
         try:
-            process = await air.lab.spawn(
-                AGENTS_VEHICLE,
+            program = await ControlledProgram.start(
+                partial(air.lab.spawn, AGENTS_VEHICLE, role="agent"),
                 [*air.command, name],
-                cwd=directory,
-                env=processes.environment(os.environ),
-                stdout=output,
-                stderr=output,
-                role="agent",
+                directory=directory,
+                control=directory / f"{agent_id}.control",
+                log=directory / f"{agent_id}.out",
             )
         except SpawnError as error:
             raise NoAgentError(str(error)) from None
-        return cls(air, directory, agent_id, process, processes)
+        return cls(directory, agent_id, program)
 
-    async def ready(self) -> dict[str, Any]:
-        """Wait until the agent answers, and return its status. Raises UnsupportedError, AgentEndedError."""
-        deadline = time.monotonic() + START_LIMIT_S
-        while True:
-            try:
-                return await self.control.ask("status", timeout_s=ANSWER_LIMIT_S)
-            except AgentRefusedError as error:
-                raise AgentEndedError(f"it refuses the command status: {error}") from None
-            except AgentSilentError:
-                if self.process.returncode is not None:
-                    self.raise_end()
-                if time.monotonic() > deadline:
-                    reason = f"its control socket did not answer within {START_LIMIT_S:g} s"
-                    raise AgentEndedError(f"{reason}: {last_line(self.output)}") from None
-                if self.output.stat().st_size > MAX_OUTPUT_BYTES:
-                    raise AgentEndedError("it prints without end and does not answer its control socket") from None
-                await asyncio.sleep(POLL_S)
+    @property
+    def last_line(self) -> str:
+        """The last line of the agent's output, or a sentence that there is none."""
+        return self.program.last_line or SILENT
 
-    def raise_end(self) -> None:
-        """Raise an error for the ended process: UnsupportedError after exit status 127, otherwise AgentExitedError."""
-        if self.process.returncode == UNSUPPORTED:
-            raise UnsupportedError(last_line(self.output))
-        raise self._exited()
-
-    def _exited(self) -> AgentExitedError:
-        return AgentExitedError(f"it ended with {self.process.end}: {last_line(self.output)}")
+    async def ready(self) -> None:
+        """Wait until the agent answers. Raises UnsupportedError, AgentEndedError."""
+        try:
+            await self.program.ready()
+        except AgentRefusedError as error:
+            raise AgentEndedError(f"it refuses the command status: {error}") from None
+        except ProgramEndedError as error:
+            if self.program.process.returncode == UNSUPPORTED:
+                raise UnsupportedError(self.last_line) from None
+            raise AgentExitedError(f"it {error}: {self.last_line}") from None
+        except AgentSilentError as error:
+            raise AgentEndedError(f"it {error}: {self.last_line}") from None
 
     async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         """Send a command to the agent, and return its answer.
@@ -291,12 +273,10 @@ class ProcessUnderTest:
         Raises AgentEndedError if the agent does not answer, and AgentRefusedError if it refuses the command.
         """
         try:
-            return await self.control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
+            return await self.program.ask(command, **arguments)
+        except ProgramEndedError as error:
+            raise AgentExitedError(f"it {error}: {self.last_line}") from None
         except AgentSilentError as error:
-            with suppress(TimeoutError):
-                await asyncio.wait_for(self.process.wait(), END_REPORT_LIMIT_S)
-            if self.process.returncode is not None:
-                raise self._exited() from None
             await self.check_answers()
             raise AgentEndedError(str(error)) from None
 
@@ -305,13 +285,13 @@ class ProcessUnderTest:
         for _ in range(MAX_REPEATED_REQUESTS):
             next_chance = time.monotonic() + REPEATED_REQUEST_LIMIT_S
             try:
-                await self.control.ask("status", timeout_s=REPEATED_REQUEST_LIMIT_S)
+                await self.program.ask("status", limit_s=REPEATED_REQUEST_LIMIT_S)
                 return
             except AgentRefusedError:
                 return
             except AgentSilentError:
                 await asyncio.sleep(next_chance - time.monotonic())
-        if self.process.returncode is None:
+        if self.program.process.returncode is None:
             raise AgentHangsError(f"it hangs: it did not answer {MAX_REPEATED_REQUESTS} requests in a row")
 
     async def export(self) -> dict[str, Any]:
@@ -328,19 +308,14 @@ class ProcessUnderTest:
 
     async def send_signal(self, number: int) -> None:
         self.signalled = True
-        await self.process.send_signal(number)
+        await self.program.process.send_signal(number)
 
     async def pause(self) -> None:
         await self.send_signal(signal.SIGSTOP)
 
     async def resume(self) -> None:
-        await self.process.resume()
+        await self.program.process.resume()
         self.signalled = False
-
-    async def kill(self) -> None:
-        self.control.close()
-        await self.send_signal(signal.SIGKILL)
-        await self.process.wait()
 
 
 def _timestamp(ancillary: Sequence[tuple[int, int, bytes]]) -> float:
@@ -349,12 +324,3 @@ def _timestamp(ancillary: Sequence[tuple[int, int, bytes]]) -> float:
             seconds, nanoseconds = _TIMESPEC.unpack_from(data)
             return float(seconds + nanoseconds / 1e9)
     return time.time()
-
-
-def last_line(path: Path) -> str:
-    if not path.exists():
-        return "it said nothing"
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - MAX_READ_BYTES))
-        lines = file.read().decode("utf-8", errors="replace").split("\n")
-    return next((line.strip()[:300] for line in reversed(lines) if line.strip()), "it said nothing")

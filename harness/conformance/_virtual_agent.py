@@ -8,11 +8,7 @@ import asyncio
 import base64
 import json
 import math
-import os
-import signal
-import subprocess
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,116 +18,48 @@ from harness.conformance._alphabet import AgentInput
 from harness.conformance._observation import KnownNames, RecordedDatagram, TestedStep, compare, datagram_text
 from harness.conformance._reference_model import ExpectedRun, ReferenceModel, TimerExpiry
 from harness.conformance._state_space import STEP_S, SettingsVariant, next_timer_name, state_of
-from harness.conformance._udp_lab import (
-    ANSWER_LIMIT_S,
-    GRACE_S,
-    POLL_S,
-    START_LIMIT_S,
-    AgentEndedError,
-    AgentExitedError,
-    AgentHangsError,
-    NoAgentError,
-    last_line,
-)
+from harness.conformance._udp_lab import SILENT, AgentEndedError, AgentExitedError, AgentHangsError, NoAgentError
 from harness.conformance._virtual_lines import given_line, virtual_mission
 from harness.conformance.results import FURTHER_CHECKS, CaseResult
 from harness.errors import UnsupportedError
-from harness.play.child_processes import ChildProcesses
+from harness.play.simulation.foreign.line_program import ANSWER_LIMIT_S, LineProgram, ProgramFailedError
 from ucp.clock import MICROSECONDS
 
-ANSWER_BYTES = 4 * 1024 * 1024
 END_CASE = "the program ends with status 0 at the end of its input"
 END_SECTION = "contract, Virtual time"
 RIGHT_END = "status 0"
 
 
 class VirtualProgram:
-    """A process of `COMMAND --virtual`."""
+    """A process of `COMMAND --virtual`. Waiting for its answers does not block the event loop. Raises NoAgentError."""
 
-    def __init__(
-        self,
-        process: subprocess.Popen[bytes],
-        processes: ChildProcesses,
-        given: asyncio.StreamWriter,
-        reading: asyncio.ReadTransport,
-        answers: asyncio.StreamReader,
-        errors: Path,
-    ) -> None:
-        self._process = process
-        self._processes = processes
-        self._input = given
-        self._reading = reading
-        self._answers = answers
-        self._errors = errors
+    def __init__(self, command: Sequence[str], errors: Path) -> None:
+        try:
+            self._program = LineProgram(command, errors)
+        except OSError as error:
+            raise NoAgentError(f"the agent cannot be started: {error.strerror}") from None
         self._lines = 0
         self.broken = False
 
-    @classmethod
-    async def start(cls, command: Sequence[str], errors: Path) -> "VirtualProgram":
-        """Start the process and return it. Raises NoAgentError.
-
-        `asyncio.create_subprocess_exec` is no alternative: after a cancellation it waits forever for the pipes.
-        """
-        try:
-            processes = ChildProcesses()
-            with errors.open("ab") as file:
-                process = subprocess.Popen(
-                    [*command, "--virtual"],
-                    bufsize=0,
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    stderr=file,
-                    start_new_session=True,
-                    env=processes.environment(os.environ),
-                )
-        except OSError as error:
-            raise NoAgentError(f"the agent cannot be started: {error.strerror}") from None
-        try:
-            return await cls._connected(process, processes, errors)
-        except BaseException:
-            await _end(process, processes)
-            raise
-
-    @classmethod
-    async def _connected(
-        cls, process: subprocess.Popen[bytes], processes: ChildProcesses, errors: Path
-    ) -> "VirtualProgram":
-        loop = asyncio.get_running_loop()
-        answers = asyncio.StreamReader(ANSWER_BYTES)
-        protocol = asyncio.StreamReaderProtocol(
-            asyncio.StreamReader()
-        )  # a StreamWriter needs it to wait for free space
-        reading, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(answers), process.stdout)
-        try:
-            writing, _ = await loop.connect_write_pipe(lambda: protocol, process.stdin)
-        except BaseException:
-            reading.close()
-            raise
-        return cls(process, processes, asyncio.StreamWriter(writing, protocol, None, loop), reading, answers, errors)
-
-    async def ask(self, line: dict[str, Any], limit_s: float = ANSWER_LIMIT_S) -> dict[str, Any]:
+    async def ask(self, line: dict[str, Any]) -> dict[str, Any]:
         """Send a line to the agent, and return its answer. Raises AgentEndedError, UnsupportedError."""
         self._lines += 1
+        text = json.dumps(line).encode("ascii") + b"\n"
+        exchange = asyncio.ensure_future(asyncio.to_thread(self._program.exchange, text))
         try:
-            async with asyncio.timeout(limit_s):
-                self._input.write(json.dumps(line).encode("ascii") + b"\n")
-                await self._input.drain()
-                text = await self._answers.readline()
-                answer = json.loads(text) if text else None
-        except TimeoutError:
+            answer = json.loads(await asyncio.shield(exchange))
+        except asyncio.CancelledError:
+            self._program.kill()  # the thread still reads from the program
+            await asyncio.wait([exchange])
+            exchange.exception()  # otherwise asyncio reports the end of the program as an unread exception
             self.broken = True
-            place = f"line {self._lines} of its process"
-            raise AgentHangsError(f"it hangs: it did not answer {place} within {limit_s:g} s") from None
-        except (OSError, ValueError, RecursionError) as error:
+            raise
+        except ProgramFailedError as error:
+            self.broken = True
+            raise self._end_error(error) from None
+        except (ValueError, RecursionError) as error:
             self.broken = True
             raise AgentEndedError(f"no readable answer: {error}") from None
-        if answer is None:
-            self.broken = True
-            with suppress(TimeoutError):
-                await asyncio.wait_for(_wait_for_end(self._process), GRACE_S)
-            if self._process.returncode is None:
-                raise AgentEndedError("it closed its standard output and still runs")
-            raise AgentExitedError(f"it ended with status {self._process.returncode}: {last_line(self._errors)}")
         if not isinstance(answer, dict):
             self.broken = True
             raise AgentEndedError("its answer is not a JSON object")
@@ -141,36 +69,23 @@ class VirtualProgram:
             raise AgentEndedError(f"it answers with an error: {answer['error']}")
         return answer
 
+    def _end_error(self, error: ProgramFailedError) -> AgentEndedError:
+        if error.outcome == "hung":
+            return AgentHangsError(f"it hangs: it {error} to line {self._lines} of its process")
+        if self._program.runs:
+            return AgentEndedError(f"it {error}")
+        return AgentExitedError(f"it {error}: {self._program.last_line() or SILENT}")
+
     async def finish(self) -> str:
         """Close the input of the process, and return a phrase about its end. The phrase is "status 0" if the agent
         follows the contract.
         """
-        self._input.close()
-        with suppress(TimeoutError):
-            await asyncio.wait_for(_wait_for_end(self._process), ANSWER_LIMIT_S)
-        status = self._process.returncode
+        status = await asyncio.to_thread(self._program.finish, ANSWER_LIMIT_S)
         return f"it still runs after {ANSWER_LIMIT_S:g} s" if status is None else f"status {status}"
 
-    async def close(self) -> None:
+    def close(self) -> None:
         """End the process and all processes that it started, even if they hold its pipes open."""
-        if not self._input.is_closing():
-            self._input.transport.abort()
-        self._reading.close()
-        await _end(self._process, self._processes)
-
-
-async def _end(process: subprocess.Popen[bytes], processes: ChildProcesses) -> None:
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    for pipe in filter(None, (process.stdin, process.stdout)):
-        pipe.close()
-    await _wait_for_end(process)
-    processes.end()
-
-
-async def _wait_for_end(process: subprocess.Popen[bytes]) -> None:
-    while process.poll() is None:
-        await asyncio.sleep(POLL_S)
+        self._program.close()
 
 
 class VirtualTimeAgent(AgentUnderTest):
@@ -193,7 +108,7 @@ class VirtualTimeAgent(AgentUnderTest):
     ) -> "VirtualTimeAgent":
         agent = cls(variant, program, idle)
         try:
-            await program.ask({"t": 0.0, "mission": virtual_mission(variant), "trace": False}, START_LIMIT_S)
+            await program.ask({"t": 0.0, "mission": virtual_mission(variant), "trace": False})
         except BaseException:
             await agent.close()
             raise
@@ -209,7 +124,7 @@ class VirtualTimeAgent(AgentUnderTest):
 
     async def close(self) -> None:
         if self._program.broken or self._idle is None:
-            await self._program.close()
+            self._program.close()
         else:
             self._idle.append(self._program)
 
@@ -287,8 +202,8 @@ def starter(command: Sequence[str], errors: Path) -> tuple[Start, list[VirtualPr
 
     async def start(variant: SettingsVariant, alone: bool) -> AgentUnderTest:
         if alone:  # an earlier incarnation of the process may be the cause of a failure
-            return await VirtualTimeAgent.start(variant, await VirtualProgram.start(command, errors), None)
-        program = idle.pop() if idle else await VirtualProgram.start(command, errors)
+            return await VirtualTimeAgent.start(variant, VirtualProgram(command, errors), None)
+        program = idle.pop() if idle else VirtualProgram(command, errors)
         return await VirtualTimeAgent.start(variant, program, idle)
 
     return start, idle

@@ -91,7 +91,7 @@ async def _run(
                 results.cases.append(await virtual.case_of_end(programs))
         finally:
             for program in programs:
-                await program.close()
+                program.close()
         return
     async with UdpLab(place, request.command, MAX_WORKERS + RETRY_WORKERS) as lab:
         start = _udp_agent.starter(lab)

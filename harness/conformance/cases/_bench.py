@@ -141,7 +141,7 @@ class BenchAgent:
     async def end(self) -> int:
         """Wait until the process ends, and return its exit status. Raises WrongBehaviourError if it does not end."""
         try:
-            return await asyncio.wait_for(self.process.process.wait(), PATIENCE_S * 2)
+            return await asyncio.wait_for(self.process.program.process.wait(), PATIENCE_S * 2)
         except TimeoutError:
             raise WrongBehaviourError("the agent ends", "it runs on") from None
 
@@ -173,7 +173,7 @@ class CaseBench:
             try:
                 yield alone
             except WrongBehaviourError:
-                if not alone.process.signalled and alone.process.process.returncode is None:
+                if not alone.process.signalled and alone.process.program.process.returncode is None:
                     await alone.process.check_answers()
                 raise
 
@@ -205,7 +205,7 @@ class CaseBench:
                 try:
                     yield BenchAgent(process, peer_socket)
                 finally:
-                    await process.kill()
+                    await process.program.kill()
             finally:
                 peer_socket.close()
         finally:

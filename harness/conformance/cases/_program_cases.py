@@ -13,7 +13,7 @@ from typing import Any
 from harness.conformance._agent_under_test import NO_KEYS
 from harness.conformance._reference_model import PEERS
 from harness.conformance._state_space import VARIANTS
-from harness.conformance._udp_lab import last_line
+from harness.conformance._udp_lab import SILENT
 from harness.conformance.cases._bench import (
     INCEPTION,
     PATIENCE_S,
@@ -143,7 +143,7 @@ async def _sigterm_early(bench: CaseBench) -> None:
 
 async def _processes(agent: BenchAgent) -> list[int]:
     """Return the process IDs of the agent. Raises CannotJudgeError if they are not visible."""
-    pids = await asyncio.to_thread(agent.process.processes.pids)
+    pids = await asyncio.to_thread(agent.process.program.children.pids)
     if not pids:
         raise CannotJudgeError("the processes of the agent are not visible here")
     return pids
@@ -166,7 +166,7 @@ async def _children(bench: CaseBench) -> None:
         await _processes(agent)
         await agent.process.send_signal(signal.SIGTERM)
         await agent.end()
-        left = await asyncio.to_thread(agent.process.processes.end_left_behind)
+        left = await agent.process.program.end_children()
         require(not left, "no process that runs after the end of the agent", ", ".join(left))
 
 
@@ -195,9 +195,7 @@ async def _ends_with(
     async with bench.program(keys, text=text) as agent:
         returned = await agent.end()
         require(returned == status, f"exit status {status} for {what}", f"status {returned}")
-        require(
-            last_line(agent.process.output) != "it said nothing", f"a sentence on standard error for {what}", "none"
-        )
+        require(agent.process.last_line != SILENT, f"a sentence on standard error for {what}", "none")
 
 
 _BROKEN: dict[str, bytes] = {

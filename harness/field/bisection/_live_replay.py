@@ -19,6 +19,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,12 @@ from harness.checker.recorded_inputs import decoded
 from harness.errors import FieldError, HarnessError, MachineError
 from harness.field.bisection.outcome import RecordDifference
 from harness.field.replay import RecordedTrace
-from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
+from harness.play.agent_control import AgentRefusedError, AgentSilentError
 from harness.play.process.agent_mission import mission_file
+from harness.play.process.controlled_program import STOP_GRACE_S, ControlledProgram, ProgramEndedError
 from harness.scenario import Scenario
 from netem.errors import LabUnavailable, NetemError
-from netem.lab import Lab, LabProcess
+from netem.lab import Lab
 from ucp.block import MAX_AGENT_ID
 from ucp.clock import MICROSECONDS
 from ucp.messages import (
@@ -51,7 +53,6 @@ from ucp.messages import (
 from ucp.trace import DroppedDatagram, HandlerRun, RecordedBytes, in_base64
 from ucp.trigger import LocalTrigger, MessageTrigger, OperatorTrigger
 
-START_LIMIT_S, ANSWER_LIMIT_S, GRACE_S = 30.0, 10.0, 5.0
 START_DELAY_S = 2.0
 """Time until mission second 0. The node of the peers has started by then."""
 SLACK_S, SLACK_WALL_S = 1.0, 0.15
@@ -248,22 +249,18 @@ class _AgentProgramReplay:
             directory = self._place / "agent"
             directory.mkdir()
             (directory / f"{agent_id}.mission.json").write_text(json.dumps(self._mission(lab)))
-            log = directory / f"{agent_id}.out"
-            agent = await lab.spawn(
-                agent_id,
+            agent = await ControlledProgram.start(
+                partial(lab.spawn, agent_id, role="agent"),
                 [*self._command, f"{agent_id}.mission.json"],
-                cwd=directory,
-                env=dict(os.environ),
-                stdout=log,
-                stderr=log,
+                directory=directory,
+                control=directory / f"{agent_id}.control",
+                log=directory / f"{agent_id}.out",
             )
-            control = AgentControl(directory / f"{agent_id}.control")
             try:
-                await self._wait_until_it_answers(control, agent, log)
-                return await self._run_mission(lab, control, agent, log)
+                await _wait_until_it_answers(agent)
+                return await self._run_mission(lab, agent)
             finally:
-                control.close()
-                await agent.terminate(GRACE_S)
+                await agent.stop()
 
     def _mission(self, lab: Lab) -> dict[str, Any]:
         header = self._record.header
@@ -281,22 +278,7 @@ class _AgentProgramReplay:
         )
         return {**mission, "events": {**mission["events"], "source": "none"}}
 
-    async def _wait_until_it_answers(self, control: AgentControl, agent: LabProcess, log: Path) -> None:
-        deadline = time.monotonic() + START_LIMIT_S
-        while True:
-            try:
-                await control.ask("status", timeout_s=ANSWER_LIMIT_S)
-                return
-            except AgentSilentError:
-                if agent.returncode is not None:
-                    raise NotStartedError(f"the agent ended with {agent.end}: {_last_line(log)}") from None
-                if time.monotonic() > deadline:
-                    raise NotStartedError(f"the agent did not answer within {START_LIMIT_S:g} s") from None
-                await asyncio.sleep(0.02)
-
-    async def _run_mission(
-        self, lab: Lab, control: AgentControl, agent: LabProcess, log: Path
-    ) -> list[tuple[float, Message]]:
+    async def _run_mission(self, lab: Lab, agent: ControlledProgram) -> list[tuple[float, Message]]:
         epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
         script, received = self._place / "script.jsonl", self._place / "heard.jsonl"
         lines = [given.to_json() for given in self._script.datagrams]
@@ -319,32 +301,46 @@ class _AgentProgramReplay:
             stdout=self._place / "peers.log",
             stderr=self._place / "peers.log",
         )
-        await self._ask(control, "start", epoch_us=epoch_us)
-        commanding = asyncio.create_task(self._command_reconciles(control, epoch_us))
-        ending = asyncio.create_task(agent.wait())
+        await _ask(agent, "start", epoch_us=epoch_us)
+        commanding = asyncio.create_task(self._command_reconciles(agent, epoch_us))
+        ending = asyncio.create_task(agent.process.wait())
         over_s = self._script.ends_s + SLACK_S + SLACK_WALL_S * self._speedup
         done, _ = await asyncio.wait({ending}, timeout=self._wall_s(epoch_us, over_s))
         commanding.cancel()
-        await peers.terminate(GRACE_S)
+        await peers.terminate(STOP_GRACE_S)
         if done:
-            raise ReplayFailedError(f"the agent ended by itself with {agent.end}: {_last_line(log)}")
+            raise ReplayFailedError(_end_text(agent, agent.ended()))
         ending.cancel()
         return _received(received, self._record.agent_id)
 
-    async def _command_reconciles(self, control: AgentControl, epoch_us: int) -> None:
+    async def _command_reconciles(self, agent: ControlledProgram, epoch_us: int) -> None:
         for t in self._script.reconciles:
             await asyncio.sleep(self._wall_s(epoch_us, t))
-            await self._ask(control, "reconcile")
-
-    async def _ask(self, control: AgentControl, command: str, **arguments: Any) -> None:
-        try:
-            await control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
-        except (AgentSilentError, AgentRefusedError) as error:
-            raise ReplayFailedError(f"the agent does not {command}: {error}") from None
+            await _ask(agent, "reconcile")
 
     def _wall_s(self, epoch_us: int, mission_s: float) -> float:
         """Return the number of seconds of wall time from now until a mission second."""
         return max(0.0, epoch_us / MICROSECONDS + mission_s / self._speedup - time.time())
+
+
+async def _wait_until_it_answers(agent: ControlledProgram) -> None:
+    try:
+        await agent.ready()
+    except ProgramEndedError as error:
+        raise NotStartedError(_end_text(agent, error)) from None
+    except AgentSilentError as error:
+        raise NotStartedError(f"the agent {error}") from None
+
+
+async def _ask(agent: ControlledProgram, command: str, **arguments: Any) -> None:
+    try:
+        await agent.ask(command, **arguments)
+    except (AgentSilentError, AgentRefusedError) as error:
+        raise ReplayFailedError(f"the agent does not {command}: {error}") from None
+
+
+def _end_text(agent: ControlledProgram, error: ProgramEndedError) -> str:
+    return f"the agent {error}: {agent.last_line or 'it said nothing'}"
 
 
 def _received(path: Path, agent_id: int) -> list[tuple[float, Message]]:
@@ -358,11 +354,6 @@ def _received(path: Path, agent_id: int) -> list[tuple[float, Message]]:
         if datagram.sender == agent_id and not isinstance(datagram.message, BlockAddRequest):
             received.append((float(line["t"]), datagram.message))
     return received
-
-
-def _last_line(log: Path) -> str:
-    lines = log.read_text(encoding="utf-8", errors="replace").split("\n") if log.exists() else []
-    return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "it said nothing")
 
 
 def _compare(

@@ -13,7 +13,8 @@ import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,32 +26,23 @@ from harness.archive.traces import HANDLER_RUN, read_trace
 from harness.errors import AgentFailedError, HarnessError, MachineError, ScenarioError, UnsupportedError
 from harness.play._vehicle_keys import KeyDirectories
 from harness.play.agent_control import (
-    AgentControl,
     AgentRefusedError,
     AgentSilentError,
     AgentStatus,
     AgentUnsupportedError,
     is_shell_error,
     last_line,
-    last_line_in,
     resolve_command,
 )
-from harness.play.child_processes import ChildProcesses
-from harness.play.process._run_lab import LabProgram, MissionLab
+from harness.play.process._run_lab import MissionLab
 from harness.play.process.agent_mission import mission_file
+from harness.play.process.controlled_program import ControlledProgram, ProgramEndedError
 from harness.play.trace_space import trace_quota
 from harness.play.variant import variant_in_use
 from harness.scenario import Scenario
 from netem.errors import SpawnError
 from ucp.features import UNSUPPORTED
 from ucp.trace import HandlerRun
-
-START_LIMIT_S = 30.0
-ANSWER_LIMIT_S = 10.0
-"""Wall time after which an agent that does not answer counts as hung."""
-STOP_GRACE_S = 5.0
-RETRY_S = 0.02
-END_LIMIT_S = 0.5
 
 
 def agent_command(scenario: Scenario, agent_id: int) -> list[str]:
@@ -74,7 +66,6 @@ class _ProcessIncarnation:
     directory: Path
     store: Path
     """File in which the agent stores its state, if it has a disk."""
-    processes: ChildProcesses = field(default_factory=ChildProcesses)
     status: AgentStatus | None = None
     """The last status that the agent reported."""
     status_between_s: tuple[float, float] = (0.0, 0.0)
@@ -115,7 +106,7 @@ class AgentProcess:
         self.detail: str | None = None
         self._rundir = rundir
         self._incarnations: list[_ProcessIncarnation] = []
-        self._process: LabProgram | None = None
+        self._program: ControlledProgram | None = None
         self._control_lock = asyncio.Lock()
         """Held while the agent answers a status request, so that no fault ends or pauses it meanwhile."""
         self._completed_before: list[str] = []
@@ -173,24 +164,26 @@ class AgentProcess:
             bundle=None if bundle is None else str(bundle),
         )
         path = self._rundir.write_mission(incarnation.directory, self.agent_id, mission)
-        output = self._log
-        self._control = AgentControl(self._control_path)
         try:
-            self._process = await lab.spawn(
-                self.agent_id,
+            self._program = await ControlledProgram.start(
+                partial(lab.spawn, self.agent_id, role="agent"),
                 [*self._command, path.name],
-                cwd=incarnation.directory,
-                env=incarnation.processes.environment(os.environ),
-                stdout=output,
-                stderr=output,
-                role="agent",
+                directory=incarnation.directory,
+                control=self._control_path,
+                log=self._log,
                 max_file_bytes=trace_quota(scenario, self._rundir.path),
             )
         except SpawnError as error:
             if scenario.command_of(self.agent_id) is None:
                 raise
             raise ScenarioError(f"`agent_command` of agent {self.agent_id}: {error}") from None
-        await self._wait_for_first_status(self._process)
+        requested_s = self._now()
+        try:
+            self._accept_status(await self._program.ready(), requested_s)
+        except ProgramEndedError:
+            raise self._end_error() from None
+        except AgentSilentError as error:
+            raise self._failure("hung", str(error)) from None
         self.outcome = "running"
 
     def _begin_incarnation(self) -> _ProcessIncarnation:
@@ -200,41 +193,28 @@ class AgentProcess:
         self._incarnations.append(_ProcessIncarnation(directory, store, reboot=kept))
         return self._incarnations[-1]
 
-    async def _wait_for_first_status(self, process: LabProgram) -> None:
-        deadline = asyncio.get_running_loop().time() + START_LIMIT_S
-        while True:
-            try:
-                requested_s = self._now()
-                self._accept_status(await self._control.ask("status", timeout_s=ANSWER_LIMIT_S), requested_s)
-                return
-            except AgentSilentError:
-                if process.returncode is not None:
-                    raise self._end_error(process) from None
-                if asyncio.get_running_loop().time() > deadline:
-                    raise self._failure("hung", f"did not answer within {START_LIMIT_S:g} s of its start") from None
-                await asyncio.sleep(RETRY_S)
+    @property
+    def _started(self) -> ControlledProgram:
+        assert self._program is not None, "`start` comes first"
+        return self._program
 
     async def watch(self) -> None:
         """Wait for the process to end without a request, then raise AgentFailedError or UnsupportedError."""
-        assert self._process is not None
-        await self._process.wait()
-        raise self._end_error(self._process)
+        await self._started.process.wait()
+        raise self._end_error()
 
     async def kill(self, *, disk_kept: bool = False) -> None:
         """Kill the process with SIGKILL. If `disk_kept` is true, the next start uses the data on the agent's disk.
 
         Cancel `watch` first. Raises AgentFailedError if the agent has already failed.
         """
-        assert self._process is not None
         async with self._control_lock:
             if self.awake:
                 await self._ask_status()  # the counters are lost with the process
-            self._control.close()
             self.outcome = "rebooting" if disk_kept else "killed"
             self._incarnations[-1].killed = not disk_kept
-            await self._process.send_signal(signal.SIGKILL)
-            await self._process.wait()
-            await self._end_children()
+            await self._started.kill()
+            await self._started.end_children()
             self._control_path.unlink(missing_ok=True)
 
     async def switch_off(self) -> None:
@@ -243,30 +223,26 @@ class AgentProcess:
 
         Raises AgentFailedError if the agent ends with an error, or not at all.
         """
-        assert self._process is not None
         async with self._control_lock:
             if self.awake:
                 await self._ask_status()
-            at_s = self._now()
-            self._control.close()
-            status = await self._process.terminate(STOP_GRACE_S)
+            at_s, program = self._now(), self._started
+            status = await program.stop()
             self._incarnations[-1].switched_off = True
-            self._left_behind += await self._end_children()
+            self._left_behind += await program.end_children()
             if status != 0:
-                raise self._failure("not exported", f"was switched off (SIGTERM) and ended with {self._process.end}")
+                raise self._failure("not exported", f"was switched off (SIGTERM) and ended with {program.process.end}")
             self.outcome, self.detail = "exported", f"switched off at {at_s:.1f} s"
             self._rundir.copy_export(self.agent_id, self._incarnations[-1].directory)
 
     async def pause(self) -> None:
         """Suspend the process. Messages wait in its socket buffer, and are lost when the buffer is full."""
-        assert self._process is not None
         async with self._control_lock:
-            await self._process.pause()
+            await self._started.process.pause()
             self.outcome = "paused"
 
     async def resume(self) -> None:
-        assert self._process is not None
-        await self._process.resume()
+        await self._started.process.resume()
         self.outcome = "running"
 
     # Commands
@@ -278,23 +254,15 @@ class AgentProcess:
         UnsupportedError if it does not support the command.
         """
         try:
-            return await self._control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
+            return await self._started.ask(command, **arguments)
         except AgentUnsupportedError as error:
             raise self._unsupported_error(f"refused the command {command}: {last_line(str(error))}") from None
         except AgentRefusedError as error:
             raise AgentRefusedError(f"agent {self.agent_id} refused to {command}: {error}") from None
+        except ProgramEndedError:
+            raise self._end_error() from None
         except AgentSilentError as error:
-            if self._process is not None and await self._has_ended(self._process):
-                raise self._end_error(self._process) from None
             raise self._failure("hung", f"stopped answering: {error}") from None
-
-    async def _has_ended(self, process: LabProgram) -> bool:
-        """Return true if the process has ended. Wait for a moment first, because its connection can end before the
-        process.
-        """
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(process.wait(), END_LIMIT_S)
-        return process.returncode is not None
 
     async def poll(self) -> AgentStatus | None:
         """Request the status of the agent. Return None if the agent is dead or paused. Raises the errors of `ask`."""
@@ -360,21 +328,12 @@ class AgentProcess:
     # End of the run
 
     async def stop(self) -> None:
-        if self._process is None:
+        if self._program is None:
             return
-        self._control.close()
-        if self._process.returncode is None:
-            if self.outcome == "hung":
-                await self._process.send_signal(signal.SIGKILL)
-                await self._process.wait()
-            else:
-                await self._process.terminate(STOP_GRACE_S)
-        left = await self._end_children()
-        if self._process.returncode != -signal.SIGKILL:  # no agent ends its children after SIGKILL
+        await (self._program.kill() if self.outcome == "hung" else self._program.stop())
+        left = await self._program.end_children()
+        if self._program.process.returncode != -signal.SIGKILL:  # no agent ends its children after SIGKILL
             self._left_behind += left
-
-    async def _end_children(self) -> list[str]:
-        return await asyncio.to_thread(self._incarnations[-1].processes.end_left_behind)
 
     def collect_files(self) -> None:
         """Write the files that the checker reads: one trace, joined from all starts of the agent, and a copy of its
@@ -428,18 +387,18 @@ class AgentProcess:
     def _log(self) -> Path:
         return self._incarnations[-1].directory / f"{self.agent_id}.log"
 
-    def _end_error(self, process: LabProgram) -> HarnessError:
+    def _end_error(self) -> HarnessError:
         """Return the error for an agent whose process ended without a request.
 
         Exit status 127 before the start of the mission means that the agent lacks a feature of the mission. A shell
         also ends with 127, if it does not find a program.
         """
-        status = self._incarnations[-1].status
-        words = last_line_in(self._log)
-        if process.returncode != UNSUPPORTED or (status is not None and status.started):
-            return self._failure("crashed", f"ended by itself with {process.end}")
+        status, program = self._incarnations[-1].status, self._started
+        words, end = program.last_line, str(program.ended())
+        if program.process.returncode != UNSUPPORTED or (status is not None and status.started):
+            return self._failure("crashed", end)
         if is_shell_error(words):
-            return self._failure("crashed", f"ended by itself with {process.end} ({words})")
+            return self._failure("crashed", f"{end} ({words})")
         return self._unsupported_error(words)
 
     def _unsupported_error(self, words: str) -> UnsupportedError:

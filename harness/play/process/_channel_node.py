@@ -81,6 +81,7 @@ class ChannelNode:
         self._loop = Loop(selector=selectors.SelectSelector())
         self._journal = journal.open("a", encoding="utf-8")
         commands: dict[str, Command] = {
+            "status": dict,
             "start": self._start,
             "move": self._move,
             "apply": self._apply,

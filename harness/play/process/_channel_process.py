@@ -7,28 +7,25 @@ run ends.
 import asyncio
 import dataclasses
 import json
-import os
 import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from harness.archive.channel_journal import CHANNEL_FILE
 from harness.archive.directory import RunDirectory
 from harness.errors import MachineError
-from harness.play.agent_control import AgentControl, AgentRefusedError, AgentSilentError
-from harness.play.child_processes import passed_on
+from harness.play.agent_control import AgentRefusedError, AgentSilentError
 from harness.play.process._channel_node import CONTROL, VALUE
+from harness.play.process.controlled_program import ControlledProgram
 from harness.scenario import Scenario
 from netem.conditions import NetworkConditions
-from netem.lab import Lab, LabProcess
+from netem.lab import Lab
 from netem.radio import Place
 from ucp.messages import PORT
 
-START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 30.0
-STOP_GRACE_S = 5.0
-ASK_AGAIN_S = 0.02
 LOG = "channel.log"
 
 
@@ -41,8 +38,7 @@ class ChannelProcess:
         self._scenario = scenario
         self._seed = seed
         self._rundir = rundir
-        self._control = AgentControl(rundir.path / CONTROL)
-        self._process: LabProcess | None = None
+        self._program: ControlledProgram | None = None
         self._conditions = NetworkConditions()
         self._begun = False
         self._asking = asyncio.Lock()
@@ -50,24 +46,19 @@ class ChannelProcess:
 
     async def start(self, lab: Lab) -> None:
         """Start the process and wait until it listens. Raises MachineError."""
-        log = self._rundir.path / LOG
-        self._process = await lab.spawn(
-            None,
+        place = self._rundir.path
+        self._program = await ControlledProgram.start(
+            partial(lab.spawn, None, role="channel"),
             [sys.executable, "-P", "-m", "harness.play.process._channel_node", CHANNEL_FILE, str(PORT)],
-            cwd=self._rundir.path,
-            env=passed_on(os.environ),
-            stdout=log,
-            stderr=log,
-            role="channel",
+            directory=place,
+            control=place / CONTROL,
+            log=place / LOG,
+            answer_limit_s=ANSWER_LIMIT_S,
         )
-        control = self._rundir.path / CONTROL
-        deadline = asyncio.get_running_loop().time() + START_LIMIT_S
-        while not control.exists():
-            if self._process.returncode is not None:
-                raise self._ended(self._process)
-            if asyncio.get_running_loop().time() > deadline:
-                raise self._failed(f"was not ready within {START_LIMIT_S:g} s")
-            await asyncio.sleep(ASK_AGAIN_S)
+        try:
+            await self._program.ready()
+        except AgentSilentError as error:
+            raise self._failed(str(error)) from None
 
     async def begin(self, epoch_us: int, places: Mapping[int, Place]) -> None:
         """Start to deliver the broadcasts of all vehicles, in place of the switch. Mission second 0 is `epoch_us`."""
@@ -122,15 +113,15 @@ class ChannelProcess:
 
     async def watch(self) -> None:
         """Wait for the process to end without a request, then raise MachineError."""
-        assert self._process is not None, "it is watched after its start"
-        await self._process.wait()
-        raise self._ended(self._process)
+        try:
+            await self._started.watch()
+        except AgentSilentError as error:
+            raise self._failed(str(error)) from None
 
     async def stop(self) -> None:
         """End the process."""
-        self._control.close()
-        if self._process is not None and self._process.returncode is None:
-            await self._process.terminate(STOP_GRACE_S)
+        if self._program is not None:
+            await self._program.stop()
 
     @property
     def _value(self) -> Path:
@@ -138,12 +129,14 @@ class ChannelProcess:
 
     async def _ask(self, command: str, **arguments: Any) -> None:
         try:
-            await self._control.ask(command, timeout_s=ANSWER_LIMIT_S, **arguments)
+            await self._started.ask(command, **arguments)
         except (AgentSilentError, AgentRefusedError) as error:
             raise self._failed(f"cannot {command}: {error}") from None
 
-    def _ended(self, process: LabProcess) -> MachineError:
-        return self._failed(f"ended by itself with {process.end}")
+    @property
+    def _started(self) -> ControlledProgram:
+        assert self._program is not None, "`start` comes first"
+        return self._program
 
     def _failed(self, detail: str) -> MachineError:
         return MachineError(f"the process of the shared channel {detail}; its log is {LOG}")

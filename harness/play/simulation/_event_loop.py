@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from harness.play.simulation._secured_agents import SimulatedKeys
     from harness.play.simulation._simulated_rogue import VirtualRogue
     from harness.play.simulation.foreign._foreign_swarm import ForeignSwarm
-    from harness.play.simulation.foreign._virtual_program import ProgramPool
+    from harness.play.simulation.foreign._program_pool import ProgramPool
     from ucp.secure.bundle import PublicKeys
     from ucp.secure.crypto_suite import UnverifiedSignature
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from harness.play._pace import VirtualTimePace
     from harness.play.simulation.foreign._answer import AgentLacksError
     from harness.play.simulation.foreign._foreign_agent import IncarnationRecord
-    from harness.play.simulation.foreign._virtual_program import ProgramPool
+    from harness.play.simulation.foreign._program_pool import ProgramPool
 
 ENGINE = "virtual time"
 PROGRESS_S = 20.0

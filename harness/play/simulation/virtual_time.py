@@ -23,7 +23,7 @@ from harness.scenario.faults import VehicleFault
 if TYPE_CHECKING:
     from harness.play.simulation._captured_air import VirtualCapture
     from harness.play.simulation._station_tracks import StationTracks
-    from harness.play.simulation.foreign._virtual_program import ProgramPool
+    from harness.play.simulation.foreign._program_pool import ProgramPool
 
 
 class SimulationBackend(Backend):
@@ -173,7 +173,7 @@ def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["ProgramPool
     if not scenario.foreign:
         yield None
         return
-    from harness.play.simulation.foreign._virtual_program import ProgramPool
+    from harness.play.simulation.foreign._program_pool import ProgramPool
 
     with closing(ProgramPool(rundir.agents)) as programs:
         yield programs

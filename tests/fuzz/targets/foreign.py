@@ -12,8 +12,8 @@ from unittest.mock import patch
 
 from harness import checker
 from harness.errors import HarnessError
-from harness.play.simulation.foreign import _foreign_swarm, _virtual_program, determinism
-from harness.play.simulation.foreign._virtual_program import LineProgram
+from harness.play.simulation.foreign import _foreign_swarm, _program_pool, determinism
+from harness.play.simulation.foreign.line_program import LineProgram
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from tests.fuzz.finding import require, sound
@@ -88,8 +88,8 @@ def _play(replaced: dict[int, bytes]) -> list[bytes]:
     """Play the scenario with some answers replaced. Return the original answers."""
     ours = type("Replaced", (_OwnAgentProgram,), {"answers": [], "replaced": replaced})
     with (
-        patch.object(_virtual_program, "LineProgram", ours),
-        patch.object(_foreign_swarm, "SHARED", _virtual_program.ProgramPool()),
+        patch.object(_program_pool, "LineProgram", ours),
+        patch.object(_foreign_swarm, "SHARED", _program_pool.ProgramPool()),
     ):
         try:
             played = simulate(SCENARIO, 1, tracing=True)

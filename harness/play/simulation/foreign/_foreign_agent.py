@@ -26,7 +26,7 @@ from harness.play.simulation.foreign._answer import (
     RefusedError,
     read_answer,
 )
-from harness.play.simulation.foreign._virtual_program import LineProgram, ProgramFailedError
+from harness.play.simulation.foreign.line_program import LineProgram, ProgramFailedError
 from ucp.events import LoggableEvent
 from ucp.messages import Datagram, Message
 from ucp.settings import Settings

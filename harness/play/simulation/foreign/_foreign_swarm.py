@@ -10,7 +10,8 @@ from harness.play.process._agent_process import agent_command, reboots_with_disk
 from harness.play.process.agent_mission import mission_file
 from harness.play.simulation._simulated_agent import DiskContents, VirtualAgent
 from harness.play.simulation.foreign._foreign_agent import ForeignAgent, IncarnationRecord
-from harness.play.simulation.foreign._virtual_program import SHARED, LineProgram, ProgramPool
+from harness.play.simulation.foreign._program_pool import SHARED, ProgramPool
+from harness.play.simulation.foreign.line_program import LineProgram
 from harness.scenario import Scenario
 from netem import addresses
 

@@ -15,7 +15,7 @@ from typing import Any
 from harness.errors import VIOLATED, HarnessError
 from harness.play.simulation.foreign._answer import shown
 from harness.play.simulation.foreign._foreign_agent import IncarnationRecord
-from harness.play.simulation.foreign._virtual_program import LineProgram, ProgramFailedError
+from harness.play.simulation.foreign.line_program import LineProgram, ProgramFailedError
 
 OF_ITSELF = "it may read a clock, draw random numbers, or depend on the order of a hash table"
 OF_BEFORE = "it may keep state of an earlier incarnation in the same process"

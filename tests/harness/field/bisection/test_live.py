@@ -54,7 +54,7 @@ def test_only_a_correct_agent_agrees_with_the_record(records: Path, tmp_path: Pa
     none = harness("bisect", "--once", records, *options, "no-such-agent")
     assert none.returncode == 125
     ending = harness("bisect", "--once", records, *options, f"{PYTHON} -c 'raise SystemExit(3)'")
-    assert ending.returncode == 125 and "the agent ended with status 3" in ending.stderr
+    assert ending.returncode == 125 and "the agent ended by itself with status 3" in ending.stderr
 
 
 def test_script_answers_a_query_after_the_agent_sends_it(records: Path) -> None:

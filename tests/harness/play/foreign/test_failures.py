@@ -9,7 +9,7 @@ import pytest
 
 from harness.errors import HarnessError, UnsupportedError
 from harness.play.progress import SilentProgress
-from harness.play.simulation.foreign import _foreign_agent, _virtual_program
+from harness.play.simulation.foreign import _foreign_agent, line_program
 from harness.run.run import Run, run
 from harness.run.simulate import simulate
 from tests.harness.play.foreign.agents import EXPORT, living, played_by, small
@@ -22,7 +22,7 @@ EVENT = "if 'event_id' in given:\n    "
 
 @pytest.fixture(autouse=True)
 def narrow_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_virtual_program, "MAX_ANSWER_BYTES", 1 << 20)
+    monkeypatch.setattr(line_program, "MAX_ANSWER_BYTES", 1 << 20)
     monkeypatch.setattr(_foreign_agent, "MAX_TIMERS_PER_S", 50)
 
 
@@ -97,7 +97,7 @@ def test_error_of_an_agent_is_one_sentence_in_the_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, outcome: str, sentence: str
 ) -> None:
     if "sleep" in code:
-        monkeypatch.setattr(_virtual_program, "ANSWER_LIMIT_S", 1.0)
+        monkeypatch.setattr(line_program, "ANSWER_LIMIT_S", 1.0)
     finished = run_with(tmp_path, "import os, time\n" + code)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (sentence in record["outcome_detail"]) and "agent 2" in record["outcome_detail"], record["outcome_detail"]

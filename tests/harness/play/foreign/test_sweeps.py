@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from harness.errors import HarnessError
-from harness.play.simulation.foreign._virtual_program import ProgramPool
+from harness.play.simulation.foreign._program_pool import ProgramPool
 from harness.run.simulate import simulate
 from harness.sweep.matrix._cell_play import RunPlayer
 from harness.sweep.matrix._matrix_file import Matrix

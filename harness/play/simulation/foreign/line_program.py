@@ -1,14 +1,10 @@
-"""Run a program that plays agents in virtual time, and keep a pool of such programs for reuse.
+"""Drive a program that plays agents in virtual time.
 
 The harness writes one line to the program's standard input and reads one line as its answer, as the contract describes
 for `--virtual`. The program has a few seconds of wall time for each answer. It does not receive Ctrl-C. It ends when
 the thread that started it ends.
-
-Starting a program takes longer than playing a short mission, so a pool keeps them for the next mission. Each process
-of the harness has a pool of its own. A forked child starts with an empty pool.
 """
 
-import atexit
 import os
 import select
 import signal
@@ -19,7 +15,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from ctypes import CDLL
 from pathlib import Path
-from threading import Lock
 from typing import IO
 
 from harness.archive.exports import MAX_EXPORT_BYTES
@@ -199,21 +194,36 @@ class LineProgram:
             self._errors.seek(0)
             self._errors.truncate()
 
+    def exchange(self, line: bytes) -> bytes:
+        """Write a line to the program, and return its answer. Raises ProgramFailedError."""
+        self.write(line)
+        return self.read()
+
     def close_input(self) -> None:
         """Close the standard input of the program. The program then ends."""
         with suppress(OSError):
             assert self._process.stdin is not None
             self._process.stdin.close()
 
+    def finish(self, within_s: float) -> int | None:
+        """Close the standard input of the program, and return its exit status. Return None if the program still runs
+        after `within_s` seconds.
+        """
+        self.close_input()
+        with suppress(subprocess.TimeoutExpired):
+            return self._process.wait(within_s)
+        return None
+
+    def kill(self) -> None:
+        """Kill the program with SIGKILL, and the other processes of its process group, such as those of a script."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
     def end(self, within_s: float = 0.0) -> None:
         """End the program and its child processes. After `within_s` seconds, kill them with SIGKILL."""
-        self.close_input()
-        try:
-            self._process.wait(within_s)
-        except subprocess.TimeoutExpired:
-            with suppress(ProcessLookupError):
-                os.killpg(self._process.pid, signal.SIGKILL)  # the process group includes the children of a script
-            self._process.wait()
+        if self.finish(within_s) is None:
+            self.kill()
             self._processes.end_left_behind()
         else:
             self.left_behind = self._processes.end_left_behind()
@@ -246,82 +256,3 @@ def _die_with_parent() -> None:
 def _shown(output: bytes) -> str:
     text = output.split(b"\n")[0].decode(errors="replace")
     return repr(text[:60] + ("..." if len(text) > 60 else ""))
-
-
-MAX_IDLE = 128
-"""Maximum number of idle programs. A further one ends the program that has been idle for the longest time."""
-GRACE_S = 1.0
-
-
-class ProgramPool:
-    """A pool of idle programs for reuse.
-
-    Standard error of a program goes to a file for each agent in the directory `logs`. With None, only error messages
-    use it.
-    """
-
-    def __init__(self, logs: Path | None = None) -> None:
-        self._logs = logs
-        self._idle: list[LineProgram] = []
-        """Idle programs, the longest idle one first."""
-        self._taken: set[LineProgram] = set()
-        self._lock = Lock()
-
-    def take(self, command: Sequence[str], agent_id: int) -> LineProgram:
-        """Return an idle or a new program, which the caller must give back. Raises OSError if a new program cannot be
-        started.
-        """
-        log = self._logs / f"{agent_id}.log" if self._logs is not None else None
-        with self._lock:
-            program = self._idle_program(tuple(command), log) or LineProgram(command, log)
-            self._taken.add(program)
-        return program
-
-    def _idle_program(self, command: tuple[str, ...], log: Path | None) -> LineProgram | None:
-        for program in reversed(self._idle):
-            if (program.command, program.log) == (command, log):
-                self._idle.remove(program)
-                if program.runs:
-                    return program
-                program.close()
-                return self._idle_program(command, log)
-        return None
-
-    def give_back(self, program: LineProgram) -> None:
-        """Return the program to the pool. If it has not answered its last input, end it instead."""
-        with self._lock:
-            self._taken.discard(program)
-            if program.owes_an_answer:
-                program.close()
-                return
-            program.clear_output()
-            self._idle.append(program)
-            if len(self._idle) > MAX_IDLE:
-                self._idle.pop(0).close()
-
-    def close(self) -> dict[int, list[str]]:
-        """End all programs. Return, by agent, the names of processes that a program with a log left behind."""
-        programs = [*self._taken, *self._idle]
-        self._taken.clear()
-        self._idle.clear()
-        for program in programs:
-            program.close_input()
-        deadline = time.monotonic() + GRACE_S
-        for program in programs:
-            program.end(max(0.0, deadline - time.monotonic()))
-        return {int(each.log.stem): each.left_behind for each in programs if each.log is not None and each.left_behind}
-
-    def release_all(self) -> None:
-        """Empty the pool without ending the programs, because they belong to the parent process."""
-        for program in [*self._taken, *self._idle]:
-            program.release()
-        self._taken.clear()
-        self._idle.clear()
-        self._lock = Lock()
-
-
-SHARED = ProgramPool()
-"""The pool for missions in memory. A sweep plays thousands of them."""
-
-atexit.register(SHARED.close)
-os.register_at_fork(after_in_child=SHARED.release_all)

@@ -1,0 +1,145 @@
+"""Drive a program in a virtual network that answers commands on a control socket: an agent, or a node of the harness.
+
+The rooms that run agents judge a failure differently. A mission ends, a conformance case fails, and a bisection skips
+the program. Therefore this driver raises errors without a verdict, and its callers replace them by their own errors.
+"""
+
+import asyncio
+import os
+import signal
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+from harness.play.agent_control import AgentControl, AgentSilentError, last_line_in
+from harness.play.child_processes import ChildProcesses
+from harness.play.process._run_lab import LabProgram
+
+START_LIMIT_S = 30.0
+ANSWER_LIMIT_S = 10.0
+"""Wall time after which a program that does not answer counts as hung."""
+STOP_GRACE_S = 5.0
+RETRY_S = 0.02
+END_LIMIT_S = 0.5
+"""Maximum wall time between the end of a process and the report of that end."""
+MAX_OUTPUT_BYTES = 16 * 1024 * 1024
+"""Maximum output of a program that is not ready yet."""
+
+
+class ProgramEndedError(AgentSilentError):
+    """An error: the program ended without a request. The message describes the end."""
+
+
+class Spawn(Protocol):
+    """The method `spawn` of a virtual network, with its vehicle."""
+
+    async def __call__(
+        self,
+        argv: Sequence[str],
+        /,
+        *,
+        cwd: Path,
+        env: dict[str, str],
+        stdout: Path,
+        stderr: Path,
+        max_file_bytes: int | None = None,
+    ) -> LabProgram: ...
+
+
+class ControlledProgram:
+    """A running program, its control socket, its log, and the processes that it started."""
+
+    def __init__(
+        self, process: LabProgram, control: Path, log: Path, children: ChildProcesses, answer_limit_s: float
+    ) -> None:
+        self.process = process
+        self.log = log
+        self.children = children
+        self._control = AgentControl(control)
+        self._answer_limit_s = answer_limit_s
+
+    @classmethod
+    async def start(
+        cls,
+        spawn: Spawn,
+        argv: Sequence[str],
+        *,
+        directory: Path,
+        control: Path,
+        log: Path,
+        max_file_bytes: int | None = None,
+        answer_limit_s: float | None = None,
+    ) -> Self:
+        """Start the program in `directory` without waiting until it is ready. Its output goes to `log`.
+
+        The time limit of an answer is ANSWER_LIMIT_S by default. Raises SpawnError, NetemError.
+        """
+        children = ChildProcesses()
+        env = children.environment(os.environ)
+        process = await spawn(argv, cwd=directory, env=env, stdout=log, stderr=log, max_file_bytes=max_file_bytes)
+        return cls(process, control, log, children, answer_limit_s or ANSWER_LIMIT_S)
+
+    @property
+    def last_line(self) -> str:
+        """The last line of the program's output that contains text, or an empty string."""
+        return last_line_in(self.log)
+
+    async def ready(self) -> dict[str, Any]:
+        """Wait until the program answers, and return its status.
+
+        Raises ProgramEndedError, AgentSilentError after START_LIMIT_S, and AgentRefusedError.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + START_LIMIT_S
+        while True:
+            try:
+                return await self._control.ask("status", timeout_s=self._answer_limit_s)
+            except AgentSilentError:
+                if self.process.returncode is not None:
+                    raise self.ended() from None
+                if loop.time() > deadline:
+                    raise AgentSilentError(f"did not answer within {START_LIMIT_S:g} s of its start") from None
+                if self.log.stat().st_size > MAX_OUTPUT_BYTES:
+                    raise AgentSilentError("prints without end and does not answer its control socket") from None
+                await asyncio.sleep(RETRY_S)
+
+    async def ask(self, command: str, *, limit_s: float | None = None, **arguments: Any) -> dict[str, Any]:
+        """Send a command to the program, and return its answer.
+
+        Raises ProgramEndedError, AgentSilentError, AgentRefusedError or AgentUnsupportedError.
+        """
+        try:
+            return await self._control.ask(command, timeout_s=limit_s or self._answer_limit_s, **arguments)
+        except AgentSilentError:
+            with suppress(TimeoutError):  # its connection can end before the process
+                await asyncio.wait_for(self.process.wait(), END_LIMIT_S)
+            if self.process.returncode is not None:
+                raise self.ended() from None
+            raise
+
+    async def watch(self) -> None:
+        """Wait for the program to end without a request, then raise ProgramEndedError."""
+        await self.process.wait()
+        raise self.ended()
+
+    def ended(self) -> ProgramEndedError:
+        """Return the error for a program that has ended without a request."""
+        return ProgramEndedError(f"ended by itself with {self.process.end}")
+
+    async def kill(self) -> None:
+        """Kill the program with SIGKILL. Its children may still run."""
+        self._control.close()
+        await self.process.send_signal(signal.SIGKILL)
+        await self.process.wait()
+
+    async def stop(self) -> int:
+        """End the program with SIGTERM, or with SIGKILL after STOP_GRACE_S. Return its exit status or signal."""
+        self._control.close()
+        if (status := self.process.returncode) is not None:
+            return status
+        return await self.process.terminate(STOP_GRACE_S)
+
+    async def end_children(self) -> list[str]:
+        """End the processes that the ended program left behind, and return their names."""
+        return await asyncio.to_thread(self.children.end_left_behind)
