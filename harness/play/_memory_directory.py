@@ -1,7 +1,8 @@
 """Keep secrets in a directory in memory. The directory is removed even if this process is killed.
 
 A file in `/tmp` may reach a disk, and stays after SIGKILL. The directory is therefore in `/dev/shm`. A guard process
-reads a pipe that only this process writes, and removes the directory when the kernel closes the pipe.
+reads a pipe whose other end only this process holds. When this process ends, the kernel closes the pipe, and the guard
+removes the directory.
 """
 
 import os

@@ -8,9 +8,11 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 
 TICK_S = 0.05
-"""Wall time between two checks of the clock."""
+"""Seconds of wall time between two checks of the clock."""
 CATCH_UP_S = 1.0
-"""Wall time. A simulation that is later than this does not catch up. It continues with the factor from now on."""
+"""Seconds of wall time by which a simulation may be late and still catch up. A simulation that is later continues from
+now on at the requested speed.
+"""
 NEXT_RUN = math.inf
 """Length of a step that ends with the next handler run of any agent."""
 
@@ -32,7 +34,7 @@ class VirtualTimePace:
         self._now_s = 0.0
         self._limited = True
         self._anchor: tuple[float, float] | None = None
-        """Wall time and mission second from which the factor counts. None: they are set at the next check."""
+        """Wall time and mission second at which the current factor began. If it is None, the next check sets it."""
         self._pace_changed = asyncio.Event()
 
     @property
@@ -57,7 +59,7 @@ class VirtualTimePace:
     def step(self, to_s: float, done: "Future[float]") -> None:
         """Continue until mission second `to_s`, or with `NEXT_RUN` until the next handler run, and then pause.
 
-        `done` receives the mission second at the end of the step. It must be in the state "running".
+        `done` receives the mission second at the end of the step. `done` must be in the state "running".
         """
         self.paused = True
         self._change()
@@ -65,8 +67,8 @@ class VirtualTimePace:
 
     @contextmanager
     def unlimited(self) -> Iterator[None]:
-        """Lift all speed limits inside the context. An event that the user causes by hand needs this, because it takes
-        no mission time.
+        """Lift all speed limits inside the context. Such a context applies an event that the user causes by hand,
+        because the event takes no mission time.
         """
         self._limited = False
         try:

@@ -40,7 +40,7 @@ class RadioRange:
         return replace(change, losses=self._set_losses({}) if change.clears_all else {}, conditions=self._conditions())
 
     def move(self, at_s: float, places: Mapping[int, Place]) -> NetworkChange | None:
-        """Move the vehicles to these positions. Return the resulting network change. Return None if the network stays
+        """Move the vehicles to these positions. Return the network change that follows, or None if the network stays
         the same.
         """
         if self._radio is None:
@@ -55,7 +55,7 @@ class RadioRange:
         )
 
     def _set_losses(self, losses: dict[frozenset[int], float]) -> dict[str, float]:
-        """Set the radio losses. Return those that changed, with keys such as "1-3" for a pair of vehicles."""
+        """Set the radio losses. Return the losses that changed, with keys such as "1-3" for a pair of vehicles."""
         changed = {pair for pair in losses.keys() | self._losses.keys() if losses.get(pair) != self._losses.get(pair)}
         self._losses = losses
         return {"-".join(map(str, sorted(pair))): losses.get(pair, 0.0) for pair in sorted(changed, key=sorted)}
@@ -72,7 +72,7 @@ def groups_text(components: Iterable[Iterable[int]]) -> str:
 def tracks_of(scenario: Scenario) -> dict[int, VehicleTrack]:
     """Return the flight path of each vehicle in virtual time.
 
-    Empty if the scenario has no flight, radio, channel or ground station that needs positions.
+    The result is empty if no part of the scenario needs positions (flight, radio, channel or ground station).
     """
     if not (scenario.flight or scenario.network.radio or scenario.network.channel or scenario.gcs):
         return {}

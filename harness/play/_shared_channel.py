@@ -1,8 +1,8 @@
 """Simulate a radio channel that all agents share, in virtual time and in real time.
 
-A message waits for the processing time of its agent, then in the queue of its radio. It arrives, if at all, when its
-frame ends. `ChannelTraffic` connects the messages with their frames, and counts their fates. It reads no clock: the
-caller gives it the times.
+A message waits for the processing time of its agent, then in the queue of its radio. If it arrives, it arrives when its
+frame ends. `ChannelTraffic` records which frame carries which message, and counts the results. It reads no clock: the
+caller passes the times.
 """
 
 from collections import Counter
@@ -15,11 +15,13 @@ from netem.channel import Channel, EndedTransmission, FrameFate, Radio, numbers
 from netem.radio import Place
 
 Journal = Callable[[dict[str, Any]], None]
-"""A function that records a message: when its radio got it, when it was sent, and which vehicles lost it."""
+"""A function that records a message on the channel: the time at which its radio received it, the time at which it was
+sent, and the vehicles that lost it.
+"""
 
 NEVER = float("inf")
 LOAD_S = 1.0
-"""Seconds of an interval of the load."""
+"""Length in seconds of the intervals in which the load of the channel is measured."""
 
 _WORD_BITS = 32
 
@@ -34,13 +36,13 @@ Message = TypeVar("Message", bound=_SentFrame)
 
 
 class ChannelTraffic(Generic[Message]):
-    """The messages on a radio channel that all agents share. They wait for the channel, or are in transmission."""
+    """The messages on a radio channel that all agents share. A message waits for the channel, or is in transmission."""
 
     def __init__(
         self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int, journal: Journal | None
     ) -> None:
         self.next_s = NEVER
-        """When a message reaches its radio, or a frame begins or ends."""
+        """The time of the next event: a message reaches its radio, or a frame begins or ends."""
         self.totals = ChannelTotals(roster)
         self._roster = roster
         self._journal = journal
@@ -51,7 +53,7 @@ class ChannelTraffic(Generic[Message]):
         self._processed_at = [0.0] * len(roster)
         self._order = 0
         self._queued: dict[int, Message] = {}
-        """Frame number -> message."""
+        """Frame number -> the message in the frame."""
 
     def send(self, now: float, sender: int, message: Message, data_bytes: int) -> None:
         """Send a message on the channel as soon as the radio is free. The messages of one agent keep their order."""
@@ -136,7 +138,7 @@ class ChannelTotals:
         self._drops.setdefault(fate, Counter())[sender] += 1
 
     def _occupy(self, began_at: float, ended_at: float) -> None:
-        """Add a time interval to the load of the channel. The channel was busy during this interval."""
+        """Count an interval in which the channel was busy."""
         while began_at < ended_at:
             index = int(began_at / LOAD_S)
             until = min(ended_at, (index + 1) * LOAD_S)
@@ -165,13 +167,13 @@ class BitCounter:
     """A counter for sets of small numbers. For each number, it counts the sets that contain the number. A set is given
     as an integer with a bit for each member.
 
-    The counts are kept in binary, each digit of all counts as one integer. To add a set is then a ripple-carry addition
-    of all bits at once, which takes two steps on average, for any number of bits.
+    The counts are stored as binary digits. One integer holds the same digit of all counts. Adding a set is a
+    ripple-carry addition of all counts at once. It takes two steps on average, regardless of the number of counts.
     """
 
     def __init__(self) -> None:
         self._digits: list[int] = []
-        """The lowest digit first."""
+        """The binary digits of all counts. The lowest digit is the first."""
 
     def add(self, bits: int) -> None:
         for place, digit in enumerate(self._digits):
@@ -183,7 +185,7 @@ class BitCounter:
             self._digits.append(bits)
 
     def counts(self) -> dict[int, int]:
-        """Return the number of added sets that contain each member. Members without occurrence are omitted."""
+        """Return the number of added sets that contain each number. Numbers that occur in no set are omitted."""
         counts: Counter[int] = Counter()
         for place, digit in enumerate(self._digits):
             for number in numbers(digit):

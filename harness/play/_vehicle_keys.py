@@ -38,8 +38,8 @@ class MissionKeys:
         return next(iter(self.bundles.values())).public
 
     def add_depot_key(self, initial_data: bytes) -> bytes:
-        """Return the data of the inception block. If event data are encrypted, the result includes the public key for
-        the depot.
+        """Add the public key of the depot to the data of the inception block, if event data are encrypted. Return the
+        data.
         """
         return seal_to(initial_data, self.public.depot) if self.seals and self.public.depot else initial_data
 
@@ -86,7 +86,9 @@ def require_key_packages(scenario: Scenario) -> None:
 
 
 def refuse_revocations(scenario: Scenario) -> None:
-    """Raise ScenarioError if the scenario excludes a vehicle and this machine lacks the key that signs this message."""
+    """Raise ScenarioError if the scenario excludes a vehicle but this machine lacks the key that must sign the
+    exclusion.
+    """
     mission_keys(scenario, bytes(FRESH_BYTES))
 
 

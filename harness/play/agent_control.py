@@ -3,7 +3,8 @@ output.
 
 An agent that lacks a feature of its mission ends with status 127 and a sentence on standard error
 (ucp/contract/CONTRACT.md). A shell, env(1) and the first process of a container also end with 127, if they do not find
-the program. In that case there is no sentence of the agent, and the run has failed instead of being unsupported.
+the program. In that case standard error has no sentence of an agent, and the run counts as failed instead of
+unsupported.
 """
 
 import asyncio
@@ -21,7 +22,7 @@ from pydantic_core import from_json
 from harness.errors import VIOLATED, HarnessError, ScenarioError
 
 FIRST_LINE_BYTES = 256
-"""Number of bytes that the kernel reads of a script's first line."""
+"""Number of bytes of a script's first line that the kernel reads."""
 
 
 def resolve_command(command: Sequence[str], what: str) -> list[str]:
@@ -85,7 +86,7 @@ def last_line(text: str) -> str:
 
 
 def is_shell_error(words: str) -> bool:
-    """Return true if the text is the error message of a shell, or of a similar program, about a missing program."""
+    """Return true if the text is the message with which a shell or a similar program reports a missing program."""
     return _SHELL_ERROR.fullmatch(words) is not None
 
 
@@ -103,7 +104,9 @@ def _version_line(version: Any) -> str | None:
 
 
 class AgentStatus(BaseModel):
-    """The status that an agent reports (see ucp/contract/CONTRACT.md). Optional fields have a default."""
+    """The status that an agent reports (see ucp/contract/CONTRACT.md). Fields that the agent may omit have a
+    default.
+    """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -126,7 +129,7 @@ class AgentStatus(BaseModel):
 
 
 class AgentSilentError(Exception):
-    """An error: the agent does not answer, or its control socket does not exist any more."""
+    """An error: the agent does not answer, or its control socket no longer exists."""
 
 
 class AgentRefusedError(HarnessError):
@@ -151,7 +154,7 @@ class AgentControl:
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
     async def ask(self, command: str, *, timeout_s: float, **arguments: Any) -> dict[str, Any]:
-        """Send a command to the agent and return its answer. The limit is `timeout_s` seconds of wall time.
+        """Send a command to the agent and return its answer. The agent has `timeout_s` seconds of wall time to answer.
 
         Raises AgentSilentError, AgentRefusedError, AgentUnsupportedError.
         """
@@ -196,7 +199,7 @@ class AgentControl:
 
 
 async def connect(socket_path: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Connect to the control socket, which gives each answer as one line. Raises OSError."""
+    """Connect to the control socket of an agent, which sends each answer as one line. Raises OSError."""
     # The address of a socket has at most 107 bytes, and the path of a run directory may be longer.
     directory = os.open(socket_path.parent, os.O_PATH)
     try:

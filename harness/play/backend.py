@@ -1,7 +1,7 @@
 """Define the interface of a backend, the part of the harness that plays a scenario.
 
-Code that treats backends differently asks one of these properties, and never for the name of the backend. A new backend
-needs a folder here, its name in `harness.backend_names`, and an entry in the table `harness.play.backends`.
+Code that treats backends differently reads one of the properties defined here, and never compares names of backends. A
+new backend needs a folder here, its name in `harness.backend_names`, and an entry in the table `harness.play.backends`.
 """
 
 import asyncio
@@ -23,12 +23,12 @@ class Backend(ABC):
 
     name: ClassVar[BackendName]
     virtual_time: ClassVar[bool] = False
-    """True if mission time is computed. There is then no lag, no speedup and no telemetry."""
+    """True if mission time is computed. Such a run has no lag, no speedup and no telemetry."""
     plays_in_memory: ClassVar[bool] = False
     """True if `harness.run.simulate` can play the same run in memory, for sweeps over thousands of runs."""
 
     not_in_uml: ClassVar[str | None] = None
-    """The reason why it does not run inside User Mode Linux, with a solution. None if it does."""
+    """The reason why this backend cannot run inside User Mode Linux, with a solution. None if it can."""
 
     @abstractmethod
     def refuse(self, scenario: Scenario) -> None:
@@ -36,7 +36,7 @@ class Backend(ABC):
 
     def remark(self, scenario: Scenario) -> str | None:
         """Return a sentence about a part of the scenario that this backend plays differently from other backends.
-        Return None if there is no difference.
+        Return None if it plays everything in the same way.
         """
         return None
 
@@ -55,8 +55,8 @@ class Backend(ABC):
     ) -> AbstractAsyncContextManager[Swarm]:
         """Return a context manager that starts the agents of a scenario. The agents write their files to `rundir`.
 
-        `refuse` must have accepted the scenario. An error that ends the mission early is raised inside the context. The
-        context catches it, and records it in `played`. Raises HarnessError if the swarm cannot be opened.
+        `refuse` must have accepted the scenario. If an error ends the mission early, the context catches it and records
+        it in `played`. Raises HarnessError if the swarm cannot be opened.
 
         - `interrupted`: ends the mission early when it is set.
         - `interactive`: a user may cause faults that the scenario does not contain, so each agent has a disk.

@@ -1,8 +1,9 @@
 """Find and end processes that an agent started and left behind.
 
-The harness puts a random mark into the environment of each agent, and a child inherits the environment. A process that
-has the mark after the end of its agent was left behind. The harness ends it. The mark also finds children that left
-the session of the agent. A child that cleared its environment is not found. It ends with the lab or the container.
+The harness puts a random mark into the environment of each agent, and a child inherits the environment. If a process
+with the mark still runs after its agent has ended, the agent left it behind, and the harness ends it. The mark also
+identifies children that left the session of the agent. A child that cleared its environment is not found. Such a child
+ends together with the lab or the container.
 """
 
 import os
@@ -15,10 +16,12 @@ from pathlib import Path
 
 NAME = "UCP_HARNESS_AGENT"
 GRACE_S = 0.5
-"""Wall seconds in which a child may end after its agent."""
+"""Seconds of wall time that a child process has to end after its agent."""
 RETRY_S = 0.02
 MAX_ROUNDS = 20
-"""Number of times that children are ended, because they may start others meanwhile."""
+"""Maximum number of times that the harness ends child processes. It repeats this because children may start others
+meanwhile.
+"""
 _PASSED_ON = {
     *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "TERM", "TMPDIR", "TZ", "LANG", "LANGUAGE", "VIRTUAL_ENV"),
     *("CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH"),
@@ -27,10 +30,11 @@ _PASSED_ON_PREFIXES = ("LC_", "LD_", "PYTHON", "UCP_", "XDG_", "ROS_", "RMW_", "
 
 
 def passed_on(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables that the harness passes to the programs of a run, because they need them to
-    start.
+    """Return those environment variables that the harness passes to the programs of a run, because the programs need
+    them to start.
 
-    The user's environment may contain secrets, such as tokens, and an agent may be a program of another author.
+    The harness passes no others. The user's environment may contain secrets, such as tokens, and an agent may be a
+    program of another author.
     """
     return {
         name: value for name, value in environ.items() if name in _PASSED_ON or name.startswith(_PASSED_ON_PREFIXES)

@@ -1,8 +1,8 @@
 """Find out whether the agent core in use is the released one or was edited.
 
 The core is the code of `ucp` that determines how an agent behaves. An engineer who develops the protocol edits it in
-place. Two things depend on an edit. A run records which core its agents had. And virtual time withholds messages that a
-released agent would ignore (`ucp.interest`) only from the released core, because an edited core might not ignore them.
+place. Two things depend on an edit. A run records which core its agents had. And virtual time omits messages that the
+released core would ignore (`ucp.interest`) only if the released core is in use. An edited core might not ignore them.
 
 `released_core.sha256` has the digests of the released files, in the format of sha256sum(1). After a reviewed change:
 
@@ -40,7 +40,7 @@ FILES = (
     "trigger",
     "wire",
 )
-"""Modules of `ucp` that `ucp.agent` and `ucp.interest` import."""
+"""The modules of the agent core: those that `ucp.agent` and `ucp.interest` import."""
 RELEASED = Path(__file__).with_name("released_core.sha256")
 
 
@@ -73,7 +73,7 @@ def _digests(core: Path = CORE) -> dict[str, str]:
 
 
 def record() -> None:
-    """Store the digests of the agent core in use as those of the released core."""
+    """Record the current agent core as the released one: store its digests."""
     RELEASED.write_text("".join(f"{digest}  {name}\n" for name, digest in _digests().items()), "ascii")
 
 

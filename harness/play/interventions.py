@@ -7,11 +7,11 @@
     interventions.ask({"reboot": [3], "down_s": 30, "disk": "kept"})
     interventions.pause().result(), interventions.step(10.0), interventions.resume(), interventions.set_factor(None)
 
-A request is an entry of the scenario's timeline without `at_s`, because it happens now. The code that checks and
-applies entries of a scenario also handles requests. The timeline in run.json then contains the entry, and its fault has
-the mark `by_hand`. `replay.yaml` in the run directory plays the whole run again. A lasting request ends an earlier
-temporary change of the same conditions. An impossible request raises ScenarioError and changes nothing. Each request
-gets an answer, at the latest when the run ends.
+A request is an entry of the scenario's timeline without `at_s`, because the run executes it at once. The code that
+checks and applies entries of a scenario also handles requests. The timeline in run.json then contains the entry, and
+the record of its fault has the mark `by_hand`. `replay.yaml` in the run directory plays the whole run again. A lasting
+request ends an earlier temporary change of the same conditions. An impossible request raises ScenarioError and changes
+nothing. Each request gets an answer, at the latest when the run ends.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ from harness.scenario.network_states import changed_values
 from harness.scenario.timeline import TimelineEntry
 
 INSTANT_S = 0.001
-"""Mission seconds between two requests that arrive in the same instant."""
+"""Mission seconds between two requests that arrive at the same moment."""
 
 _NAMED = re.compile(r"(?P<list>timeline|fates)\.(?P<number>\d+)(?P<rest>\.|: )?")
 
@@ -65,7 +65,7 @@ class GrowingTimeline:
             raise ScenarioError(_error_of_last_entry(str(error), document["timeline"])) from None
 
     async def until(self, swarm: Swarm, mission_s: float) -> None:
-        """Play the mission up to `mission_s`, including the changes of the timeline."""
+        """Play the mission up to `mission_s`, and apply the changes of the timeline that are due."""
         for change in [change for change in timeline_of(self.scenario) if self._played_s < change.at_s <= mission_s]:
             await swarm.until(change.at_s)
             await swarm.apply(self.with_origin(change))
@@ -73,12 +73,12 @@ class GrowingTimeline:
         await swarm.until(mission_s)
 
     def with_origin(self, change: Change) -> Change:
-        """Return the change. If a user requested it, it gets the mark `by_hand`."""
+        """Return the change. If a user requested it, add the mark `by_hand`."""
         return change
 
 
 def _error_of_last_entry(problem: str, timeline: list[dict[str, Any]]) -> str:
-    """Return the error message for the user who added the last entry of the timeline."""
+    """Return an error message about the last entry of the timeline, for the user who added it."""
     last = len(timeline) - 1
 
     def name(named: re.Match[str]) -> str:
@@ -91,7 +91,7 @@ def _error_of_last_entry(problem: str, timeline: list[dict[str, Any]]) -> str:
 
 
 MAX_WAITING = 100
-"""Maximum number of waiting requests. Further ones are refused."""
+"""Maximum number of requests that may wait. Further requests are refused."""
 
 MAX_FACTOR = 1e6
 MAX_STEP_S = 31 * 86400.0
@@ -100,26 +100,26 @@ Entry = dict[str, Any]
 
 
 class Interventions(GrowingTimeline):
-    """The interventions in one run. Any thread may use its public methods and properties."""
+    """Events that a user requests during one run. Any thread may use the public methods and properties."""
 
     def __init__(
         self, scenario: Scenario, *, virtual_time: bool, factor: float | None = None, paused: bool = False
     ) -> None:
-        """Create the object. `factor` and `paused` apply to virtual time only, and `paused` stops time at mission
-        second 0.
+        """Create the object. `factor` and `paused` apply only to virtual time. If `paused` is true, virtual time stops
+        at mission second 0.
         """
         super().__init__(scenario)
         self._initial_scenario = scenario
         self.pace = VirtualTimePace(factor, paused=paused) if virtual_time else None
-        """The pace of virtual time, for the backend. None in real time."""
+        """The speed of virtual time, which the backend reads. None in real time."""
         self.on_entry_added: Callable[[], None] = lambda: None
-        """Function to call in the thread of the run whenever an entry was added."""
+        """A function that the thread of the run calls whenever an entry was added."""
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         """The event loop of the run. None before its start and after its end."""
         self._swarm: Swarm | None = None
         self._closed: str | None = "the mission has not started"
-        """Reason why no request is possible. None while requests are possible."""
+        """Reason why the run does not accept requests. None while it accepts them."""
         self._requests: deque[tuple[Entry, Future[float]]] = deque()
         self._request_arrived = asyncio.Event()
         self._by_hand: dict[float, TimelineEntry] = {}
@@ -128,26 +128,26 @@ class Interventions(GrowingTimeline):
 
     @property
     def by_hand(self) -> list[TimelineEntry]:
-        """The timeline entries that the user has added by request."""
+        """The timeline entries that the user has requested."""
         return list(self._by_hand.values())
 
     @property
     def closed(self) -> str | None:
-        """The reason why the user cannot request events now. None if requests are possible."""
+        """The reason why the run does not accept requests now. None if it accepts them."""
         return self._closed
 
     @property
     def prepares_all_agents(self) -> bool:
-        """True if all agents are prepared for any event by hand. For example, each agent has a disk, so that it can
-        reboot.
+        """True if all agents are prepared for every event that the user may request. For example, each agent has a
+        disk, so that it can reboot.
 
-        False if the swarm has foreign agents, because they may not support this.
+        It is false if the swarm has foreign agents, because these may not support a reboot.
         """
         return not self._initial_scenario.foreign
 
     @property
     def now_s(self) -> float:
-        """The number of mission seconds since the start."""
+        """The current mission second."""
         return self._swarm.now() if self._swarm is not None else 0.0
 
     @property
@@ -164,7 +164,7 @@ class Interventions(GrowingTimeline):
         """Request an event. `entry` is a timeline entry without `at_s`. The future returns the mission second at which
         the event happens.
 
-        The future raises ScenarioError if the event is impossible. The run then stays as it is.
+        The future raises ScenarioError if the event is impossible. An impossible event changes nothing in the run.
         """
         answer: Future[float] = Future()
         with self._lock:
@@ -178,9 +178,9 @@ class Interventions(GrowingTimeline):
         return answer
 
     def pause(self) -> Future[float]:
-        """Pause virtual time. The future returns the mission second.
+        """Pause virtual time. The future returns the mission second of the pause.
 
-        The answers of this and the following methods raise ScenarioError in real time, and after the end of the run.
+        In real time and after the end of the run, the futures of all methods that control time raise ScenarioError.
         """
         return self._change_pace(lambda pace, _: pace.pause())
 
@@ -203,7 +203,7 @@ class Interventions(GrowingTimeline):
 
     def step_to_next_run(self) -> Future[float]:
         """Advance virtual time to the next handler run of any agent, and then pause. The future returns the mission
-        second.
+        second of this run.
         """
         return self._change_pace(lambda pace, answer: pace.step(NEXT_RUN, answer), answers=False)
 
@@ -231,7 +231,7 @@ class Interventions(GrowingTimeline):
     # For the thread of the run. `story` is a harness.play.mission.Story
 
     async def story(self, swarm: Swarm, scenario: Scenario) -> None:
-        """Play the mission like `harness.play.mission.play`, and also execute the user's requests."""
+        """Play the mission like `harness.play.mission.play`, and execute the user's requests meanwhile."""
         try:
             first, *_ = timeline_of(self.scenario)
             await swarm.begin(first)
@@ -279,7 +279,8 @@ class Interventions(GrowingTimeline):
     async def _play_until(self, swarm: Swarm, mission_s: float) -> bool:
         """Play until `mission_s` or until a request arrives. Return true if `mission_s` was reached.
 
-        It may also return early without a new request, because the wake-up of an earlier request can arrive late.
+        The method may also return early without a new request, because the signal of an earlier request can arrive
+        late.
         """
         if self._requests:
             return False
@@ -342,8 +343,7 @@ class Interventions(GrowingTimeline):
                 timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
 
     def _refuse_unprepared(self, entry: TimelineEntry) -> None:
-        """Raise ScenarioError if the entry needs a preparation of agents at the start of the run, and this did not
-        happen.
+        """Raise ScenarioError if the agents would have needed a preparation at the start of the run for this entry.
 
         Also raise it for a revocation that this machine cannot sign.
         """

@@ -39,7 +39,7 @@ class RunOutcome:
     counters: dict[str, Any] | None = None
     datagrams: dict[str, dict[str, int]] = field(default_factory=dict)
     channel: dict[str, Any] | None = None
-    """Frames on a shared channel."""
+    """The counts of frames on a shared channel. None without a channel."""
     capture: dict[str, dict[str, int]] | None = None
     agents: dict[str, Any] = field(default_factory=dict)
     vehicles: dict[str, Any] = field(default_factory=dict)
@@ -66,9 +66,7 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class SoughtRun:
-    """A description of a handler run for which a caller waits. If `branch` or `agent` is None, any branch or agent
-    matches.
-    """
+    """A handler run for which a caller waits. If `branch` or `agent` is None, any branch or agent matches."""
 
     handler: str
     branch: str | None = None
@@ -84,7 +82,7 @@ def _same_connections(now: dict[str, Any], before: dict[str, Any]) -> bool:
 
 
 class Swarm(Protocol):
-    """The agents of a mission, with operations on them. All times are mission seconds."""
+    """The interface to the agents of a mission. All times are mission seconds."""
 
     played: RunOutcome
 
@@ -99,10 +97,11 @@ class Swarm(Protocol):
     async def until(self, mission_s: float) -> None: ...
 
     async def until_run(self, sought: SoughtRun, mission_s: float) -> int | None:
-        """Wait until an agent runs this handler, at most until `mission_s`. Return the ID of the agent. Return None if
-        no agent ran the handler.
+        """Wait until an agent runs this handler, at most until `mission_s`. Return the ID of the agent, or None if no
+        agent ran the handler.
 
-        Handler runs that the last change caused also count, and with processes all runs since the last `until`.
+        Handler runs that the last change caused also count. With processes, all handler runs since the last call of
+        `until` count.
         """
 
     async def apply(self, change: Change) -> None:
@@ -112,7 +111,7 @@ class Swarm(Protocol):
         """Hold back the messages that match `fate` and are sent at `fate.from_s` or later. Return the number of this
         hold for `release`.
 
-        Raises ScenarioError if messages cannot be held here.
+        Raises ScenarioError if this backend cannot hold messages.
         """
 
     async def release(self, number: int, fate: Fate) -> None:
@@ -123,7 +122,7 @@ class Swarm(Protocol):
     async def stop_events(self) -> None: ...
 
     async def until_idle(self, limit_s: float) -> bool:
-        """Wait until all living agents are idle and no message is on its way. Return false if this takes longer than
+        """Wait until all living agents are idle and no message is in transit. Return false if this takes longer than
         `limit_s` mission seconds.
         """
 
@@ -134,7 +133,7 @@ class Swarm(Protocol):
         """Let the agent begin a reconcile."""
 
     async def top_chain_hashes(self) -> dict[int, str]:
-        """Return the hash of each living agent's newest chain position."""
+        """Return the top chain hash of each living agent."""
 
     async def completed(self) -> dict[int, int]:
         """Return the number of completed blocks of each agent that is neither dead nor paused."""
@@ -144,7 +143,7 @@ class Swarm(Protocol):
 
 
 Story = Callable[[Swarm, Scenario], Awaitable[None]]
-"""A function that plays a mission with a swarm, from start to end."""
+"""A function that plays a mission with a swarm from start to end."""
 
 
 async def play(swarm: Swarm, scenario: Scenario) -> None:

@@ -29,7 +29,7 @@ class SwarmSnapshot:
     duration_s: float
     network: str
     statuses: Mapping[int, AgentStatus | None]
-    """Agent -> its last status. None before the first one."""
+    """Agent -> its last status report. None before the first report."""
 
 
 class ProgressDisplay(Protocol):
@@ -43,7 +43,7 @@ class ProgressDisplay(Protocol):
 
 
 class SilentProgress:
-    """A display without output. Programs use it when they call the harness."""
+    """A display without output, for programs that call the harness."""
 
     def show(self, snapshot: SwarmSnapshot) -> None:
         pass

@@ -1,8 +1,8 @@
 """The disk space that the traces of a run need: an estimate before the start, and a quota that protects the disk.
 
 Each agent that receives a message writes a line to its trace, so traces grow with the third power of the number of
-agents, or faster. A trace ends at its quota as it ends on a full disk: with a whole line, and with a reason in
-`run.json`. Without a quota, the traces would leave no space for exports, verdict and report.
+agents, or faster. A trace ends at its quota in the same way as on a full disk: after a complete line, and with a reason
+in `run.json`. Without a quota, the traces would leave no space for exports, verdict and report.
 """
 
 import math
@@ -19,10 +19,10 @@ LEAST_BYTES_PER_AGENT = 8 * MEGABYTE
 """Minimum quota of an agent. The limit also applies to its export and its store, which are much smaller."""
 MEAN_S = 30.0
 MESSAGES_PER_MINUTE = ((2, 4), (5, 38), (10, 229), (15, 885), (20, 2010), (30, 6050), (50, 25_500), (100, 90_700))
-"""Number of agents, and messages of the swarm per minute with an event every 30 s: docs/appendix/growth.md."""
+"""Messages per minute for some numbers of agents, if each agent logs an event every 30 s (docs/appendix/growth.md)."""
 BYTES_PER_LINE = 800
 LINES_WITHOUT_IDLE_RECEIPTS = 2
-"""Lines for each message in virtual time, which delivers only messages that can affect their receivers."""
+"""Number of trace lines per message in virtual time, which delivers only messages that can affect their receivers."""
 
 
 def trace_quota(scenario: Scenario, directory: Path) -> int:
@@ -35,7 +35,7 @@ def trace_quota(scenario: Scenario, directory: Path) -> int:
 def estimated_bytes(scenario: Scenario, *, all_delivered: bool) -> int:
     """Return the estimated size of all traces together.
 
-    With `all_delivered`, traces also record messages that have no effect, as those of processes do.
+    If `all_delivered` is true, traces also record messages that have no effect, as the traces of processes do.
     """
     agents = len(scenario.roster)
     messages = _messages_per_minute(agents) * scenario.duration_s / 60
@@ -45,8 +45,8 @@ def estimated_bytes(scenario: Scenario, *, all_delivered: bool) -> int:
 
 
 def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) -> tuple[str, str]:
-    """Return a remark on large traces, and a warning if the traces will probably not fit on the disk. Small traces give
-    two empty texts.
+    """Return two texts: a remark about large traces, and a warning if the traces will probably not fit on the disk.
+    Both are empty if the traces are small.
     """
     expected = estimated_bytes(scenario, all_delivered=all_delivered)
     quota = trace_quota(scenario, directory) * len(scenario.roster)

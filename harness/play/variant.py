@@ -14,8 +14,9 @@ of the agents, and the function of the reference that judges them.
     def tied_vote_is_approved(state): ...
 
 A variant replaces entries in the tables of `ucp.agent`, as if its user had edited `ucp/`. All users of the tables then
-have the variant: every backend, the prover and the conformance test. Handing a variant through all of these layers was
-the alternative. It would touch each of them, and one forgotten layer would silently play the original.
+have the variant: every backend, the prover and the conformance test. The alternative was to pass a variant through all
+of these layers. This would change each of them, and a layer that does not pass it on would play the original protocol
+without an error.
 
 The file is code of the user. It is loaded only if the user names it, never because a record names it.
 """
@@ -43,7 +44,7 @@ class VariantError(HarnessError):
 
 @dataclass(frozen=True)
 class CoreChange:
-    """A variant's new handler for one algorithm of the agents. The fields after `run` extend the declarations of the
+    """A variant's new handler for one algorithm of the agents. The fields after `run` add to the declarations of the
     original handler.
     """
 
@@ -107,7 +108,7 @@ class Variant:
 
     @property
     def version(self) -> str:
-        """The name and digest of the variant, as records contain them."""
+        """The name and digest of the variant, as run.json and other records contain them."""
         return f"{self.name} {self.digest}"
 
     @property
@@ -173,8 +174,8 @@ class NumberedHandler(Protocol):
 
 @contextmanager
 def replaced(tables: list[MutableMapping[Any, Any]], new: Mapping[int, Callable[[Any], Any]]) -> Iterator[None]:
-    """Replace the handlers of these algorithms in all tables inside the context. Each function in `new` turns the
-    original handler into its replacement.
+    """Replace the handlers of these algorithms in all tables inside the context. Each function in `new` receives the
+    original handler and returns the replacement.
     """
     before = [dict(table) for table in tables]
     made: dict[int, Any] = {}

@@ -23,13 +23,13 @@ STDOUT, STDERR = 1, 2
 _FRAME = struct.Struct(">B3xI")
 _READ_BYTES = 1 << 16
 _LAST_WORDS_S = 1.0
-"""Wall time after the end of a container in which its last output arrives."""
+"""Seconds of wall time after the end of a container during which its last output may still arrive."""
 _KILLED_BY_SIGNAL = 128  # exit status of a shell or of docker-init after a signal, minus its number
 _NO_SUCH_PROGRAM = 127
 
 
 class ContainerOutput:
-    """Copies the output of a container from the stream of `docker attach` to two files.
+    """A copier that writes the output of a container, from the stream of `docker attach`, to two files.
 
     The stream consists of frames: number of the output, 3 unused bytes, length (u32, big-endian), content (Docker
     Engine API, "Attach to a container", stream format).
@@ -177,7 +177,7 @@ def _is_signal(number: int) -> bool:
 
 MEBIBYTE = 1 << 20
 INIT = 1
-"""Number of processes in a container besides the program: docker-init, which forwards signals."""
+"""Number of additional processes in a container: docker-init, which forwards signals."""
 
 
 def recipe(
@@ -189,7 +189,7 @@ def recipe(
     limits: DockerOptions,
     max_file_bytes: int | None = None,
 ) -> dict[str, Any]:
-    """Return the keyword arguments with which the Docker SDK creates the container.
+    """Return the keyword arguments with which the Docker SDK creates a container for a program.
 
     The container has no capabilities. It can write only into /tmp and the directories in `kept`.
     """

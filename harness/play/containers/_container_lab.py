@@ -3,8 +3,9 @@
     async with await ContainerLab.open(scenario, rundir, say) as lab:
         agent = await lab.spawn(7, [...], role="agent", ...)
 
-Each vehicle has a holder, a container that only keeps a network namespace (see the package). Containers see the run
-directory under the same path, so control sockets and files have the same paths as with processes.
+Each vehicle has a holder, a container that only keeps a network namespace (see the docstring of
+`harness.play.containers`). Containers see the run directory under the same path, so control sockets and files have the
+same paths as with processes.
 """
 
 import asyncio
@@ -39,7 +40,7 @@ from netem.errors import SpawnError
 from netem.lab import Lab
 
 LOOK_EVERY_S = 5.0
-"""Wall time between two checks that the engine still answers."""
+"""Seconds of wall time between two checks that the Docker engine still answers."""
 
 
 class ContainerLab:
@@ -54,9 +55,9 @@ class ContainerLab:
         self._ours: ContainerImage | None = None
         self._named: ContainerImage | None = None
         self._holders: dict[str, int] = {}
-        """Container ID of a holder -> vehicle."""
+        """Container ID of the holder of a network namespace -> vehicle."""
         self._containers: dict[str, Container] = {}
-        """Container ID -> each started container, including ended ones."""
+        """Container ID -> container, for all containers that were started, including ended ones."""
         self._incarnations: Counter[tuple[int, str]] = Counter()
         self._networks: set[int] = set()
         """Inode numbers of the vehicles' network namespaces."""
@@ -168,8 +169,8 @@ class ContainerLab:
     ) -> Container:
         """Start a program in its own container, in the network of a vehicle.
 
-        `max_file_bytes` limits the files of a program in an image of the harness. Another program might not survive the
-        signal that the limit causes.
+        `max_file_bytes` limits the size of files, but only for programs in an image of the harness. At the limit, the
+        kernel sends a signal that might end another program.
         """
         holder = next(identity for identity, held in self._holders.items() if held == vehicle)
         image = self._named if role == "agent" and vehicle in self._in_named else self._ours
@@ -313,7 +314,7 @@ class ContainerLab:
         self._failure.exception()  # otherwise asyncio would report an exception that is not retrieved
 
     async def _remove_containers(self) -> None:
-        """Remove all containers of the run, including those whose creation was interrupted."""
+        """Remove all containers of the run, including containers whose creation was interrupted."""
         self._closed = True
         await self._engine.settle()
         containers = await self._engine.ask(
@@ -330,7 +331,7 @@ class ContainerLab:
             raise error
 
     def _kill_processes(self) -> None:
-        """Kill all processes in the networks of the lab, for the case that Docker does not answer."""
+        """Kill all processes in the networks of the lab. This is used if Docker does not answer."""
         for process in Path("/proc").iterdir():
             if process.name.isdecimal():
                 with contextlib.suppress(OSError):

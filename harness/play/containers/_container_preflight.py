@@ -30,7 +30,8 @@ def refuse_variants() -> None:
 def check_debuggers(scenario: Scenario) -> None:
     """Raise DockerError if the debugger that a vehicle needs is missing in its image.
 
-    The project's image has no debuggers. An image from the host has those in the shared directories.
+    The project's image has no debuggers. An image with the programs of this machine has the debuggers in its shared
+    directories.
     """
     setups = (scenario.vehicles.setup_of(vehicle) for vehicle in scenario.roster)
     for debugger in sorted({setup.debugger for setup in setups if setup.debugger is not None}):

@@ -37,7 +37,7 @@ class ContainerImage:
     """A Docker image. `python` is its Python interpreter. `mounted` lists the directories of this machine that its
     containers can read.
 
-    Nothing is mounted into a `foreign` image, because paths refer to files in the image.
+    No directory is mounted into a `foreign` image, because the paths in its commands refer to files in the image.
     """
 
     name: str
@@ -52,12 +52,12 @@ class ContainerImage:
     def environment(self, env: Mapping[str, str]) -> dict[str, str]:
         """Return the environment variables for a program inside the container.
 
-        Without shared directories, it has only variables that differ from this process.
+        Without shared directories, the result has only the variables that differ from those of this process.
         """
         return {key: value for key, value in env.items() if self.mounted or os.environ.get(key) != value}
 
     def shared(self, argv: Sequence[str]) -> list[Path]:
-        """Return the paths of this machine that the container must contain, so that the command `argv` can start."""
+        """Return the paths on this machine that the container must share so that the command `argv` can start."""
         files = [Path(word) for word in self.command(argv) if Path(word).is_absolute() and Path(word).is_file()]
         return outermost([*self.mounted, *([] if self.foreign else map(_with_environment, files))])
 
@@ -84,7 +84,7 @@ def host_image() -> ContainerImage:
 
 
 def is_shared(program: Path) -> bool:
-    """Return true if containers that use the programs of this machine contain this program."""
+    """Return true if the program is in a directory that containers with this machine's programs share."""
     mounted = host_image().mounted
     return all(any(path.is_relative_to(outer) for outer in mounted) for path in (program, program.resolve()))
 
@@ -97,8 +97,8 @@ def named(engine: DockerEngine, name: str) -> ContainerImage:
 
 
 def agents_in_named(scenario: Scenario) -> Iterable[int]:
-    """Return the agents that run in the image of the scenario: the agents with a command in `agent_command`, if this
-    key lists commands by agent, and otherwise all agents.
+    """Return the agents that run in the image that the scenario names. If the key `agent_command` lists commands by
+    agent, these are the agents with a command. Otherwise these are all agents.
     """
     if scenario.docker.image is None:
         return ()
@@ -115,13 +115,15 @@ def project(engine: DockerEngine, say: Callable[[str], object]) -> ContainerImag
 
 
 def project_name() -> str:
-    """Return a name for the Docker image of this project. The name depends on the contents of the image."""
+    """Return the name of this project's Docker image. The name depends on the content of the image."""
     made_of = _tar(context()) + json.dumps(build_arguments()).encode("ascii")
     return f"{PROJECT_IMAGE}:{version('ucp-harness')}-{hashlib.sha256(made_of).hexdigest()[:12]}"
 
 
 def build_arguments() -> dict[str, str]:
-    """Return the versions of the packages to install in the Docker image. The versions equal those installed here."""
+    """Return the versions of the packages to install in the Docker image. They are the versions installed on this
+    machine.
+    """
     arguments = {"PYMAVLINK": version("pymavlink")}
     with suppress(PackageNotFoundError):  # optional: needed only for secure missions
         arguments["CRYPTOGRAPHY"] = version("cryptography")
@@ -163,7 +165,7 @@ def context() -> dict[str, bytes]:
 
 
 def _tar(files: Mapping[str, bytes]) -> bytes:
-    """Return a tar archive of the files. Equal files always give an equal archive."""
+    """Return a tar archive of the files. The same files always give the same archive."""
     archive = io.BytesIO()
     with tarfile.open(fileobj=archive, mode="w") as tar:
         for name, content in files.items():
@@ -174,7 +176,7 @@ def _tar(files: Mapping[str, bytes]) -> bytes:
 
 
 def _with_environment(program: Path) -> Path:
-    """Return the directory of the virtual environment that contains the program. Without a virtual environment, return
+    """Return the directory of the program's virtual environment. If the program is in no virtual environment, return
     the program.
     """
     environment = program.parent.parent
@@ -205,7 +207,7 @@ def _package(name: str) -> Path:
 
 
 def outermost(paths: Iterable[Path]) -> list[Path]:
-    """Return the directories that do not lie inside another directory of the list."""
+    """Return those directories of the list that do not lie inside another one."""
     roots: list[Path] = []
     for path in sorted(set(paths)):
         if not any(path.is_relative_to(outer) for outer in roots):

@@ -1,7 +1,8 @@
 """Write a Docker Compose file with the vehicles and agents of a scenario, so that a user can start them by hand.
 
 The file needs no harness. A directory beside it holds the mission files and the build context of the image. Docker
-builds the network, so there are no conditions and no faults. Otherwise the containers equal those of the backend.
+builds the network, so the swarm has no network conditions and no faults. Otherwise the containers equal those of the
+backend.
 """
 
 import os
@@ -25,9 +26,9 @@ from sitl.vehicle import VehicleKind
 from ucp.agent_files import write_json_atomically
 
 INSIDE = "/ucp"
-"""Path in each container of the directory beside the compose file."""
+"""Path in each container at which the directory beside the compose file is mounted."""
 SECRETS = "/run/secrets"
-"""Directory in which compose places files for single containers."""
+"""Directory in a container in which compose places secret files."""
 
 TOP = """\
 # {name}: {count} agents{vehicles}, to start by hand and look inside:
@@ -81,7 +82,7 @@ def write_compose(
 
 
 def _keys(scenario: Scenario) -> MissionKeys | None:
-    """Return the mission keys from the user's key files. These files stay in their directory. Return None for a mission
+    """Return the mission keys from the user's key directory. The key files stay there. Return None for a mission
     without keys.
     """
     if scenario.security is None:
@@ -166,7 +167,7 @@ def _services(
 
 
 def _our_image(scenario: Scenario, folder: Path) -> tuple[ContainerImage, dict[str, Any]]:
-    """Return the image of this project, and the build section of the Compose file."""
+    """Return the settings of this project's image for the Compose file, with the section that builds it."""
     context = folder / "image"
     context.mkdir()
     if scenario.docker.image_from_host:

@@ -27,7 +27,7 @@ GREETING_LIMIT_S = 10.0
 ANSWER_LIMIT_S = 30.0
 CLEAN = "`ucp-harness clean` removes what is left"
 AT_ONCE = 8
-"""Maximum number of simultaneous calls. More would not be faster."""
+"""Maximum number of simultaneous calls of the Docker SDK. A higher number would not be faster."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -38,8 +38,8 @@ class DockerError(MachineError, LabError):
 
 
 class DockerEngine:
-    """The connection to Docker. Call its SDK object `api` only through the method `do`, or `ask` in asynchronous
-    code.
+    """The connection to Docker. Call the functions of its SDK object `api` only through the method `do`, or through
+    `ask` in asynchronous code.
     """
 
     def __init__(self, api: docker.APIClient) -> None:
@@ -68,9 +68,9 @@ class DockerEngine:
         return cls(api)
 
     def do(self, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function of the SDK, and return its result. Raises DockerError.
+        """Call a function of the SDK, and return its result.
 
-        `what` names the call in an error. Raises DockerError, or the SDK's APIError if it is refused.
+        `what` names the call in an error. Raises DockerError, or the SDK's APIError if Docker refuses the call.
         """
         if self._failure is not None:
             raise self._failure
@@ -87,7 +87,7 @@ class DockerEngine:
             raise self.give_up(sentence) from None
 
     def give_up(self, sentence: str) -> DockerError:
-        """Record a failure of Docker. All later calls raise it. Return the error of the first recorded failure."""
+        """Record a failure of Docker, so that all later calls raise an error. Return the error of the first failure."""
         self._failure = self._failure or DockerError(sentence)
         return self._failure
 
@@ -114,7 +114,7 @@ class DockerEngine:
 
 
 class DockerEvents:
-    """Follows Docker's messages about containers with a certain label, in order."""
+    """A reader of Docker's messages about all containers with a certain label, in order."""
 
     def __init__(
         self,
@@ -123,9 +123,8 @@ class DockerEvents:
         on_event: Callable[[dict[str, Any]], None],
         loop: asyncio.AbstractEventLoop,
     ) -> None:
-        """Start to follow Docker's messages. Each one is given to `on_event`.
-
-        `on_event` is called in the loop for each event, and with an empty event when the stream ends.
+        """Start to follow Docker's messages. The loop calls `on_event` with each message, and with an empty message
+        when the stream ends.
         """
         filters = {"type": "container", "label": label}
         self._stream = engine.do("events", engine.api.events, since=int(time.time()) - 1, filters=filters, decode=True)

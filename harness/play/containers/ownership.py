@@ -41,7 +41,9 @@ def this_process() -> str:
 
 
 def is_alive(owner: str) -> bool:
-    """Return true if the process that a container's label names still exists. For an invalid label return false."""
+    """Return true if the process that owns a container still exists. The label of the container identifies this
+    process. Return false for an invalid label.
+    """
     match owner.split():
         case [boot, pid, started] if pid.isdecimal():
             return boot == _boot() and started == _start_time(int(pid))

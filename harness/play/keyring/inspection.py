@@ -28,7 +28,7 @@ from ucp.secure.bundle import (
 from ucp.secure.keyfile import KeyFileError, key_in, read_any_key_file
 
 Facts = dict[str, Any]
-"""The JSON output for a file: `file`, `kind`, `mission`, and further keys for some kinds."""
+"""The facts about a key file as JSON: `file`, `kind`, `mission`, and further keys for some kinds."""
 
 
 def inspect(path: Path) -> list[Facts]:
@@ -43,7 +43,7 @@ def inspect(path: Path) -> list[Facts]:
 
 
 def in_words(facts: Facts) -> str:
-    """Return the facts as one line of text. Public keys are shortened."""
+    """Format the facts about a key file as one line of text. Public keys are shortened."""
     more = [f"{name.replace('_', ' ')} {_shown(name, value)}" for name, value in facts.items() if name not in _HEAD]
     return f"{facts['file']}: {facts['kind']}, mission {facts['mission']}" + "".join(f", {words}" for words in more)
 
@@ -68,7 +68,7 @@ def _shown(name: str, value: Any) -> str:
 
 def _inspect(path: Path) -> Facts:
     def private(document: Facts) -> Facts:
-        """Return the mission of a private key, and the public key that belongs to the private key."""
+        """Return the mission of a private key, and the public key that belongs to it."""
         mission = key_in(document, "mission", MISSION_ID_BYTES).hex()
         private_key = key_in(document, "private_key", KEY_BYTES)
         if document["schema"] == DEPOT_SCHEMA:

@@ -87,11 +87,13 @@ class KeyDirectory:
         return _as_keys_error(lambda: load_public(self.directory / PUBLIC_NAME))
 
     def bundle(self, agent_id: int) -> Bundle:
-        """Return the secret keys of a vehicle. Raises KeysError if the vehicle has been excluded."""
+        """Return the secret keys of a vehicle. Raises KeysError if the vehicle is revoked."""
         return self.bundles([agent_id])[agent_id]
 
     def bundles(self, agents: Sequence[int] | None = None, *, also_revoked: bool = False) -> dict[int, Bundle]:
-        """Return the secret keys of these vehicles. By default, return those of all vehicles that are not excluded."""
+        """Return the secret keys of these vehicles. Without `agents`, return those of all vehicles that are not
+        revoked.
+        """
         public, path = self.public(), self.directory / VEHICLES_NAME
         revocation = None if also_revoked else self.revocation()
         revoked = revocation.revoked if revocation else frozenset[int]()
@@ -136,16 +138,16 @@ class KeyDirectory:
         return [*paths.values()]
 
     def revocation(self, public: PublicKeys | None = None) -> Revocation | None:
-        """Return the newest list of excluded vehicles in the directory, after a check of its signature.
+        """Read the newest list of revoked vehicles from the directory, and check its signature.
 
-        Return None if there is no list.
+        Return None if the directory has no list.
         """
         path = self.directory / REVOCATION_NAME
         return load_revocation(path, public or self.public()) if path.exists() else None
 
     def revoke(self, agents: Sequence[int]) -> Revocation:
-        """Exclude these vehicles from the mission. Return a signed list with the next number, which contains all
-        vehicles excluded so far.
+        """Revoke these vehicles. Return a signed list with the next number. The list contains all vehicles revoked so
+        far.
         """
         public, last = self.public(), self.revocation()
         before = last.revoked if last else frozenset[int]()
@@ -167,7 +169,7 @@ class KeyDirectory:
         return revocation
 
     def authority(self, public: PublicKeys) -> bytes:
-        """Return the private key that signs lists of excluded vehicles. Raises KeysError if the key does not match
+        """Return the private key that signs lists of revoked vehicles. Raises KeysError if the key does not match
         `public`.
         """
 
@@ -183,7 +185,7 @@ class KeyDirectory:
 
 
 def load_depot_key(path: Path) -> Depot:
-    """Return the key that decrypts event data, from a key file or a directory of keys. Raises KeysError."""
+    """Read the key that decrypts event data from a key file or a directory of keys. Raises KeysError."""
     file = path / DEPOT_NAME if path.is_dir() else path
 
     def parse(document: dict[str, Any]) -> Depot:
@@ -193,7 +195,7 @@ def load_depot_key(path: Path) -> Depot:
 
 
 def load_revocation(path: Path, public: PublicKeys) -> Revocation:
-    """Return the list of excluded vehicles in a file, if its signature is valid for this mission. Raises KeysError."""
+    """Read a list of revoked vehicles from a file. Raises KeysError if its signature is not valid for this mission."""
 
     def parse(document: dict[str, Any]) -> Revocation:
         _check_mission(document, public)
@@ -208,7 +210,7 @@ def load_revocation(path: Path, public: PublicKeys) -> Revocation:
 
 
 def write_revocation(path: Path, revocation: Revocation, public: PublicKeys) -> None:
-    """Write a signed list of excluded vehicles. Raises OSError."""
+    """Write a signed list of revoked vehicles. Raises OSError."""
     message = base64.b64encode(revocation.encode()).decode("ascii")
     document = {"schema": REVOCATION_SCHEMA, "mission": public.mission.hex(), "message": message}
     write_key_file(path, document, secret=False)
@@ -220,7 +222,7 @@ def _check_mission(document: Mapping[str, Any], public: PublicKeys) -> None:
 
 
 def _as_keys_error(read: Callable[[], T]) -> T:
-    """Return the result of `read`. A KeyFileError is converted to a KeysError."""
+    """Call `read` and return its result. Convert a KeyFileError to a KeysError."""
     try:
         return read()
     except KeyFileError as error:
@@ -236,17 +238,17 @@ def _unknown_agent(agent_id: int, public: PublicKeys) -> KeysError:
 
 
 def listed(agents: Iterable[int]) -> str:
-    """Return the agents as a list in words."""
+    """Return the agents as text for a sentence, such as "agents 1 and 2"."""
     first, *others = sorted({*agents})
     shown = ", ".join(map(str, [first, *others[:MOST_NAMED]])) + (", ..." if len(others) > MOST_NAMED else "")
     return f"agents {shown}" if others else f"agent {shown}"
 
 
 class RevocationAuthority:
-    """The authority that excludes vehicles. It signs lists of all vehicles excluded so far. `last` is the newest list.
+    """The authority that revokes vehicles. It signs lists of all vehicles revoked so far. `last` is the newest list.
 
-    Without a `private_key`, only `last` is available. New revocations are not stored, because a mission must not change
-    the directory of its keys.
+    Without a `private_key`, the authority can only return `last`. It does not store new lists, because a mission must
+    not change the directory of its keys.
     """
 
     def __init__(self, public: PublicKeys, private_key: bytes | None, last: Revocation | None = None) -> None:
@@ -261,7 +263,7 @@ class RevocationAuthority:
 
     @classmethod
     def in_directory(cls, home: KeyDirectory, public: PublicKeys) -> "RevocationAuthority":
-        """Return the authority of a key directory. The private key and the list of excluded vehicles may be missing.
+        """Return the authority of a key directory. The private key and the list of revoked vehicles may be missing.
 
         Raises KeysError.
         """
@@ -270,11 +272,11 @@ class RevocationAuthority:
 
     @property
     def revoked(self) -> frozenset[int]:
-        """The vehicles that are excluded so far."""
+        """The vehicles that are revoked so far."""
         return self._last.revoked if self._last else frozenset()
 
     def refuse(self, agents: Iterable[int], directory: object) -> None:
-        """Raise KeysError if the authority cannot exclude these agents. The message names `directory`."""
+        """Raise KeysError if the authority cannot revoke these agents. The message names `directory`."""
         lacking = {*agents} - self.revoked
         if self._private_key is not None or not lacking:
             return
@@ -286,8 +288,8 @@ class RevocationAuthority:
         )
 
     def revoke(self, agent_id: int) -> bytes:
-        """Return a message body with a signed list that excludes this agent. Sign a new list only if the newest one
-        lacks the agent.
+        """Return a message body with a signed list of revoked agents that contains this agent. Sign a new list only if
+        the newest list lacks the agent.
         """
         if self._last is None or agent_id not in self._last.revoked:
             assert self._private_key is not None, "was refused"

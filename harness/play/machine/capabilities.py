@@ -27,7 +27,7 @@ from sitl.vehicle import VehicleError
 class MachineRequirement:
     """A property that this machine needs to play runs. `way_out` is the remedy for a machine that lacks it.
 
-    Without a `needed` property, no run is possible.
+    If a `needed` property is missing, this machine can play no run.
     """
 
     name: str
@@ -98,7 +98,7 @@ def _ardupilot() -> MachineRequirement:
 
 
 _SHOWN = {"": (100.0, "%"), "s": (1000.0, "ms"), "bit/s": (0.001, "kbit/s"), "packets": (1.0, "packets")}
-"""Unit of `netem.measure` -> factor and name of the printed unit."""
+"""Unit in `netem.measure` -> factor and name of the unit that is printed."""
 
 
 def measure_engines(requirements: Iterable[MachineRequirement], say: Callable[[str], None]) -> list[EngineMeasurement]:
@@ -126,8 +126,8 @@ def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -
 
 @contextlib.contextmanager
 def progress_line(console: Console) -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows progress. On a terminal, each text replaces the previous one. Otherwise, each text is
-    printed as a line.
+    """Yield a function that shows progress. On a terminal, each text replaces the previous one. Without a terminal, the
+    function prints each text as a line.
     """
     if not console.is_terminal:
         yield lambda words: console.print(words, highlight=False, soft_wrap=True)

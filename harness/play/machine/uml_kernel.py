@@ -12,7 +12,7 @@ from netem import uml, uml_shell
 from netem.errors import UmlError
 
 OUT = "--out="
-"""Option that passes the run directory to the command inside."""
+"""The option that passes the run directory to the command inside User Mode Linux."""
 
 
 class UmlKernel(StrEnum):

@@ -1,8 +1,9 @@
 """Run an agent under test as a program in the network namespace of its vehicle.
 
-The harness starts the program, sends commands to its control socket, and collects its files. An agent that starts
-again after a kill or a brown-out is a new incarnation: a new process in a directory of its own. The new process cannot
-overwrite files of an earlier incarnation. It also does not find them, unless the fault left the disk intact.
+The harness starts the program, sends commands to its control socket, and collects its files. If an agent starts again
+after a kill or a power failure, it is a new incarnation: a new process in a new directory. The new process cannot
+overwrite files of an earlier incarnation. It gets the stored data of the earlier incarnation only if the fault left the
+disk intact.
 """
 
 import asyncio
@@ -65,25 +66,25 @@ class _ProcessIncarnation:
 
     directory: Path
     store: Path
-    """File in which the agent stores its state, if it has a disk."""
+    """The file in which the agent stores its state, if the agent has a disk."""
     status: AgentStatus | None = None
     """The last status that the agent reported."""
     status_between_s: tuple[float, float] = (0.0, 0.0)
-    """Earliest and latest mission second at which the agent can have read its counters for `status`."""
+    """The earliest and the latest mission second at which the agent can have read the counters in `status`."""
     killed: bool = False
-    """The agent ended by SIGKILL, and its disk was not kept."""
+    """True if the incarnation ended by SIGKILL and its disk was not kept."""
     switched_off: bool = False
-    """The agent ended by SIGTERM. Only its files show its actions after the last status."""
+    """True if the incarnation ended by SIGTERM. Its actions after the last status are known only from its files."""
     reboot: bool = False
-    """The agent started with the data on its disk."""
+    """True if the incarnation started with the data on its disk."""
     completed_known: bool = False
-    """The completed blocks of this killed incarnation have been read from its trace."""
+    """True if the blocks that this killed incarnation completed have been read from its trace."""
     trace_bytes_copied: int = 0
-    """Number of bytes of its trace that the trace of the first incarnation already contains."""
+    """Number of bytes of this incarnation's trace that were already appended to the trace of the first incarnation."""
 
     def handler_runs(self) -> dict[str, int | float] | None:
-        """Return the number of handler runs that the agent last reported, with the time of the report. Return None if
-        there is no report.
+        """Return the number of handler runs that the agent last reported, and the time of this report. Return None
+        without a report.
         """
         if self.status is None:
             return None
@@ -95,20 +96,22 @@ class AgentProcess:
     """The process of one agent. The object also keeps the files and results of its earlier processes."""
 
     def __init__(self, agent_id: int, rundir: RunDirectory, command: Sequence[str], now: Callable[[], float]) -> None:
-        """Create the object. `command` starts the agent with its mission file as last argument. `now` returns mission
-        seconds.
+        """Create the object without starting the process. `command` starts the agent with its mission file as last
+        argument. `now` returns mission seconds.
         """
         self.agent_id = agent_id
         self._command = command
         self._now = now
         self.outcome = "not started"
-        """State of the agent. After the run, `run.json` records it with `detail`."""
+        """The state of the agent as one or two words. `run.json` records it after the run, together with `detail`."""
         self.detail: str | None = None
         self._rundir = rundir
         self._incarnations: list[_ProcessIncarnation] = []
         self._program: ControlledProgram | None = None
         self._control_lock = asyncio.Lock()
-        """Held while the agent answers a status request, so that no fault ends or pauses it meanwhile."""
+        """A lock that is held while the agent answers a status request. Faults wait for it before they end or pause the
+        agent.
+        """
         self._completed_before: list[str] = []
         self._left_behind: list[str] = []
 
@@ -142,7 +145,7 @@ class AgentProcess:
     ) -> None:
         """Start the program, and wait until it reports its status.
 
-        - `keeps_disk`: the agent stores its state in a file, with which it can reboot.
+        - `keeps_disk`: the agent stores its state in a file, so that it can reboot with it.
         - `epoch_us`: start time of the mission that the agent joins. None if the mission has not started.
         - `keys`: the key directories of a secured mission.
 
@@ -206,7 +209,7 @@ class AgentProcess:
     async def kill(self, *, disk_kept: bool = False) -> None:
         """Kill the process with SIGKILL. If `disk_kept` is true, the next start uses the data on the agent's disk.
 
-        Cancel `watch` first. Raises AgentFailedError if the agent has already failed.
+        Cancel the task that runs `watch` first. Raises AgentFailedError if the agent has already failed.
         """
         async with self._control_lock:
             if self.awake:
@@ -221,7 +224,7 @@ class AgentProcess:
         """End the process with SIGTERM. An agent exports its chain when it receives this signal. Cancel the task that
         runs `watch` first.
 
-        Raises AgentFailedError if the agent ends with an error, or not at all.
+        Raises AgentFailedError if the agent ends with an error or does not end.
         """
         async with self._control_lock:
             if self.awake:
@@ -308,8 +311,8 @@ class AgentProcess:
             self.outcome = "exported"
 
     def handler_runs_since(self, mission_s: float, handler: str) -> list[HandlerRun]:
-        """Return the runs of this handler that the trace records after `mission_s` and since the agent's last start.
-        The oldest run is first.
+        """Return the runs of this handler in the trace that happened after `mission_s` and since the agent's last
+        start. The oldest run is first.
 
         Lines that cannot be parsed are skipped, because the checker reports them.
         """
@@ -339,7 +342,7 @@ class AgentProcess:
         """Write the files that the checker reads: one trace, joined from all starts of the agent, and a copy of its
         last export.
 
-        A repeated call adds only new lines. Raises OSError.
+        A repeated call appends only new lines. Raises OSError.
         """
         for number, incarnation in enumerate(self._incarnations, 1):
             if incarnation.killed and not incarnation.completed_known:

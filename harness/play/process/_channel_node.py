@@ -1,9 +1,9 @@
 """Simulate a shared radio channel in a process of its own: `python -m harness.play.process._channel_node`.
 
-It takes over the broadcasts of all vehicles from the switch (`netem.relay`), and delivers them as `LiveChannel`
-decides. Its working directory is the run directory: it contains the socket `channel.control` for the commands below,
-and the journal `channel.jsonl`. Large values of commands are files there, because a line of a control socket is short.
-SIGTERM ends the process.
+It takes over the broadcasts of all vehicles from the switch (`netem.relay`), and delivers them when `LiveChannel`
+decides. Its working directory is the run directory. The process creates the socket `channel.control` there, which
+accepts the commands below, and the journal `channel.jsonl`. Large values of commands are passed in files, because the
+length of a line on a control socket is limited. SIGTERM ends the process.
 
 The process waits with `select`, whose timeouts are exact to microseconds. It measures how late each delivery is.
 """
@@ -47,12 +47,12 @@ from ucp.messages import (
 
 CONTROL = "channel.control"
 VALUE = "channel.value"
-"""File with a large value of a command or an answer."""
+"""Name of the file with a large value of a command or an answer."""
 
 NANOSECONDS = 1e9
 KEPT_QUESTIONS = 10_000
 TYPE_AT = 3
-"""Place of the type code in a datagram."""
+"""Position of the type code in a datagram."""
 ANSWER_TO = {
     TYPE_CODES[question]: TYPE_CODES[answer]
     for question, answer in (
@@ -62,11 +62,13 @@ ANSWER_TO = {
         (RequestForBlock, BlockResponse),
     )
 }
-"""Type code of a question -> type code of its answers."""
+"""Type code of a query or request -> type code of its answers."""
 
 
 class ChannelNode:
-    """The process that simulates the radio channel. It logs to `journal`. Raises OSError if it may not read packets."""
+    """The process that simulates the radio channel. It writes its log to `journal`. Raises OSError if the process may
+    not read packets.
+    """
 
     def __init__(self, directory: Path, journal: Path, port: int) -> None:
         self._directory = directory
@@ -133,7 +135,9 @@ class ChannelNode:
             channel.send(at_s, heard.vehicle, heard.frame, len(data), _sequence(data, heard.vehicle))
 
     def _deliver_to_all(self, relay: Relay, heard: ReceivedBroadcast) -> None:
-        """Deliver a broadcast of the rogue node (a sender outside the swarm) at once, without use of the channel."""
+        """Deliver a broadcast of the rogue node (a sender outside the swarm) at once. It does not occupy the
+        channel.
+        """
         for vehicle in self._roster:
             relay.deliver(vehicle, heard.frame)
 
@@ -198,16 +202,16 @@ class ChannelNode:
 
 
 class DeliveryLateness:
-    """Measure how late the channel delivered frames, in mission seconds."""
+    """A meter of the time by which the channel delivered frames late, in mission seconds."""
 
     def __init__(self) -> None:
         self.missed = 0
-        """Broadcasts that the process did not hear."""
+        """Number of broadcasts that the process did not receive, because its buffer was full."""
         self.unsent = 0
-        """Deliveries that a port did not accept."""
+        """Number of deliveries that a port did not accept."""
         self._all = array("f")
         self._most: list[float] = []
-        """Greatest lateness in each interval of the load."""
+        """Greatest lateness of a delivery in each interval of the load."""
 
     def add(self, due_s: float, now: float) -> None:
         """Record the lateness of a delivery that was due at `due_s` and happened at the time `now`."""
@@ -235,21 +239,24 @@ class DeliveryLateness:
 
 
 class AnswerTimeMeter:
-    """Measure the time from the delivery of a query to the agent's answer, in mission seconds.
+    """A meter of the time from the delivery of a query to the agent's answer, in mission seconds.
 
-    In virtual time, an agent answers at once, and `processing_s` follows. A process first waits for a processor. If
-    many agents share few processors, they answer one after another, and fewer answers collide.
+    In virtual time, an agent answers at once, and its radio gets the answer after `processing_s`. A real process first
+    waits for a processor. If many agents share few processors, they answer one after another, and fewer answers
+    collide.
     """
 
     def __init__(self) -> None:
         self._all = array("f")
         self._question: dict[bytes, int] = {}
-        """Frame of a question -> type code of its answers. Only the latest questions are kept."""
+        """Frame of a query -> type code of its answers. Only the latest queries are kept."""
         self._asked_s: dict[tuple[int, int], float] = {}
-        """(Vehicle, type code of an answer) -> when the vehicle got the latest question."""
+        """(Vehicle, type code of an answer) -> the time at which the vehicle received the latest query for such an
+        answer.
+        """
 
     def sent(self, heard: ReceivedBroadcast, data: bytes, at_s: float) -> None:
-        """Record that a vehicle sent this datagram."""
+        """Record that a vehicle sent this datagram at `at_s`."""
         code = data[TYPE_AT] if len(data) > TYPE_AT else None
         if code in ANSWER_TO:
             self._question[heard.frame] = ANSWER_TO[code]
@@ -269,8 +276,8 @@ class AnswerTimeMeter:
 
 
 def _quantiles(ordered: list[float]) -> dict[str, float]:
-    """Return the median and the 95 % quantile of the values, which are in ascending order. Both results are 0 if there
-    are no values.
+    """Return the median and the 95 % quantile of the values, which are in ascending order. Return 0 for both if the
+    sequence is empty.
     """
     count = len(ordered)
     shares = {"median_s": count // 2, "p95_s": count * 95 // 100}
@@ -278,7 +285,9 @@ def _quantiles(ordered: list[float]) -> dict[str, float]:
 
 
 def _sequence(data: bytes, vehicle: int) -> int | None:
-    """Return the sequence number of a message. Return None if the data are not a message of the vehicle's agent."""
+    """Return the sequence number of a message. Return None if the data are not a message of the agent on this
+    vehicle.
+    """
     if len(data) < HEADER.size:
         return None
     magic, _, _, sender, sequence, _ = HEADER.unpack_from(data)

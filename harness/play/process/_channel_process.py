@@ -42,7 +42,7 @@ class ChannelProcess:
         self._conditions = NetworkConditions()
         self._begun = False
         self._asking = asyncio.Lock()
-        """The file of values belongs to one command at a time."""
+        """A lock for the file of values, which only one command at a time may use."""
 
     async def start(self, lab: Lab) -> None:
         """Start the process and wait until it listens. Raises MachineError."""

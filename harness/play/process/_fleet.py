@@ -21,14 +21,16 @@ from sitl.vehicle import Home, VehicleError, VehicleKind
 from ucp.clock import MissionClock
 
 LATE_S = 10.0
-"""Mission seconds by which ArduPilot, or a vehicle on a busy machine, may take off later than computed."""
+"""Mission seconds by which a vehicle may take off later than computed. ArduPilot, or a busy machine, can cause such a
+delay.
+"""
 AWAY_M = 5.0
 
 
 class Fleet:
     """The vehicles of a run, one for each agent. `bool(fleet)` is false in a run without vehicles.
 
-    The watchers end the mission with VehicleFailedError when a vehicle fails.
+    The tasks in `watchers` end the mission with VehicleFailedError when a vehicle fails.
     """
 
     def __init__(
@@ -146,7 +148,7 @@ class Fleet:
     # End of the run
 
     def shortfalls(self, mission_s: float) -> list[str]:
-        """Return a sentence for each vehicle that has not left its home position, although it should have."""
+        """Return a sentence for each vehicle that should have left its home position, but has not."""
         sentences = (
             vehicle.shortfall() for vehicle in self._vehicles.values() if self._should_have_left(vehicle, mission_s)
         )

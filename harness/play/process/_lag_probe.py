@@ -1,6 +1,6 @@
 """Measure how late this machine wakes up programs, and how long each agent waits for a processor.
 
-The harness starts this program beside a mission. It writes JSON lines to the file in its first argument, and ends when
+The harness runs this program during a mission. It writes JSON lines to the file in its first argument, and ends when
 its standard input ends. `harness.archive.lag` describes a line.
 
 A timer of an agent expires late for two reasons:
@@ -9,8 +9,8 @@ A timer of an agent expires late for two reasons:
 - The process is busy, or waits for a processor. The kernel counts the running and the waiting time of each process
   (/proc/PID/schedstat), and the time in which programs waited for a disk (/proc/pressure/io).
 
-These figures exist for agents in any language. An agent can influence them only by using processor time. The program
-imports only the standard library, so that it starts fast.
+The kernel provides these values for agents in any language. An agent can change them only by using processor time. The
+program imports only the standard library, so that it starts fast.
 """
 
 import json
@@ -22,9 +22,11 @@ from pathlib import Path
 from typing import TextIO
 
 BEAT_S = 0.02
-"""Wall time between two measurements of the machine."""
+"""Seconds of wall time between two measurements of this machine."""
 SLICE_MISSION_S = 2.0
-"""Time of one line in mission seconds. A line has at least `MIN_SLICE_S` and at most `MAX_SLICE_S` of wall time."""
+"""Mission seconds that one output line covers. A line covers at least `MIN_SLICE_S` and at most `MAX_SLICE_S` seconds
+of wall time.
+"""
 MIN_SLICE_S = 0.1
 MAX_SLICE_S = 1.0
 NANOSECONDS = 1e9
@@ -66,8 +68,8 @@ class KernelCounters:
         return busy
 
     def stalled(self) -> float:
-        """Return the seconds in which this machine ran no program because of a disk or a hypervisor, since the previous
-        call.
+        """Return the seconds since the previous call in which this machine ran no program, because of a disk or a
+        hypervisor.
         """
         before, self._stalled = self._stalled, self._read_stalled()
         return sum(self._stalled) - sum(before)

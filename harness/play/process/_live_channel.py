@@ -1,11 +1,12 @@
 """Decide when each broadcast on a shared radio channel reaches each vehicle, without I/O and without a clock.
 
-The model and the random draws are those of virtual time. A message of an agent waits for its processing time and in the
-queue of its radio. When its frame ends, the conditions of the network apply to each copy that the channel delivers.
-Other broadcasts, such as ARP requests, do not use the channel, and only the conditions apply to them.
+The model and the random numbers are the same as in virtual time. A message of an agent waits for its processing time
+and in the queue of its radio. When its frame ends, the conditions of the network apply to each copy that the channel
+delivers. Other broadcasts, such as ARP requests, do not use the channel, and only the conditions apply to them.
 
-The caller is always a little late: it hears of a broadcast after it was sent, and of an event after its time. Both have
-their exact times, so lateness delays a delivery but changes no other decision of the model.
+The caller is always slightly late: it calls `send` after the broadcast was sent, and `advance` after the time of an
+event. It passes the exact times of both. Lateness therefore delays deliveries, but changes no other decision of the
+model.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ from netem.radio import Place
 class _ChannelMessage:
     frame: bytes
     sequence: int | None
-    """The number of the message, if it is one of an agent."""
+    """The sequence number of the message in the frame. None if the frame contains no message of an agent."""
 
 
 class FrameDelivery(NamedTuple):
@@ -33,7 +34,7 @@ class FrameDelivery(NamedTuple):
 
     at_s: float
     order: int
-    """Deliveries at the same time keep this order."""
+    """A number that orders deliveries at the same time."""
     vehicle: int
     frame: bytes
 
@@ -69,7 +70,7 @@ class LiveChannel:
         self._traffic.send(at_s, self._number[vehicle], _ChannelMessage(frame, sequence), data_bytes)
 
     def pass_by(self, at_s: float, vehicle: int, frame: bytes) -> None:
-        """Let a vehicle broadcast this frame without use of the channel."""
+        """Let a vehicle broadcast this frame without occupying the channel."""
         sender = self._number[vehicle]
         everyone = (1 << len(self._roster)) - 1
         self._copy(at_s, self._medium.draw(sender, at_s, len(frame)), everyone, frame)

@@ -103,15 +103,15 @@ class ProgramRun:
         self._lag: LagMeter | None = None
         self._udp_before_start: Mapping[int, UdpCounters] = {}
         self._injected: list[TimedInjection] = []
-        """The injections that the rogue node was ordered to make."""
+        """The injections that were requested from the rogue node."""
         self._waited_until_s = 0.0
         """Mission second at which the last `until` or `until_run` ended."""
         self._starting: dict[int, asyncio.Task[None]] = {}
-        """Agent -> its restart, which may still be under way."""
+        """Agent -> the task that restarts it, which may still be running."""
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[Self]:
-        """Open the virtual network inside this context, and end the run afterwards.
+        """Open the virtual network for the context, and end the run at the end of the context.
 
         Raises HarnessError if the lab cannot be opened. Later errors are recorded in `played`.
         """
@@ -181,7 +181,7 @@ class ProgramRun:
             self._fleet.take_off()
 
     async def _log_script(self) -> None:
-        """Let each running agent log its scripted events at their times."""
+        """Let each running agent log its scripted events at the scripted times."""
         for event in sorted(self.scenario.events.script, key=lambda event: event.at_s):
             await self.until(event.at_s)
             agent = self._agent(event.agent)
@@ -249,7 +249,8 @@ class ProgramRun:
     async def _strike_all(self, fault: Fault) -> None:
         """Apply the fault to all its agents at the same time.
 
-        Raises ScenarioError if it is possible for no agent. If it is impossible for some agents, record the reasons.
+        Raises ScenarioError if the fault is impossible for all of them. If it is impossible for some, record the
+        reasons.
         """
         strikes = [self._strike(fault, agent_id) for agent_id in fault.agents]
         problems = [problem for problem in await asyncio.gather(*strikes, return_exceptions=True) if problem]
@@ -328,8 +329,9 @@ class ProgramRun:
     async def _apply_conditions(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
         """Apply and record the network conditions of a change.
 
-        The timeline passes the requested conditions in `asked`, and the record shows them with the applied ones. A
-        change by flight is recorded as the change alone.
+        For a change of the timeline, `asked` contains the requested conditions, and the record contains both the
+        requested and the applied conditions. For a change by the movement of vehicles, the record contains only the
+        change.
         """
         async with self._changing_network:  # apply changes in the order of their requests
             conditions = add_rogue_listener(change.conditions, self.scenario)
@@ -344,7 +346,7 @@ class ProgramRun:
         self.rundir.append_network(record)
 
     def _without_rogue(self, applied: AppliedConditions) -> dict[str, Any]:
-        """Return the network conditions and packet counters as JSON, without those of the rogue node."""
+        """Return the network conditions and packet counters as JSON, without the links of the rogue node."""
         figures = applied.to_json()
         if self._rogue is not None:
             figures["receivers"].pop(str(self._rogue.vehicle), None)
@@ -484,7 +486,9 @@ class ProgramRun:
         self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
 
     def _datagram_counters(self, counted: Mapping[int, UdpCounters]) -> dict[str, dict[str, int]]:
-        """Return the datagram counters of the agents for run.json. Omit agents whose vehicle program also uses UDP."""
+        """Return the datagram counters of the agents for run.json. Omit agents whose vehicle program also uses UDP,
+        because their counters contain its datagrams.
+        """
         agents = [agent for agent in self._udp_before_start if agent in self.scenario.roster]
         return {
             str(agent): {

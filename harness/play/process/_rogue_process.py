@@ -24,14 +24,14 @@ class RogueProcess:
     def __init__(self, vehicle: int, scenario: Scenario, seed: int, rundir: RunDirectory) -> None:
         self.vehicle = vehicle
         self.sent: dict[int, int] = {}
-        """Number of an injection -> number of datagrams that it made. Filled by `stop`."""
+        """Number of an injection -> number of datagrams that it sent. `stop` sets these numbers."""
         self._scenario = scenario
         self._seed = seed
         self._rundir = rundir
         self._program: ControlledProgram | None = None
 
     async def start(self, lab: Lab) -> None:
-        """Start the process and wait until it answers. Raises MachineError."""
+        """Start the process and wait until it answers. Raises MachineError if this fails."""
         place = self._rundir.path
         self._program = await ControlledProgram.start(
             partial(lab.spawn, self.vehicle),

@@ -27,13 +27,13 @@ class LabProgram(Protocol):
 
     @property
     def end(self) -> str:
-        """A phrase that describes to the user how the program ended."""
+        """A phrase for the user that describes how the program ended."""
 
     async def wait(self) -> int:
         """Wait for the program to end and for all its output to be in its files. Return `returncode`."""
 
     async def send_signal(self, number: int) -> None:
-        """Send a signal to the program. If it has ended, do nothing."""
+        """Send a signal to the program. Do nothing if it has ended."""
 
     async def pause(self) -> None:
         """Suspend the program until `resume`."""
@@ -47,7 +47,7 @@ class LabProgram(Protocol):
 class MissionLab(Protocol):
     """A virtual network with vehicles. Its methods raise NetemError if the network fails.
 
-    Methods without a docstring are documented in `netem.lab.Lab`.
+    `netem.lab.Lab` documents the methods that have no docstring here.
     """
 
     @property

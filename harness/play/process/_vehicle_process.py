@@ -116,8 +116,8 @@ class VehicleProcess:
         self.pilot.hand_over()
 
     def place(self, field: Home) -> Place:
-        """Return the last reported position relative to the middle of the field. Without a report, return the home
-        position.
+        """Return the last reported position relative to the middle of the field. If the vehicle has not reported a
+        position, return its home position.
         """
         position = self.pilot.state.position if self.pilot else None
         if position is None:
@@ -193,7 +193,9 @@ class VehicleProcess:
         await self._run_pilot(self.pilot.terminate_flight())
 
     def shortfall(self) -> str | None:
-        """Return a sentence if the vehicle still flies but has not left its home position. Otherwise return None."""
+        """Return a sentence if the vehicle is still active but has not left its home position. Otherwise return
+        None.
+        """
         if self.pilot is None or self._flight is None or self._process is None or self._process.returncode is not None:
             return None
         return self.pilot.shortfall(self._flight)

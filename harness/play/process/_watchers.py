@@ -45,7 +45,7 @@ class MissionTasks:
             task.cancel()
 
     def create_task(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Start a task. The mission ends only after the task has ended. `stop` does not cancel the task.
+        """Start a task that `stop` does not cancel. The mission ends only after the task has ended.
 
         Raises RuntimeError if a failure is already ending the mission.
         """

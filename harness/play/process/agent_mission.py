@@ -12,7 +12,7 @@ from ucp.messages import PORT
 from ucp.mission import SCHEMA
 
 NO_QUIRKS = {"ignore_commit": 0.0, "crash_on_tie": False, "early_phase3_expiry": False, "stale_chain_hash": False}
-"""The quirks that each mission file has. It has further quirks only if the scenario requests them."""
+"""The quirks that every mission file contains. Other quirks are in the file only if the scenario requests them."""
 
 
 def mission_file(
@@ -66,8 +66,8 @@ def mission_file(
 
 
 def _source(events: EventOptions, with_vehicle: bool) -> str:
-    """Return the source of the agent's events. For scripted events it is "none", because the harness sends them to the
-    agent.
+    """Return the event source for the mission file. It is "none" for scripted events, because the harness sends them to
+    the agent.
 
     An agent without a vehicle draws its events at random.
     """

@@ -51,7 +51,9 @@ def network_needs(scenario: Scenario) -> list[str]:
 
 
 def add_rogue_listener(conditions: NetworkConditions, scenario: Scenario) -> NetworkConditions:
-    """Return the network conditions. If the scenario has a rogue node, add links to it without loss and delay."""
+    """Return the network conditions. If the scenario has a rogue node, the result has additional links to it, without
+    loss and delay.
+    """
     return conditions.with_listener(scenario.rogue, scenario.roster) if scenario.rogue else conditions
 
 
@@ -59,7 +61,8 @@ def _network_states(scenario: Scenario) -> list[NetworkConditions]:
     """Return the different network conditions that occur in the scenario, at the scenario's speed and without
     partitions.
 
-    With a radio model, one link of each state loses more than the others, because links differ during the flight.
+    With a radio model, one link in each of them loses more messages than the others. The different links of a flight
+    are tested in this way.
     """
     states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
     out_of_reach = {frozenset(scenario.roster[:2]): 0.5} if scenario.network.radio else {}
@@ -79,8 +82,8 @@ def _network_states(scenario: Scenario) -> list[NetworkConditions]:
 def refuse_unsupported_network(scenario: Scenario) -> None:
     """Raise MachineError with a solution if this machine cannot create the network conditions of the scenario.
 
-    If the scenario needs more than loss and partitions, open a lab for a fraction of a second. Some kernels with netem
-    reject certain conditions. Apply these conditions in the lab.
+    If the scenario needs more than loss and partitions, this opens a lab for a fraction of a second. If some kernels
+    with netem reject the conditions of the scenario, the conditions are applied in this lab as a test.
     """
     needs = network_needs(scenario)
     uncertain = [network for network in _network_states(scenario) if may_refuse(network)]

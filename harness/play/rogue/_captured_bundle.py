@@ -1,8 +1,8 @@
 """Let an attacker use the keys of a captured vehicle to decrypt datagrams and to sign new ones.
 
-The group secret opens the datagrams of all senders, and derives the sealing keys of any sender. It does not contain the
-signature keys of other vehicles. A block sealed in another vehicle's name is therefore signed with the captured
-vehicle's key.
+With the group secret, the attacker can decrypt the datagrams of all senders, and compute the encryption keys of any
+sender. It does not have the signature keys of other vehicles. It therefore signs a block in another vehicle's name with
+the key of the captured vehicle.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from ucp.secure.session import Session
 class CapturedKeys:
     """The keys of a captured vehicle. `random_bytes` returns 8 random bytes for each forged restart of a vehicle.
 
-    Times are mission seconds; `now_us` is UTC in microseconds.
+    Times are mission seconds. `now_us` is the time in microseconds UTC.
     """
 
     def __init__(self, bundle: Bundle, random_bytes: Callable[[], bytes]) -> None:
@@ -29,14 +29,14 @@ class CapturedKeys:
         self._random_bytes = random_bytes
         self._opener = DatagramOpener(bundle)
         self._sessions: dict[int, Session] = {}
-        """Forged sender -> its session."""
+        """Imitated sender -> the forged session for its datagrams."""
         self._signatures: dict[bytes, bytes] = {}
         """Block hash -> the genuine signature, from received datagrams."""
 
     def opened(self, datagram: bytes) -> tuple[Message, AnsweredRequest] | None:
-        """Return the message in a datagram, and the identification that an answer must contain.
+        """Decrypt a datagram. Return its message, and the identification that an answer to it must contain.
 
-        Return None if the datagram cannot be decrypted.
+        Return None if the keys do not decrypt the datagram.
         """
         try:
             opened = self._opener.open(datagram)
@@ -51,7 +51,7 @@ class CapturedKeys:
     def sealed(
         self, sender: int, sequence: int, message: Message, request: AnsweredRequest | None, now: float, now_us: int
     ) -> bytes:
-        """Return a datagram in the name of `sender` that is as close to genuine as these keys allow. Use each sequence
+        """Return an encrypted datagram in the name of `sender`, as genuine as these keys allow. Use each sequence
         number once.
         """
         session = self._sessions.get(sender)

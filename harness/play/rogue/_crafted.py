@@ -55,7 +55,7 @@ def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, r
 
 
 def corrupted(data: bytes, bits: int, rng: Random) -> bytes:
-    """Return the datagram with `bits` randomly chosen bits inverted."""
+    """Return a copy of the datagram in which `bits` randomly chosen bits are inverted."""
     flipped = bytearray(data)
     for bit in rng.sample(range(8 * len(data)), min(bits, 8 * len(data))):
         flipped[bit // 8] ^= 1 << bit % 8

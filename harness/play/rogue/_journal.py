@@ -1,7 +1,7 @@
 """Write `rogue.jsonl`, the log of the datagrams that the rogue node sends.
 
-The first LINES datagrams of an injection have one line each. Later datagrams are counted by mission second. Such a line
-has `count` and `bytes`, and `messages` and `refused` by type and reason.
+The first LINES datagrams of an injection have one line each. Later datagrams are counted by mission second. A line of
+such counts has the keys `count` and `bytes`, `messages` by message type, and `refused` by reason.
 """
 
 from collections import Counter
@@ -18,7 +18,7 @@ class RogueJournal:
         self._write = write
         self._lines: Counter[int] = Counter()
         self._counted: dict[int, dict[str, Any]] = {}
-        """Injection -> its line of counts that is not written yet."""
+        """Injection -> its line of counts that has not been written yet."""
 
     def add(self, injected: RogueDatagram, at_s: float) -> None:
         number, record = injected.injection, injected.to_json(at_s)

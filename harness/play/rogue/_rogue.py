@@ -3,9 +3,10 @@
 Like `ucp.agent`, it is driven by calls (`receive`, `begin`, `handle_timer`), and `to_send` returns the results. Times
 are mission seconds. Equal inputs and seeds give equal outputs.
 
-It follows the chain of the swarm from outside. A Block Add Request contains the top chain hash of its sender before the
-commit, and a Commit Block the one after it. A forged block on top of the last of these meets the conditions of
-Algorithm 6 at all agents with this chain. The thesis leaves signatures to the platform (Section 3.3).
+The rogue node knows the chain of the swarm from received messages. A Block Add Request contains the top chain hash of
+its sender before the commit, and a Commit Block contains the chain hash after the commit. A forged block on top of the
+newest of these chain hashes meets the conditions of Algorithm 6 at all agents with this chain. The thesis leaves
+signatures to the platform (Section 3.3).
 """
 
 from collections import Counter, deque
@@ -41,9 +42,9 @@ if TYPE_CHECKING:
     from ucp.secure.sealed_datagrams import AnsweredRequest
 
 MAX_REMEMBERED = 10_000
-"""Maximum number of datagrams that are kept for replays."""
+"""Maximum number of received datagrams that the rogue node keeps for replays."""
 MAX_WAITING = 100_000
-"""Maximum number of copies that wait to be sent. Further copies are not made."""
+"""Maximum number of datagrams that wait to be sent. The rogue node makes no further ones."""
 FLOOD_BATCH = 64
 """Maximum number of messages of a flood in a row, before the rogue node handles other work."""
 
@@ -63,9 +64,9 @@ class RogueDatagram:
     source: int
     datagram: bytes
     plain: bytes | None = None
-    """The datagram before sealing, if the rogue node sealed it."""
+    """The datagram before encryption. None if the rogue node did not encrypt it."""
     receivers: Sequence[int] | None = None
-    """The only receivers, or None for a broadcast."""
+    """The receivers of the datagram. None for a broadcast."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
         said = self.plain or self.datagram
@@ -99,7 +100,7 @@ class RogueLogic:
     """The state of the rogue node: received messages, active injections, and datagrams to send.
 
     `epoch_us` is mission second 0 on the agents' clocks, in microseconds. `captured` are the keys of a captured
-    vehicle. `initial_data` is that of the mission, and is needed for lies about chains.
+    vehicle. `initial_data` is the data of the inception block. Forged messages about chains need it.
     """
 
     def __init__(
@@ -117,13 +118,13 @@ class RogueLogic:
         self._epoch_us = epoch_us
         self._captured = captured
         self._secured = captured is not None
-        """True if the node has keys, or has received a sealed datagram."""
+        """True if the rogue node has keys, or has received an encrypted datagram."""
         self._received: deque[tuple[int, str, bytes]] = deque(maxlen=MAX_REMEMBERED)
         self._top_chain_hash: bytes | None = None
         self._votes_name_chain = False
         self._known_blocks = KnownBlocks(initial_data, epoch_us)
         self._queries: dict[tuple[int, str], AnsweredRequest] = {}
-        """(sender, type of a query) -> identification of the last sealed query, for an answer."""
+        """(Sender, type of a query) -> identification of the last encrypted query, which an answer must contain."""
         self._windows: list[_ActiveInjection] = []
         self._waiting: list[tuple[float, int, RogueDatagram]] = []
         self._outbox: list[RogueDatagram] = []
@@ -163,8 +164,8 @@ class RogueLogic:
         return clear.sender, NAMES.get(clear.type, ""), *(opened or (None, None))
 
     def begin(self, number: int, injection: Injection, now: float) -> None:
-        """Begin the injection with this number, which counts from 1. A replay, a lie, or a forgery without duration
-        ends in this call.
+        """Begin injection number `number`, counted from 1. A replay, a `lie`, or a forgery without duration also ends
+        in this call.
         """
         self.sent[number] += 0
         if isinstance(injection, Replay):
@@ -183,7 +184,7 @@ class RogueLogic:
         return min([*times, *(at for at, _, _ in self._waiting[:1])], default=None)
 
     def handle_timer(self, now: float) -> None:
-        """Add the datagrams that are due to the queue."""
+        """Add the datagrams that are due now to the queue."""
         while self._waiting and self._waiting[0][0] <= now:
             self._outbox.append(heappop(self._waiting)[2])
         for window in list(self._windows):

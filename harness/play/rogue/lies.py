@@ -1,5 +1,5 @@
-"""Create the forged message that a timeline entry `lie` describes. The entry names blocks and chains as the rogue node
-knows them.
+"""Create the forged message that an entry `lie` of the timeline describes. The entry names blocks and chains that the
+rogue node knows.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from ucp.messages import (
 )
 
 NOBODYS = b"\xff" * HASH_BYTES
-"""A hash that no block has."""
+"""A hash that belongs to no block."""
 MADE = "made "
 
 
@@ -109,5 +109,5 @@ class KnownBlocks:
 
 
 def made_block(agent_id: int, timestamp_us: int) -> Block:
-    """Return a block in the name of an agent that the agent never completed."""
+    """Return a block in the name of an agent. The agent never completed such a block."""
     return Block(agent_id, timestamp_us, LoggableEvent(timestamp_us, 1, b"made by its captor").encode())

@@ -7,7 +7,9 @@ from ucp.secure.envelope import CONTROL_NAMES, NAMES, read_clear_header
 from ucp.secure.envelope import VERSION as SECURED
 
 OF_NO_INJECTION = -1
-"""Injection number of a datagram that the scenario itself contains (`harness.scenario.injection`)."""
+"""Injection number of a datagram that belongs to no injection, because the scenario itself contains it
+(`harness.scenario.injection`).
+"""
 
 
 def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, Any]:
@@ -40,7 +42,7 @@ def _secured(datagram: bytes) -> dict[str, Any]:
 FORGED_FROM = 1 << 31
 """First sequence number of forged datagrams. Agents never reach it."""
 _EACH = 1 << 17
-"""Sequence numbers for each injection, more than a flood has datagrams."""
+"""Number of sequence numbers for each injection. It is more than the number of datagrams in a flood."""
 
 
 def forged_sequence(injection: int, count: int) -> int:

@@ -1,8 +1,8 @@
 """Write packet capture files of a simulated run, one for the network interface of each vehicle.
 
 The files have the format of `netem.capture`, and contain the frames that a kernel would send. Mission second 0 is the
-Unix epoch, at speedup 1. Frames also reach the interface of a paused or dead agent. A copy that the network corrupts
-is in no file of a receiver, because the simulation does not deliver it.
+Unix epoch, at speedup 1. The files of a paused or dead agent also contain the frames that reach its interface. A
+corrupted copy of a frame is in no file of a receiver, because the simulation does not deliver it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,7 +35,7 @@ class VirtualCapture:
             self._open = opened.pop_all()
 
     def air(self, *arguments: Any, deliver_all: bool) -> "CapturedAir":
-        """Return a simulated network that writes to these files."""
+        """Return a simulated network that writes all frames to these files."""
         return CapturedAir(self, *arguments, deliver_all=deliver_all)
 
     def record(self, mission_s: float, number: int, frame: bytes, *, outbound: bool) -> None:

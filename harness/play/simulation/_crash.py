@@ -1,7 +1,8 @@
 """Detect that an agent crashed although it runs in the harness's own process.
 
 An engineer edits the core in place, and in virtual time the core runs in the process of the harness. An exception that
-comes out of `ucp` is a failure of the agent, like the end of an agent's process. Any other exception is the harness's.
+comes out of `ucp` is a failure of the agent, like the end of an agent's process. Any other exception is an error of the
+harness.
 """
 
 from pathlib import Path
@@ -17,7 +18,9 @@ MAX_WORDS = 200
 
 
 def core_crash(incarnation: SimulatedIncarnation | None, error: Exception) -> AgentFailedError | None:
-    """Return the failure of the agent if the agent's own code raised the exception. Otherwise return None."""
+    """Return the failure of the agent if its own code raised the exception. Return None if code of the harness raised
+    it.
+    """
     frames = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
     ours = [(path, line) for path, line in frames if path.is_relative_to(CORE) or path.is_relative_to(HARNESS)]
     if incarnation is None or incarnation.state is None or not ours or not ours[-1][0].is_relative_to(CORE):

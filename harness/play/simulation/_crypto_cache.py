@@ -1,13 +1,13 @@
 """Cache cryptographic results for all agents of a simulated mission.
 
-All agents receive the same bytes. The header, the sender's keys, the plaintext and the validity of the signature are
-functions of keys and bytes alone. The cache stores the results of these functions by their arguments. A receiver with
-another secret, another public key or other bytes has other arguments, so it never gets a result of another receiver.
-Checks that depend on the receiver are not cached: freshness, the current epoch, its own queries, and revocations.
+All agents receive the same bytes. The header, the sender's keys, the plaintext and the validity of the signature depend
+only on keys and bytes. The cache stores these results by the keys and bytes. If a receiver has a different secret,
+public key or datagram, it never gets the cached result of another receiver. Checks that depend on the receiver are not
+cached: freshness, the current epoch, its own queries, and revocations.
 
 A signature is valid if it was made in this process over the same bytes with the private key of the same key pair. Such
-a signature is not verified again, except one in `VERIFIED_EVERY`, which would reveal a library that cannot verify its
-own signatures. All other signatures are verified. A full cache drops its oldest entries, which only costs time.
+a signature is not verified again, except one in `VERIFIED_EVERY`, which detects a library that cannot verify its own
+signatures. All other signatures are verified. A full cache drops its oldest entries, which only costs time.
 """
 
 from functools import lru_cache
@@ -26,7 +26,7 @@ VERIFIED_EVERY = 128
 
 
 def cached_crypto() -> CryptoFunctions:
-    """Return the cryptographic functions, with caches, for all agents of a mission."""
+    """Return the cryptographic functions for all agents of a mission. The functions cache their results."""
     signatures = RecordedSignatures()
     return CryptoFunctions(
         read=lru_cache(DATAGRAMS_CACHED)(read_clear_header),
@@ -39,11 +39,13 @@ def cached_crypto() -> CryptoFunctions:
 
 
 class RecordedSignatures:
-    """A record of all signatures made in this process, so that they can be verified without computation."""
+    """A record of all signatures made in this process. It replaces the computation when such a signature is
+    verified.
+    """
 
     def __init__(self) -> None:
         self._made: dict[bytes, tuple[bytes, bytes]] = {}
-        """Signature -> public key of the key pair, and the signed bytes."""
+        """Signature -> the public key of its key pair, and the signed bytes."""
         self._number = count(1)
 
     def signer(self, private_key: bytes) -> "RecordingSigner":

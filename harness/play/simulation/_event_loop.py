@@ -46,19 +46,21 @@ if TYPE_CHECKING:
 
 ANY_INCARNATION = 0
 KEPT_MESSAGES = 10_000
-"""Number of messages that a rogue node knows if it starts during a run. A rogue node keeps the same number."""
+"""Number of past messages that a rogue node knows if it starts during a run. A rogue node that runs from the start
+keeps the same number.
+"""
 
 
 class EventLoop:
     """The agents of a scenario on a simulated network. The number of an agent is its index in the roster.
 
-    `deliver_all`: deliver also the messages that a released agent would ignore. This takes longer and changes only the
+    `deliver_all`: also deliver the messages that a released agent would ignore. This takes longer and changes only the
     traces. Every message is delivered if an agent has quirks, is not the harness's own, or has an edited core
     (`harness.play.core_version`), because such an agent might not ignore it. The same is true of a secured mission in
     which messages can be dropped: a second copy is a replay even if the first one had no effect.
 
     `interactive`: a user may request injections during the run. `fate_script` creates the object that applies scripted
-    fates, and `air` the network. `programs` are the programs that play foreign agents.
+    fates. `air` creates the network. `programs` are the programs that play foreign agents.
     """
 
     def __init__(
@@ -95,10 +97,12 @@ class EventLoop:
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
         self._incarnations: list[list[SimulatedIncarnation]] = [[] for _ in self.roster]
         self._alive: list[SimulatedIncarnation | None] = [None] * (len(self.roster) + 1)
-        """The living incarnation of each agent, or None. The last entry is that of the rogue node, and always None."""
+        """The living incarnation of each agent, or None. The last entry belongs to the rogue node and is always
+        None.
+        """
         self._foreign_swarm = self._foreign_agents(programs) if scenario.foreign else None
         self._late = {self._number[agent_id]: LateTimers(text) for agent_id, text in scenario.lateness.items()}
-        """Number of an agent with `lateness` -> its late timers."""
+        """Number of an agent with the key `lateness` -> its late timers."""
         self._channel = self._shared_channel()
         self._medium = Medium(self.roster, seed, AT_ONCE if self._channel else LATENCY)
         self._script = fate_script(scenario.fates, self.roster, BlockNames(self.roster, self._incarnations).of)
@@ -109,14 +113,16 @@ class EventLoop:
         self._recent_messages: deque[tuple[int, int, Message, float]] | None = (
             deque(maxlen=KEPT_MESSAGES) if interactive else None
         )
-        """Messages for a rogue node that may start later. None if no rogue node can start later."""
+        """Messages for a rogue node that may start later in the run. None if no rogue node can start."""
         self._sought: SoughtRun | None = None
         self._found: int | None = None
-        """The agent that ran the sought handler."""
+        """The ID of the agent that ran the handler for which the caller waits."""
         self._stopped_within_instant = False
-        """True if the sought run ended `run` while other inputs of the same instant may remain."""
+        """True if `run` stopped at the handler run for which the caller waits, and other inputs of the same moment may
+        remain.
+        """
         self._recent_runs: list[tuple[int, HandlerRun]] | None = None
-        """Handler runs that the last change of the timeline caused. None after `run`."""
+        """Handler runs that the last change of the timeline caused. `run` sets it to None."""
         self._recurrence: RecurrenceSearch | None = None
         """The search for a cycle, while the swarm settles."""
 
@@ -212,7 +218,7 @@ class EventLoop:
 
     @contextmanager
     def _containing_crash(self, number: int) -> Iterator[None]:
-        """Continue the mission without this agent if the agent crashes in the context."""
+        """Let the other agents continue the mission if this agent crashes inside the context."""
         try:
             yield
         except Exception as error:
@@ -225,7 +231,7 @@ class EventLoop:
         raise NotImplementedError
 
     def _handle_message(self, number: int, incarnation: SimulatedIncarnation, flight: MessageInFlight) -> None:
-        """Give a message to the agent. Skip a message that cannot affect the agent."""
+        """Give the message to the agent, unless it cannot affect the agent."""
         sender, message = flight.sender, flight.message
         if self._tracing or incarnation.secured is not None or type(message) in ONLY_COUNTED:
             self._tally_answers(number, incarnation)
@@ -248,7 +254,7 @@ class EventLoop:
     def _handle_other_input(
         self, number: int, incarnation: SimulatedIncarnation, what: DueEvent | StrayDatagram | None
     ) -> None:
-        """Give the agent a timer expiry, an event, or a datagram that no agent sent as a message."""
+        """Give the agent an input that is not a message: a timer expiry, an event, or a stray datagram."""
         agent = incarnation.agent
         if what is None:
             self._end_timer(number, incarnation)
@@ -289,10 +295,10 @@ class EventLoop:
         self._finish_input(number, incarnation)
 
     def _tally_answers(self, number: int, incarnation: SimulatedIncarnation) -> None:
-        """Give the agent all answers that have arrived, if their only effect is that the agent counts them.
+        """Give the agent those arrived answers that it only counts.
 
-        The loop calls this before the tally is read, and before other inputs if a trace is written, so that the lines
-        of the trace are in order.
+        The loop calls this before a handler reads the count. If a trace is written, the loop also calls it before other
+        inputs, so that the lines of the trace are in order.
         """
         agent, state = incarnation.agent, incarnation.state
         if state is None or incarnation.waiting is not None or not self._air.open_queries[number]:
@@ -331,9 +337,7 @@ class EventLoop:
                 self._recent_messages.append((incarnation.agent.agent_id, sequence, message, self._now))
 
     def _send_sealed(self, number: int, incarnation: SimulatedIncarnation, agent: KeyedAgent) -> None:
-        """Send the encrypted messages of the agent. If a rogue node starts after this call, it does not receive these
-        messages.
-        """
+        """Send the encrypted messages of the agent. A rogue node that starts later does not receive these messages."""
         for sealed, sequence, message, plain in agent.sealed_to_send():
             if message is None:
                 self._send_stray(number, incarnation, sealed)
@@ -344,7 +348,7 @@ class EventLoop:
                 self._rogue.receive_datagram(sealed, self._now)
 
     def _send_stray(self, number: int, incarnation: SimulatedIncarnation, datagram: bytes) -> None:
-        """Send a datagram that is not a valid message of the agent. The rogue node does not receive it."""
+        """Send a datagram of the agent that is not a valid message. The rogue node does not receive it."""
         incarnation.bytes_sent += len(datagram)
         self._air.broadcast_stray(self._now, number, datagram)
 
@@ -364,7 +368,7 @@ class EventLoop:
         """Return the next mission second at which a timer of the agent expires, or at which the agent must send a
         delayed answer.
 
-        `soonest` is this time by the agent's clock, if none of its timers is late.
+        `soonest` is this time on the agent's clock, for the case that none of its timers is late.
         """
         if number not in self._late:
             return incarnation.mission_s(soonest)
@@ -402,7 +406,7 @@ class EventLoop:
 
     def _check_sought(self, agent_id: int, run: HandlerRun) -> None:
         """Check whether a caller waits for this handler run. If the timeline has just changed, only store the handler
-        run, so that the next call of `until_run` can check it.
+        run. The next call of `until_run` then checks it.
         """
         if self._recent_runs is not None:
             self._recent_runs.append((agent_id, run))
@@ -412,7 +416,7 @@ class EventLoop:
     # Incarnations
 
     def _start(self, number: int, stored: DiskContents | None = None) -> None:
-        """Start an agent. If `stored` is given, the agent starts with these contents of its disk."""
+        """Start an agent. `stored` is the content of its disk, or None."""
         agent_id = self.roster[number]
         incarnations = self._incarnations[number]
         clock = self.scenario.clocks.get(agent_id)
@@ -459,11 +463,11 @@ class EventLoop:
             self._air.schedule(max(self._now, incarnation.started_at + due), number, (current, event_id, data, None))
 
     def _resume(self, number: int, incarnation: SimulatedIncarnation, waiting: list[ScheduledInput]) -> None:
-        """Let the agent handle the inputs that waited during a pause, in the order of a real process: datagrams,
-        timers, events.
+        """Let the agent handle the inputs that waited during a pause, in the same order as a real process: first
+        datagrams, then timers, then events.
 
-        Each datagram is handled at its position in the order of inputs. If the agent sends a query meanwhile, a later
-        datagram of the pause can be an answer to it.
+        Datagrams are handled in the order of their arrival. If the agent sends a query while it handles them, a later
+        datagram of the pause can be an answer to this query.
         """
         incarnation.waiting, incarnation.resumed_at = None, self._now
         position = self._air.position

@@ -1,19 +1,19 @@
 """Prove that a simulated swarm repeats a cycle forever. In a cycle, the state of all agents recurs, and no input from
 outside the swarm follows.
 
-The search compares the swarm at moments without messages in flight, just before the next timer ends. A state consists
-of the protocol state of every agent, its timers relative to this moment, and the order of the timers. From this moment
-on, only timers cause further steps. If the state recurs, it recurs forever, provided that the network draws do not
-matter. They do not matter if each message certainly arrives or certainly does not, and one of these conditions is met:
+The search compares the swarm at moments without messages in flight, just before the next timer expires. A state
+consists of the protocol state of every agent, its timers relative to this moment, and the order of the timers. From
+this moment on, only timers cause further steps. If the state recurs, it recurs forever, provided that the random draws
+of the network have no effect. They have no effect if each message certainly arrives or certainly does not, and one of
+these conditions is met:
 
 - All messages take the same time.
-- Each message and its answers have arrived before the next timer ends, and were only answered or counted. Then their
-  delays have no effect.
+- Each message and its answers arrive before the next timer expires, and agents only answer or count them.
 
 Otherwise the recurrence proves nothing. The traces show such cycles too (`harness.checker.recurring_cycles`).
 
 The search uses Brent's algorithm. It keeps one state and compares it with the following ones, then keeps a later state
-and compares it with twice as many. Its memory therefore does not grow with the length of the run.
+and compares it with twice as many states states. Its memory therefore does not grow with the length of the run.
 """
 
 from collections import defaultdict
@@ -26,7 +26,9 @@ from ucp.agent import ON_TIMER
 from ucp.state import AgentState
 
 CHECK_AFTER_S = 120.0
-"""Mission seconds in which a swarm may settle before the search starts. The search costs time."""
+"""Mission seconds that a swarm gets to become idle before the search for a cycle starts. The search takes computing
+time.
+"""
 SAME_INSTANT_S = 1e-6
 MAX_STEPS = 1000
 """Maximum number of recorded steps of a cycle."""
@@ -34,19 +36,19 @@ MAX_STEPS = 1000
 
 @dataclass(frozen=True, slots=True)
 class AgentAtRest:
-    """An agent at a moment at which no message is on its way."""
+    """The state of an agent at a moment without messages in transit."""
 
     state: AgentState
     local_s: float
-    """Time of the agent's clock at the next end of a timer of any agent."""
+    """Time on this agent's clock at the next timer expiry of the whole swarm."""
     wakes_s: float | None
-    """Mission second at which the agent's own next timer ends. None if no timer runs."""
+    """Mission second at which this agent's next timer expires. None if no timer runs."""
 
 
 class RecurrenceSearch:
-    """The search for a repeated state of the swarm. The simulation calls `check` whenever no message is on its way.
+    """The search for a repeated state of the swarm. The simulation calls `check` whenever no message is in transit.
 
-    `delays`: minimum and maximum delay of a message, in seconds.
+    `delays` are the minimum and the maximum delay of a message, in seconds.
     """
 
     def __init__(self, delays: tuple[float, float]) -> None:
@@ -63,18 +65,19 @@ class RecurrenceSearch:
     def _reset(self) -> None:
         self._steps: list[CycleStep] = []
         self._answered_by: dict[int, set[int]] = defaultdict(set)
-        """Agent in a reconcile -> agents that answered its queries since the kept state."""
+        """Agent in a reconcile -> the agents that have answered its queries since the kept state."""
         self._order_is_certain = True
-        """False if two timers end so close to each other that rounding may decide their order."""
+        """False if two timers expire so close to each other that rounding may decide their order."""
         self._delays_matter = False
 
     def check(
         self, swarm: Sequence[AgentAtRest], order: Sequence[object], fates: tuple[int, ...], fate_at: float
     ) -> bool:
-        """Return true if the swarm repeats a cycle. Call this only while no message is on its way and at least one
+        """Return true if the swarm repeats a cycle. Call this only while no message is in transit and at least one
         timer runs.
 
-        - `order`: order of the next ends of timers, for late timers also within an agent.
+        - `order`: order of the next timer expiries. For agents with late timers, it also has the order within the
+          agent.
         - `fates`: number of messages that each scripted fate has matched.
         - `fate_at`: time at which a fate last changed the delivery of a message.
         """
@@ -98,8 +101,8 @@ class RecurrenceSearch:
         return False
 
     def record_timer_ends(self, now: float, local_s: float, state: AgentState) -> None:
-        """Record that timers of an agent are about to expire. The agent must already have counted all answers that have
-        arrived.
+        """Record that timers of this agent are about to expire. The agent must already have counted all answers that
+        have arrived.
         """
         if now != self._next_s:
             self._delays_matter = True
@@ -151,7 +154,7 @@ def _changeable_by_messages(swarm: Sequence[AgentAtRest]) -> list[object]:
 
 
 def _state(agent: AgentAtRest) -> tuple[object, ...]:
-    """Return the state that determines the agent's next steps. Times are relative to the agent's clock."""
+    """Return the part of the agent's state that determines its next steps. Times are relative to the agent's clock."""
     state = agent.state
     return (
         state.agent_id,

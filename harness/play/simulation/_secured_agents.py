@@ -39,12 +39,12 @@ class SecuredOwnAgent(SecuredAgent, OwnAgent):
 class SimulatedKeys:
     """The keys of the vehicles of a simulated mission. A vehicle keeps its keys after a restart.
 
-    `interactive`: a user may request injections during the run. Raises HarnessError.
+    `interactive` is true if a user may request injections during the run. Raises HarnessError.
     """
 
     def __init__(self, scenario: Scenario, seed: int, *, interactive: bool) -> None:
         self.nothing_is_dropped = not interactive and _drops_nothing(scenario)
-        """True if agents drop no datagram. Then messages without effect need not be delivered."""
+        """True if agents drop no datagram. The simulation then need not deliver messages without effect."""
         self._seed = seed
         keys = mission_keys(scenario, _derived_bytes(seed, "keys"))
         assert keys is not None, "the scenario is secured"
@@ -57,7 +57,8 @@ class SimulatedKeys:
         self.crypto = cached_crypto()
 
     def agent(self, agent_id: int, incarnation: int, now: float) -> Callable[..., SecuredOwnAgent]:
-        """Return a function that creates an agent with keys. The agent starts at mission second `now`.
+        """Return a function that creates this incarnation of the agent, with its keys. The incarnation starts at
+        mission second `now`.
 
         Incarnations are numbered from 1.
         """
@@ -71,7 +72,7 @@ class SimulatedKeys:
         return partial(SecuredOwnAgent, session, seal=make_seal(bundle) if self.mission.seals else None)
 
     def key_fields(self, agent_id: int, incarnation: int, now: float) -> dict[str, Any]:
-        """Return the keys for an agent in another language, as fields of its first input line."""
+        """Return the keys of an agent that is a separate program, as fields of its first input line."""
         bundle = self.mission.bundles[agent_id]
         return {
             "bundle": (bundle if incarnation == 1 else bundle.used()).to_json(),

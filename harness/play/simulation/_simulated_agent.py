@@ -16,13 +16,15 @@ from ucp.store import StoredState
 from ucp.trace import Entry, RecordedBytes
 
 AgentOutput = tuple[int, Message | None, RecordedBytes | None]
-"""(sequence, message, datagram): an output of an agent. The datagram is None if nothing has encoded it yet.
+"""An output of an agent: (sequence number, message, datagram). The datagram is None if nothing has encoded it yet.
 
 An output that is not a message of the agent has only the datagram, with sequence 0 and no message.
 """
 
 DiskContents = StoredState | tuple[Any]
-"""The contents of an agent's disk after a brown-out. A foreign agent has a tuple with one value of its own."""
+"""The content of an agent's disk after a power failure. For a foreign agent, it is a tuple with one value that only the
+agent understands.
+"""
 
 
 class VirtualAgent(Protocol):
@@ -39,7 +41,7 @@ class VirtualAgent(Protocol):
 
     @property
     def chain_changed_at(self) -> float | None:
-        """The time at which the chain last changed, by the agent's clock. 0 means no change yet, and None means
+        """The time of the last change of the chain, on the agent's clock. It is 0 without a change, and None if it is
         unknown.
         """
 
@@ -81,7 +83,7 @@ class VirtualAgent(Protocol):
         """Return the hashes of the blocks that the agent has completed, in order."""
 
     def export(self, now: float, exported_at_us: int) -> dict[str, Any]:
-        """Return the chain export as JSON."""
+        """Return the chain export of the agent as JSON."""
 
     def stored(self, now: float) -> DiskContents: ...
 
@@ -139,4 +141,4 @@ class OwnAgent(Agent):
         return StoredState.of(self.state)
 
     def end(self, now: float) -> None:
-        """Do nothing. After the end, this object still has the last state of the agent."""
+        """Do nothing, because this object keeps the last state of the agent."""

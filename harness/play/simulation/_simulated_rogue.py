@@ -1,7 +1,7 @@
 """Run the rogue node, a sender of forged messages, in virtual time.
 
 The rogue node receives every datagram at the time of sending. Its own datagrams arrive after the mean latency at every
-living agent, except the agent that it imitates. That agent would drop them as an echo of its own messages.
+living agent, except the imitated agent, which would drop a datagram in its own name.
 """
 
 from collections.abc import Callable, Sequence

@@ -23,9 +23,13 @@ from sitl.track import VehicleTrack
 from sitl.vehicle import VehicleError
 
 SHOW_S = 0.25
-"""Minimum wall time between two updates, so that their cost does not grow with the speedup."""
+"""Minimum seconds of wall time between two updates of the ground station. The minimum keeps the cost of updates
+independent of the speedup.
+"""
 SILENT_S = 1.0
-"""Wall time after which a vehicle sends a heartbeat, even if time is paused. A station reports a silent one as lost."""
+"""Seconds of wall time after which a vehicle sends a heartbeat, even if virtual time is paused. A ground station
+reports a vehicle without heartbeats as lost.
+"""
 READ_BYTES = 65_536
 
 
@@ -38,8 +42,8 @@ class _StationConnection:
 
 
 class StationTracks:
-    """The connections of a simulated run to its ground station. Use them in one event loop, and close them after the
-    run.
+    """The connections between a simulated run and its ground station. Use them in one event loop, and close them after
+    the run.
     """
 
     def __init__(self, station: GroundStation) -> None:
@@ -90,7 +94,7 @@ class StationTracks:
                     connection.sock.send(data)
 
     def close(self) -> dict[str, Any]:
-        """Close all connections to the ground station, and return their record for run.json."""
+        """Close all connections to the ground station. Return the record of these connections for run.json."""
         passed = self._station.to_json()
         self._station.close()
         for connection in self._connections.values():

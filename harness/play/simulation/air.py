@@ -6,15 +6,15 @@ Agents broadcast each message, so each message reaches nearly all agents. Most o
 - A query reaches all agents except those that will still be in a reconcile when it arrives.
 - An answer reaches only the agents that have sent the query, or will have sent it when the answer arrives.
 
-The omission changes no agent to the last bit, for two reasons. The network draws belong to the broadcast as a whole.
-The position of an input in the order, (time, rank, receiver), does not depend on other deliveries.
+The omission changes the state of no agent, for two reasons. Random draws of the network belong to the broadcast as a
+whole. And the position of an input in the order of inputs (time, rank, receiver) does not depend on other deliveries.
 
-Agents only count most answers. The air does not deliver these answers one by one. It gives them to the agent in order
-before the agent reads its count (`take_answers`), and only then computes when they arrived.
+Agents only count most answers. The air does not deliver these answers one by one. It stores them, and gives them to the
+agent in order before the agent reads its count (`take_answers`). Only then it computes when they arrived.
 
-If vehicles share a radio channel, every message occupies it, also one that matters to no agent. A message arrives when
-its frame ends. Only then is it known which agents receive it and which of them ask for it, so it is delivered to these
-agents at once, and no answer is kept.
+If vehicles share a radio channel, every message occupies it, even if it has no effect on any agent. A message arrives
+when its frame ends. Only then it is known which agents receive it, and on which of them it has an effect. The message
+is therefore delivered at once, and no answer is stored.
 """
 
 from collections import defaultdict
@@ -52,9 +52,9 @@ class MessageInFlight:
     rank: int
     draws: RandomDraws
     datagram: RecordedBytes | None
-    """The datagram as traces record it. None if nothing has encoded it yet."""
+    """The datagram in the form that traces record. None if no code has encoded it yet."""
     sealed: bytes | None = None
-    """The sealed datagram. None if the mission is not secured."""
+    """The encrypted datagram. None if the mission is not secured."""
 
     def __lt__(self, other: object) -> bool:
         return False  # two copies with equal time, rank and receiver are equal
@@ -66,45 +66,45 @@ QueryKind = Literal["vote", "reconcile"]
 
 @dataclass(slots=True, eq=False)
 class _AnswerLog:
-    """The answers to one query, and the agents that sent this query."""
+    """The stored answers to one query, and the agents that sent this query."""
 
     answers: dict[int, list[MessageInFlight]] = field(default_factory=dict)
-    """Sender -> its answers, in the order of sending."""
+    """Sender -> its answers to the query, in the order of sending."""
     askers: set[int] = field(default_factory=set)
     """Numbers of the agents whose query is open."""
     answer_count: int = 0
-    """Number of all answers."""
+    """Number of all answers to the query."""
     quiet_at: float = 0.0
-    """Time after which no answer arrives."""
+    """The time after which no further answer to the query arrives."""
 
 
 @dataclass(slots=True, eq=False)
 class _OpenQuery:
-    """A query that an agent sent at the position `since` of all inputs. The agent still accepts answers to it."""
+    """A query to which an agent still accepts answers. `since` is its position in the order of all inputs."""
 
     question: Question
     log: _AnswerLog
     since: "ScheduledInput"
     answered_by: set[int] = field(default_factory=set)
-    """Senders whose answers the agent has received."""
+    """Senders whose answers to the query the agent has received."""
     answers_seen: int = 0
     """Number of answers that existed at the last call of `take_answers`."""
     next_at: float = 0.0
-    """Time at which the next of these answers arrives."""
+    """Time at which the next of the stored answers arrives."""
     first: tuple[float, int] = (NEVER, 0)
-    """Time and rank of the first answer, if the agent uses only one answer."""
+    """Time and rank of the first answer to the query, if the agent uses only one answer."""
 
 
 DueEvent = tuple[int, int, bytes, int | None]
-"""(incarnation, event ID, data, microseconds): an event to log.
+"""An event to log: (incarnation, event ID, data, time in microseconds).
 
-Incarnation 0 stands for the current one. Without a time, the event has that of the agent's clock.
+Incarnation 0 stands for the current incarnation. Without a time, the event gets the time of the agent's clock.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class StrayDatagram:
-    """A datagram with the address of vehicle `source` as its sender, but not a message of the agent there."""
+    """A datagram that is not a message of the agent, but has the address of vehicle `source` as its sender."""
 
     source: int
     datagram: bytes
@@ -126,20 +126,21 @@ class _BroadcastCopies:
 
 
 _UNKNOWN = _BroadcastCopies([])
-"""A placeholder for the copies of a message on a shared channel. They are known at the end of its frame."""
+"""A placeholder for the copies of a message on a shared channel. The copies are known only at the end of its frame."""
 
 ScheduledInput = tuple[float, int, int, MessageInFlight | DueEvent | StrayDatagram | None]
-"""(mission seconds, rank, agent number, input). The input is a message, an event, or None for the end of a timer.
+"""A scheduled input: (mission second, rank, agent number, input). The input is a message, an event, or None for a timer
+expiry.
 
-The number after that of the last agent is the number of the rogue node. If two inputs have the same time, the one with
-the lower rank comes first.
+The rogue node has the number after the last agent. If two inputs have the same time, the one with the lower rank comes
+first.
 """
 
 
 class VirtualAir:
     """The simulated network between the agents in `roster`. The number of an agent is its index in the roster.
 
-    `deliver_all`: also deliver messages that cannot change their receiver.
+    If `deliver_all` is true, messages that cannot affect their receiver are delivered, too.
     """
 
     def __init__(
@@ -153,15 +154,15 @@ class VirtualAir:
         deliver_all: bool,
     ) -> None:
         self.busy_until = [0.0] * len(roster)
-        """Agent number -> earliest end of its current reconcile. Until then it answers no query."""
+        """Agent number -> earliest possible end of its current reconcile. Until then the agent answers no query."""
         self.started_at = [0.0] * len(roster)
-        """Agent number -> time of its start. The agent does not receive messages that were sent before."""
+        """Agent number -> time of its start. The agent does not receive messages that were sent before this time."""
         self.paused_at: dict[int, float] = {}
-        """Number of a paused agent -> start of the pause. Inputs since then wait for the agent."""
+        """Number of a paused agent -> start of the pause. Its inputs wait until the end of the pause."""
         self.open_queries: list[dict[QueryKind, _OpenQuery]] = [{} for _ in roster]
         """Agent number -> its open queries."""
         self._quiet_at = 0.0
-        """Arrival of the last copy, except messages on a shared channel."""
+        """Arrival time of the last copy of any message, except messages on a shared channel."""
         self.position: ScheduledInput = (0.0, 0, 0, None)
         """Current position in the order of inputs."""
         self._roster = roster
@@ -177,7 +178,9 @@ class VirtualAir:
         self._waiting: dict[str, list[tuple[MessageInFlight, int]]] = defaultdict(list)
         self._arrived_at: dict[str, float] = {}
         self._held: dict[int, list[tuple[MessageInFlight, int, float]]] = defaultdict(list)
-        """Number of a hold -> held messages, each with its receiver and its arrival without the hold."""
+        """Number of a hold -> held messages, each with its receiver and the arrival time that it would have without the
+        hold.
+        """
 
     def deliver_everything(self) -> None:
         """Deliver all messages from now on, including those that cannot have an effect on their receiver."""
@@ -185,9 +188,9 @@ class VirtualAir:
 
     @property
     def quiet_at(self) -> float:
-        """The latest mission second at which a message that is now on its way can arrive.
+        """The latest mission second at which a message that is in transit can arrive.
 
-        While a shared channel has messages, it is at least the time of the channel's next event.
+        While a shared channel has messages, this is at least the time of the channel's next event.
         """
         channel = self._channel
         return self._quiet_at if channel is None or channel.next_s == NEVER else max(self._quiet_at, channel.next_s)
@@ -217,12 +220,12 @@ class VirtualAir:
         heappush(self._queue, (at, self._rank, number, what))
 
     def timer_order(self, ends: Mapping[int, float]) -> list[int]:
-        """Return the agents in the order of their next timer expiries, which `ends` contains."""
+        """Return the agents in the order of their next timer expiries. `ends` contains the times of these expiries."""
         queue = sorted(happening[:3] for happening in self._queue if happening[3] is None)
         return list(dict.fromkeys(number for at, _, number in queue if ends.get(number) == at))
 
     def inject(self, at: float, stray: StrayDatagram, numbers: Iterable[int]) -> None:
-        """Schedule the arrival at these agents of a datagram that no agent sent as a message."""
+        """Schedule the arrival of a stray datagram, which no agent sent as a message, at these agents."""
         self._rank += 1
         self._quiet_at = max(self._quiet_at, at)
         for number in numbers:
@@ -302,8 +305,8 @@ class VirtualAir:
     def _deliver_frame(
         self, at: float, transmission: EndedTransmission, message: MessageInFlight | StrayDatagram
     ) -> None:
-        """Deliver a message whose transmission on the shared channel ends. The network conditions apply to each
-        copy.
+        """Deliver a message whose transmission on the shared channel ends. The network conditions, such as loss, apply
+        to each copy.
         """
         sender, received = transmission.sender, transmission.received
         draws = self._medium.draw(sender, at, transmission.data_bytes)
@@ -326,8 +329,8 @@ class VirtualAir:
     def _interested_receivers(self, received: int, flight: MessageInFlight, at: float) -> Iterable[int]:
         """Return the receivers on which the message can have an effect.
 
-        An agent that reconciles ignores questions. An answer that arrives at once matters only to the agents that ask
-        now. A paused agent may ask before it reads the answer.
+        An agent that reconciles ignores queries. An answer affects only agents whose query is open now, because it
+        arrives at once. A paused agent may send the query before it reads the answer.
         """
         if self._deliver_all or self._medium.latest > 0:
             return numbers(received)
@@ -342,10 +345,10 @@ class VirtualAir:
     # Answers
 
     def take_answers(self, number: int) -> list[tuple[float, int, MessageInFlight]]:
-        """Return the answers that the agent must count now, in order of arrival, each as (mission seconds, rank,
+        """Return the answers that the agent must count now, in order of arrival, each as (mission second, rank,
         answer).
 
-        They have arrived since the agent's query. Only the first answer of each sender counts.
+        These answers have arrived since the agent's query. Only the first answer of each sender counts.
         """
         new = []
         now, rank, _, _ = self.position
@@ -387,7 +390,7 @@ class VirtualAir:
         self.busy_until[number] = 0.0
 
     def _open_query(self, number: int, question: Question) -> None:
-        """Open a query of the agent. Later answers to a different agent with the same query count, too."""
+        """Open a query of the agent. Later answers count even if they answer the same query of another agent."""
         open_queries = self.open_queries[number]
         about: QueryKind = "vote" if question[0] is BlockAddResponse else "reconcile"
         before = open_queries.get(about)
@@ -401,7 +404,7 @@ class VirtualAir:
                 self._schedule_earliest(flights, number, query)
 
     def _keep_answer(self, question: Question, flight: MessageInFlight, sender: int) -> None:
-        """Store an answer for all agents that have sent its query, or will send it before the answer arrives."""
+        """Store an answer for all agents that have sent this query or will send it before the answer arrives."""
         log = self._answer_logs[question]
         log.answer_count += 1
         log.quiet_at = self._quiet_at
@@ -427,7 +430,9 @@ class VirtualAir:
     def _earliest(
         self, flights: Iterable[MessageInFlight], receiver: int, since: ScheduledInput
     ) -> tuple[float, int, MessageInFlight] | None:
-        """Return (mission seconds, rank, message) of the first arrival after `since`. Return None if there is none."""
+        """Return the first arrival of these messages after `since`, as (mission second, rank, message). Return None if
+        there is none.
+        """
         since_s, since_rank, _, _ = since
         started_at = self.started_at[receiver]
         soonest, latest = self._medium.soonest, self._medium.latest

@@ -14,19 +14,21 @@ from ucp.state import AgentState
 RIGHT_AFTER_S = 1e-6
 
 NameOf = Callable[[bytes], str | None]
-"""A block's name from its hash, if it is known."""
+"""A function that returns the name of a block from its hash. It returns None if the block has no name."""
 
 
 @dataclass(slots=True, eq=False)
 class _ScriptedFate:
-    """A scripted delivery rule with two counts: the messages that it matched, and the deliveries that it decided."""
+    """A scripted delivery rule (fate) with two counts: the messages that it matched, and the deliveries that it
+    decided.
+    """
 
     index: int
     fate: Fate
     matches: int = 0
     decided: int = 0
     arrivals: dict[int, list[float]] = field(default_factory=dict)
-    """Number of a datagram that has not been sent yet -> mission seconds of its arrivals."""
+    """Number of a matching datagram that has not been sent yet -> mission seconds at which it arrives."""
     holds: bool = False
     """True while the fate holds messages and the end of the hold is unknown."""
 
@@ -42,17 +44,17 @@ class DecidedDelivery:
     """
 
     arrivals: list[tuple[int, float]] = field(default_factory=list)
-    """(receiver, time): the copy arrives at this time."""
+    """(receiver, time): the copy arrives at the receiver at this time."""
     waiting: list[tuple[int, str]] = field(default_factory=list)
-    """(receiver, name): the copy arrives after the message that matches the fate with this name."""
+    """(receiver, name): the copy arrives after the message that the fate with this name matches."""
     held: list[tuple[int, int, float]] = field(default_factory=list)
-    """(number, receiver, time): the copy arrives at this time, or at the end of the hold with this number if later."""
+    """(number, receiver, time): the copy arrives at this time, or later at the end of the hold with this number."""
     named: list[tuple[str, float]] = field(default_factory=list)
-    """(name, time): the message that matches the fate with this name arrives at this time."""
+    """(name, time): the message that the fate with this name matches arrives at this time."""
 
 
 class FateScript:
-    """The scripted delivery rules of a run. `name_of` returns the name of the block that has a given hash.
+    """The scripted delivery rules (fates) of a run. `name_of` returns the name of the block with a given hash.
 
     The number of a receiver is its index in `roster`.
     """
@@ -61,7 +63,7 @@ class FateScript:
         self.listens = bool(fates)
         """True if there are fates, so that `decide` must be called."""
         self.last_s: float | None = None
-        """Time at which the last message was sent whose delivery a fate changed."""
+        """The time at which a fate last changed the delivery of a message."""
         self._parts = [_ScriptedFate(index, fate) for index, fate in enumerate(fates)]
         self._number = {agent_id: number for number, agent_id in enumerate(roster)}
         self._name_of = name_of
@@ -78,7 +80,7 @@ class FateScript:
         return part.index
 
     def release(self, number: int, fate: Fate) -> None:
-        """End the hold with this number. `fate` is the rule with the times at which the hold ends."""
+        """End the hold with this number. `fate` contains the times at which the hold ends."""
         part = self._parts[number]
         part.fate, part.holds = fate, False
 
@@ -125,7 +127,7 @@ class FateScript:
         return decided
 
     def settled_counts(self, now: float) -> tuple[int, ...] | None:
-        """Return the number of messages that each rule has matched, at most the largest message number in the rule's
+        """Return the number of messages that each rule has matched, but at most the largest message number in its
         `count`.
 
         Return None if the result of a rule still depends on time.
@@ -140,7 +142,7 @@ class FateScript:
     def unmatched(self, waiting: Collection[str]) -> list[str]:
         """Return a sentence for each rule that had no effect, because its author expects an effect.
 
-        `waiting`: names of rules. The message that such a rule matches has not arrived, and other messages wait for it.
+        `waiting` contains the names of rules whose message has not arrived, although other messages wait for it.
         """
         sentences = []
         for part in self._parts:
@@ -169,24 +171,26 @@ class FateScript:
                 yield part
 
     def _count_match(self, part: _ScriptedFate) -> bool:
-        """Count a matching message. Return true if the rule applies to the message with this number."""
+        """Count a matching message. Return true if the rule applies to the message with this count."""
         part.matches += 1
         counts = part.fate.counts
         return counts is None or part.matches in counts
 
 
 class RunningTimer(NamedTuple):
-    """A running timer of an agent. Its number counts all timers that the agent has started, from 0."""
+    """A running timer of an agent. The timers that the agent starts are numbered from 0."""
 
     name: str
     number: int
     """Number of timers that the agent started before this one."""
     deadline: float
-    """Time of its end by the agent's clock."""
+    """Time on the agent's clock at which the timer expires."""
 
 
 class LateTimers:
-    """The timers of one agent across all its restarts. `text` is the agent's `lateness` in the scenario."""
+    """The timers of one agent, some of which expire late. They are counted across restarts. `text` is the agent's
+    `lateness` in the scenario.
+    """
 
     def __init__(self, text: str = "") -> None:
         self.running: dict[str, RunningTimer] = {}

@@ -27,31 +27,31 @@ class KeyedAgent(Protocol):
 
 @dataclass(slots=True)
 class SimulatedIncarnation:
-    """An agent in virtual time, from a start or restart to its end."""
+    """An agent in virtual time, from one start to the next end."""
 
     agent: VirtualAgent
     source: RandomEvents
     clock: AgentClock | None
-    """None if the clock shows mission time."""
+    """The clock of the agent. None if it shows mission time."""
     started_at: float
     state: AgentState | None = None
-    """The protocol state of the agent. None for a foreign agent, which does not show it."""
+    """The protocol state of the agent. None for a foreign agent, whose state the harness cannot read."""
     secured: KeyedAgent | None = None
-    """The agent, if it has keys."""
+    """The same agent with its interface for keys. None if it has no keys."""
     rebooted: bool = False
-    """True if the agent started with the data of its disk, after a brown-out."""
+    """True if the agent started with the data on its disk, after a power failure."""
     deadline: float | None = None
-    """Mission second at which the next timer ends."""
+    """Mission second at which the agent's next timer expires."""
     waiting: list[ScheduledInput] | None = None
     """Inputs that have arrived during a pause. None if the agent is not paused."""
     resumed_at: float = 0.0
-    """Mission second of the end of the last pause. Answers that arrived earlier are handled at this time."""
+    """Mission second at which the last pause ended. Answers that arrived during the pause are handled at this time."""
     bytes_sent: int = 0
     handler_runs: int = 0
-    """Number of handler runs. Only counted if a trace is written."""
+    """Number of handler runs. They are counted only if a trace is written."""
     ended_at: float | None = None
     logs: bool = True
-    """True while the agent logs events."""
+    """True while the agent still logs events."""
 
     @property
     def idle(self) -> bool:
@@ -66,8 +66,8 @@ class SimulatedIncarnation:
         return mission_s if self.clock is None else self.clock.shows(mission_s)
 
     def timestamp_us(self, mission_s: float) -> int:
-        """Return the time on the agent's clock in microseconds, at least 0. After the agent ended, its clock stands
-        still.
+        """Return the time on the agent's clock in microseconds, at least 0. After the end of the agent, this is the
+        time of its end.
         """
         return max(0, round(self._last_local_s(mission_s) * MICROSECONDS))
 
@@ -81,7 +81,7 @@ class SimulatedIncarnation:
 
     @property
     def chain_changed_at(self) -> float | None:
-        """The mission second of the last change of the chain, 0 if there was no change, and None if the time is
+        """The mission second of the last change of the chain. It is 0 without a change, and None if the time is
         unknown.
         """
         local_s = self.agent.chain_changed_at

@@ -1,4 +1,4 @@
-"""Reuse encrypted event data from the records of a mission, because a replay lacks the keys of the vehicles."""
+"""Reuse encrypted event data from the records of a mission, because a replay does not have the keys of the vehicles."""
 
 import base64
 from collections.abc import Iterable, Mapping
@@ -11,10 +11,12 @@ from ucp.sealed import SEAL_BYTES
 
 @dataclass(frozen=True)
 class RecordedSeals:
-    """A substitute for encryption that returns recorded data. Event data without a record stay unencrypted."""
+    """A substitute for encryption that returns the recorded encrypted data. Event data without a record are not
+    encrypted.
+    """
 
     sealed: Mapping[bytes, bytes]
-    """Encoded last event of a block -> sealed event data of the block."""
+    """Encoded last event of a block -> encrypted event data of the block."""
 
     def __call__(self, event_data: bytes, timestamp_us: int) -> bytes:
         try:

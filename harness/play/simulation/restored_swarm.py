@@ -1,4 +1,4 @@
-"""Simulate a swarm whose agents start with stored states, in place of empty chains."""
+"""Simulate a swarm whose agents start with stored states instead of empty chains."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -21,7 +21,7 @@ class RestoredSwarm(Simulation):
     def __init__(
         self, scenario: Scenario, stored: Mapping[int, StoredState], recorder: Recorder, **options: Any
     ) -> None:
-        """Create the swarm. `options` are those of `Simulation`."""
+        """Create the swarm. `options` are the options of `Simulation`."""
         super().__init__(scenario, 0, recorder, **options)
         self._stored = stored
         self._generating = False

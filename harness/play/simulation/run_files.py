@@ -22,7 +22,7 @@ class DiskRecorder:
         """`trace_quota` is the maximum size of each trace, in bytes."""
         self._rundir = rundir
         self._left = defaultdict[int, int](lambda: trace_quota)
-        """Number of bytes that the trace of each agent may still grow."""
+        """Agent -> number of bytes by which its trace may still grow."""
         self._traces: dict[int, TraceFile] = {}
 
     def begin(self, incarnation: SimulatedIncarnation) -> None:
@@ -61,7 +61,7 @@ class DiskRecorder:
         self._rundir.keep_exports_before_final_reconcile()
 
     def export(self, at_s: float, incarnations: Iterable[SimulatedIncarnation]) -> None:
-        """Write the chain exports of these agents. Raises OSError."""
+        """Write the current chain exports of these agents. Raises OSError."""
         for incarnation in incarnations:
             path = self._rundir.agents / f"{incarnation.agent.agent_id}.chain.json"
             write_json_atomically(path, incarnation.export(at_s))
@@ -76,7 +76,7 @@ class DiskRecorder:
 
 
 def header(incarnation: SimulatedIncarnation) -> dict[str, Any]:
-    """Return the first line of a trace, as keyword arguments of `ucp.trace.header_line`."""
+    """Return the content of a trace header for this incarnation, as keyword arguments of `ucp.trace.header_line`."""
     agent = incarnation.agent
     clock = {"epoch_us": 0, "speedup": 1, **(incarnation.clock.model_dump() if incarnation.clock else {})}
     return {
@@ -90,7 +90,7 @@ def header(incarnation: SimulatedIncarnation) -> dict[str, Any]:
 
 
 class Recorder(Protocol):
-    """An object that records the events of a run while they happen."""
+    """An object that records the events of a run as they happen."""
 
     tracing: bool
     """True if handler runs are recorded. Otherwise `write` is not called."""

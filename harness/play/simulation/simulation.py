@@ -1,9 +1,9 @@
 """Simulate a swarm in virtual time, with the same agent code that `ucp.node` runs.
 
 The simulation does not wait, and does not depend on the machine. The same scenario and seed give the same run to the
-last bit. The events of each agent, the network draws of each sender and the quirks of each agent have random streams of
-their own. A further fault in the scenario therefore changes no draw of the others. Vehicles are tracks without
-telemetry, so agents draw their events at random (Algorithm 21).
+last bit. The events of each agent, the network effects on each sender and the quirks of each agent use separate random
+streams. Another fault in the scenario therefore does not change the random numbers of other agents. Vehicles are only
+flight paths without telemetry, so agents log random events (Algorithm 21).
 """
 
 import base64
@@ -46,7 +46,7 @@ PROGRESS_S = 20.0
 
 
 class _AnyHandlerRun(SoughtRun):
-    """A description that matches any handler run."""
+    """An object that matches every handler run."""
 
     def matches(self, agent_id: int, run: HandlerRun) -> bool:
         return True
@@ -96,25 +96,25 @@ class Simulation(EventLoop):
         self._breathe = on_progress
         self._pace = pace
         self._disks: dict[int, DiskContents] = {}
-        """Agent number -> contents of its disk, for agents that are off and reboot with it."""
+        """Agent number -> content of its disk, for agents that are switched off and will reboot with it."""
         self._switched_off: dict[int, SimulatedIncarnation] = {}
         self._failures: dict[int, AgentFailedError | AgentLacksError] = {}
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
         self._all_rest_from_s = NEVER
-        """The time after which all places stay the same, if only a channel needs places."""
+        """The time after which no vehicle moves any more. It is set only if just the channel needs positions."""
         if self._channel and not (scenario.flight or scenario.gcs):
             self._all_rest_from_s = max(track.course.rests_from_s for track in self._tracks.values())
         self._moves_at = NEVER
         self.lost_vehicles: set[int] = set()
         """Vehicles that a ground station no longer sees, because they were shot down, fell, or were switched off."""
         self._injected: list[TimedInjection] = []
-        """The injections that the rogue node was ordered to make."""
+        """The injections that were requested from the rogue node."""
 
     @property
     def tracks(self) -> Mapping[int, VehicleTrack]:
-        """The flight paths of the vehicles. The table is empty if the scenario needs no positions."""
+        """The flight paths of the vehicles. The result is empty if the scenario needs no positions."""
         return self._tracks
 
     # The methods of harness.play.mission.Swarm
@@ -160,9 +160,7 @@ class Simulation(EventLoop):
                 await self._breathe(self)
 
     async def _run_at(self, pace: "VirtualTimePace", furthest: float) -> None:
-        """Play the simulation like `run`, but only up to the mission second that the requested speed allows at this
-        moment.
-        """
+        """Play the simulation like `run`, but at most up to the mission second that the requested speed allows now."""
         allowed_s = await pace.allowed_until(self._now)
         if allowed_s is None:
             return
@@ -224,7 +222,7 @@ class Simulation(EventLoop):
         self._recorder.changed({**record, **more})
 
     def _move(self) -> None:
-        """Move the vehicles to their positions at this time, and adapt the radio losses."""
+        """Move the vehicles to their current positions, and update the radio losses."""
         if not self._tracks:
             return
         places = {vehicle: Place(*track.in_field(self._now)) for vehicle, track in self._tracks.items()}
@@ -254,7 +252,7 @@ class Simulation(EventLoop):
     def _is_settled(self) -> bool:
         """Return true if all agents are idle. If agents hang instead, record them in `played`.
 
-        Callers must make sure that no message is on its way and that no timer runs.
+        Call this only if no message is in transit and no timer runs.
         """
         hanging = [
             incarnation.agent for incarnation in self.living() if incarnation.waiting is None and not incarnation.idle
@@ -396,7 +394,7 @@ class Simulation(EventLoop):
         return (incarnation for incarnation in self._alive if incarnation is not None)
 
     def exporting(self) -> Iterator[SimulatedIncarnation]:
-        """Yield the agents that leave a chain export, in the order of the roster: those alive, and those that were
+        """Yield the agents that have a chain export, in the order of the roster: living agents, and agents that were
         switched off.
         """
         for number, incarnation in enumerate(self._alive):
@@ -454,7 +452,7 @@ class Simulation(EventLoop):
         self, incarnation: SimulatedIncarnation, status: AgentStatus | None
     ) -> dict[str, int | float] | None:
         """Return the number of handler runs of the agent, with the time of the count. A foreign agent reports this
-        number.
+        number itself.
         """
         if status is None:
             return None
@@ -529,7 +527,7 @@ class Simulation(EventLoop):
 
 
 def no_vehicles(keys: Sequence[str]) -> str:
-    """Return an error message: these keys of the scenario need flying vehicles."""
+    """Return the error message for keys of the scenario that need flying vehicles."""
     named = ", ".join(f"`{key}`" for key in keys)
     return (
         f"{named} need{'s' if len(keys) == 1 else ''} flying vehicles, but virtual time computes the tracks: use "

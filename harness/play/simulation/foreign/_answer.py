@@ -38,9 +38,9 @@ class ForeignAnswer:
     """A valid answer of a foreign agent."""
 
     sent: list[tuple[bytes, RecordedBytes]]
-    """Datagrams, each with its record, which contains the message if the datagram is one."""
+    """The sent datagrams. Each has its record, which contains the message if the datagram is one."""
     timer: float | None
-    """Time of the next end of a timer, by the agent's clock."""
+    """Time on the agent's clock at which its next timer expires."""
     trace: list[Entry] = field(default_factory=list)
     command_answer: Any = None
     """The answer to a command. The parser does not check it."""
@@ -91,7 +91,7 @@ def _datagram(text: Any) -> tuple[bytes, RecordedBytes]:
 
 
 def _entries(trace: list[Any]) -> Iterable[Entry]:
-    """Yield the lines of a trace except its header, which the harness writes."""
+    """Yield the lines of a trace except its header. The harness writes the header itself."""
     for number, line in enumerate(trace):
         if isinstance(line, dict) and "schema" in line:
             continue

@@ -1,9 +1,9 @@
 """Run one start of a foreign agent (a separate program) in virtual time. It has the same interface as an agent in this
 process.
 
-The harness writes each input to the program as a line. The answer contains the datagrams that the agent sends, the end
-of its next timer, and the lines of its trace. The harness asks for the agent's state with the commands of the control
-socket. These commands are not part of the mission, so their lines of the trace are discarded.
+The harness writes each input to the program as a line. The answer contains the datagrams that the agent sends, the
+expiry of its next timer, and the lines of its trace. The harness asks for the agent's state with the commands of the
+control socket. These commands are not part of the mission, so the harness discards their trace lines.
 """
 
 import json
@@ -33,13 +33,17 @@ from ucp.settings import Settings
 from ucp.trace import Entry, HandlerRun, RecordedBytes, in_base64
 
 MAX_TIMERS_PER_S = 10_000
-"""Maximum number of ends of timers in a mission second. An agent with more of them counts as hung."""
+"""Maximum number of timer expiries in a mission second. An agent with more of them counts as hung."""
 MAX_SENT_PER_S = 5000
-"""Maximum number of datagrams in a mission second. More datagrams, and the answers to them, would grow without end."""
+"""Maximum number of datagrams that an agent may send in a mission second. Without a limit, the datagrams and their
+answers could grow without end.
+"""
 ROUNDED_S = 2e-6
-"""Tolerance for times of a trace, which have six decimal places."""
+"""Tolerance in seconds for times in a trace, which are rounded to six decimals."""
 NO_VIRTUAL_TIME = (2, 127)
-"""Exit statuses of agents without virtual time. They take `--virtual` for a mission file (2), or refuse it (127)."""
+"""Exit statuses of programs that do not support virtual time. They interpret `--virtual` as a mission file (2), or
+refuse it (127).
+"""
 
 
 class _CounterPerSecond:
@@ -64,7 +68,7 @@ class IncarnationRecord:
     agent_id: int
     command: tuple[str, ...]
     after_another: bool
-    """True if the process had played another incarnation before."""
+    """Add `count` to the counter. Return its total for the mission second of `now`."""
     limit: int
     exchanges: list[tuple[bytes, bytes]] = field(default_factory=list)
     length: int = 0
@@ -97,7 +101,7 @@ class ForeignAgent:
         """Start the agent by writing its first input line.
 
         - `mission`: mission file (`ucp-mission/1`).
-        - `store`: contents of the disk with which the agent boots.
+        - `store`: content of the disk with which the agent boots.
         - `key_fields`: keys of the agent in a secured mission.
         - `record_bytes`: maximum size of `record`.
         """
@@ -239,7 +243,9 @@ class ForeignAgent:
     # Lines
 
     def _time_text(self, now: float) -> str:
-        """Return the time of an input as text. Rounding never makes it earlier than the time of the previous input."""
+        """Return the time of an input as text. The rounded time is never earlier than the time of the previous
+        input.
+        """
         return repr(float(max(now, self._now)))
 
     def _ask(self, command: str, now: float) -> dict[str, Any]:

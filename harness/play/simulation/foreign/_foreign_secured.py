@@ -55,7 +55,7 @@ class SecuredForeignAgent(ForeignAgent):
         return super()._lacks_error(self._hidden(words))
 
     def _hidden(self, words: str) -> str:
-        """Return the text with all secrets, and parts of secrets, removed."""
+        """Return the text without the agent's secrets and parts of them."""
 
         def shown(digits: re.Match[str]) -> str:
             text = digits[0].lower()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from harness.play.simulation._secured_agents import SimulatedKeys
 
 MAX_RECORD_BYTES = 128 * 1024 * 1024
-"""Maximum size of all recorded inputs and answers of a mission."""
+"""Maximum size in bytes of all inputs and answers that are recorded in a mission."""
 
 
 def commands_of(scenario: Scenario) -> dict[int, list[str]]:
@@ -30,7 +30,7 @@ def commands_of(scenario: Scenario) -> dict[int, list[str]]:
 class ForeignSwarm:
     """The foreign agents of a scenario, that is, the agents that are separate programs.
 
-    By default `programs` is the pool that all missions in this process share. `keys` are those of a secured mission.
+    By default `programs` is the pool that all missions in this process share. `keys` are the keys of a secured mission.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class ForeignSwarm:
         return agent_id in self._commands
 
     def command_of(self, agent_id: int) -> list[str]:
-        """Return the command of the agent without `--virtual`."""
+        """Return the command of the agent. The caller appends `--virtual`."""
         return self._commands[agent_id]
 
     def start(self) -> None:
@@ -84,7 +84,7 @@ class ForeignSwarm:
     ) -> ForeignAgent:
         """Start the agent, with the contents of its disk if `stored` is given. Raises HarnessError.
 
-        It starts at mission second `started_at`, when the agent's clock shows `now`.
+        The agent starts at mission second `started_at`, when its clock shows `now`.
         """
         if agent_id not in self._playing:
             self._start(agent_id)
@@ -122,8 +122,8 @@ class ForeignSwarm:
         self._playing.clear()
 
     def _mission(self, agent_id: int, incarnation: int) -> dict[str, Any]:
-        """Return the mission file of an agent. The file differs from that of a real process where virtual time requires
-        it.
+        """Return the mission file of an agent. Where virtual time requires it, the file differs from the mission file
+        of a real process.
         """
         mission = mission_file(
             agent_id,

@@ -32,9 +32,10 @@ class NondeterminismError(HarnessError):
 
 
 class DeterminismCheck:
-    """Checks recorded agents for determinism, with one process for each command. Close it after use.
+    """A check of recorded agents for determinism, with one process for each command. Close it after use.
 
-    `patient`: wait for the next second of the clock first, because an agent may read a clock in whole seconds.
+    If `patient` is true, the check first waits for the next second of the clock, because an agent may read a clock in
+    whole seconds.
     """
 
     def __init__(self, *, patient: bool) -> None:
