@@ -1,13 +1,14 @@
-"""Decide whether agents with different chains had a chance to agree. The checks of characteristics 5 and 6 use the
+"""Decide whether agents with different chains had a chance to agree. The checks of characteristics 5 and 6 use this
 decision.
 
 Two idle agents with different chains stay different, because only a vote or a query of another agent's phase 2 starts a
-reconcile. A difference is therefore a violation only if the network was fully connected, and the differing agent then
-completed a reconcile that began after the last change of any other chain. Otherwise the characteristics do not apply.
+reconcile. A difference is therefore a violation only if the network was fully connected, and if the agent with the
+different chain then completed a reconcile that began after the last change of any other chain. Otherwise the
+characteristics do not apply.
 
 The system consists of the agents that ran until the end. An agent that was switched off earlier neither sends nor
-receives blocks. If all agents were switched off, the system consists of all of them, and a reconcile is a chance only
-while all of them ran.
+receives blocks. If all agents were switched off, the system consists of all of them. A reconcile is then a chance only
+if it happened while all of them ran.
 """
 
 import math
@@ -23,7 +24,7 @@ def check_endless_cycle(name: str, evidence: Evidence) -> Judgement | None:
     """Return the verdict `violated` if some agents repeat a cycle forever, although all agents took part and the
     network connects them. Return None in every other case.
 
-    `harness.checker._liveness` has the evidence.
+    `harness.checker._liveness` reports the evidence.
     """
     cycle = evidence.cached(cycle_of)
     if cycle is None or evidence.connected_since_s is None or evidence.missing or evidence.paused_at_end:
@@ -32,12 +33,12 @@ def check_endless_cycle(name: str, evidence: Evidence) -> Judgement | None:
 
 
 MAX_REASONS = 3
-"""Maximum number of agents in a reason."""
+"""Maximum number of agents that a reason names."""
 
 
 def explain_unknown(evidence: Evidence) -> str | None:
-    """Return the reason why the exported chains do not show the whole system in an idle state. Return None if they show
-    it.
+    """Return the reason why the exported chains do not show the whole system in an idle state. Return None if they
+    do.
     """
     if not evidence.exports:
         return "the run has no chain exports"
@@ -56,7 +57,7 @@ def _idle(ids: list[int]) -> str:
 
 
 def explain_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
-    """Return the reason why no agent in `differing` had a chance to agree. Return None if at least one agent had a
+    """Return the reason why none of the `differing` agents had a chance to agree. Return None if one of them had a
     chance.
     """
     if evidence.record is None:
@@ -85,7 +86,7 @@ def explain_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
 
 
 def _explain_agent(evidence: Evidence, since: float, agent_id: int) -> str:
-    """Return the reason why this agent had no chance to agree. The agent must have a trace."""
+    """Return the reason why this agent had no chance to agree with the others. The agent must have a trace."""
     changed = {peer: trace.chain_changed_at() for peer, trace in evidence.traces.items() if peer != agent_id}
     peer = max(changed, key=lambda peer: changed[peer], default=agent_id)
     when = "the system became fully connected"

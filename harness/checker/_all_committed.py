@@ -16,7 +16,8 @@ NAME = "all committed everywhere"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge the exported chains. Blocks that only killed or switched-off agents held do not count (Section 3.3).
+    """Return the verdict on characteristic 5. Blocks that only killed or switched-off agents held do not count (Section
+    3.3).
 
     The verdict is `not applicable` if an export is missing, if an agent was not idle, or if the agents that lack a
     block had no chance to get it.
@@ -63,10 +64,10 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _split_completed(evidence: Evidence) -> tuple[int, list[str]]:
-    """Return the number of lost completed blocks, and the hashes of all other completed blocks.
+    """Return the number of completed blocks that were lost, and the hashes of the other completed blocks.
 
-    A block counts as lost if no present agent holds it, and its author was killed (Section 3.3), restarted or switched
-    off.
+    A block counts as lost if no present agent holds it, and if the agent that completed it was killed (Section 3.3),
+    restarted or switched off.
     """
     completed = evidence.completed_blocks()
     exports = evidence.present.values()

@@ -1,7 +1,8 @@
 """Check characteristic 1: agents work without a coordinator, and an agent runs code only in reaction to an event.
 
 Every handler run has a local trigger, or a message that its sender really sent. Every vote ends with its own timer, so
-no vote waits for another agent. Only traces show this, and only if their names are known.
+no vote waits for another agent. Only traces show this, and only if the checker knows the names of handlers and messages
+in them.
 """
 
 from typing import Any
@@ -31,8 +32,8 @@ _LOCAL = {handler.name for handler in ON_LOCAL_EVENT.values()}
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Check the trigger of every handler run in all traces. The verdict is `not applicable` if a trace is missing,
-    damaged or incomplete.
+    """Check the trigger of every handler run in all traces, and return the verdict on characteristic 1. The verdict is
+    `not applicable` if a trace is missing, damaged or incomplete.
     """
     if not evidence.traces:
         return Judgement(
@@ -114,8 +115,8 @@ def _has_known_names(run: HandlerRun) -> bool:
 
 
 def _wrong_trigger(run: HandlerRun, ran: set[str], sent: dict[int, Sendings]) -> str | None:
-    """Return a phrase about the error in the trigger of a handler run, to complete "the handler ...". Return None if
-    the trigger is valid.
+    """Return a phrase about the error in the trigger of a handler run. The phrase completes a sentence that begins with
+    "the handler". Return None if the trigger is valid.
     """
     match run.trigger:
         case MessageTrigger(name, sender, sequence):

@@ -8,7 +8,7 @@ from harness.checker.uniform_chain import common_prefix
 
 
 def figures(evidence: Evidence) -> dict[str, float | int | None]:
-    """Return the numeric results of a run by name. None means that a result is unknown.
+    """Return the numeric results of a run by name. A result of None is unknown.
 
     `copies_min` and `copies_mean` are the minimum and the mean number of chains that contain a completed block.
     `uniform_at_s` is the mission second since which all chains are equal, or None if they differ.
@@ -50,8 +50,8 @@ def figures(evidence: Evidence) -> dict[str, float | int | None]:
 
 
 def _sum_over_agents(evidence: Evidence, counter: str) -> int | None:
-    """Return the sum of a counter over all agents. Return None if neither run.json nor complete traces contain the
-    counter.
+    """Return the sum of a counter over all agents. Return None if neither run.json nor the traces contain it
+    completely.
     """
     agents = evidence.record.agents.values() if evidence.record else ()
     counts: list[int | None] = [getattr(agent, counter) for agent in agents]
@@ -72,7 +72,7 @@ def _sum_over_agents(evidence: Evidence, counter: str) -> int | None:
 def compute_uniform_at_s(evidence: Evidence) -> float | None:
     """Return the mission second since which all chains are equal. This is the time of the last change of any chain.
 
-    Return None if the chains differ at the end, or if their changes are not on record.
+    Return None if the chains differ at the end, or if no record contains these changes.
     """
     if len({export.chain_of_block_hashes for export in evidence.exports.values()}) != 1:
         return None

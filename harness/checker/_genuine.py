@@ -1,4 +1,4 @@
-"""Check characteristic 4: each block is unchanged, and was completed by the agent that it names."""
+"""Check characteristic 4: each block is unchanged, and was completed by the agent whose ID it contains."""
 
 import base64
 from dataclasses import dataclass, field, replace
@@ -14,20 +14,20 @@ from ucp.block import Block, InceptionBlock, next_chain_hash
 NAME = "genuine"
 
 _Content = tuple[int, int, str, str]
-"""Agent, timestamp, event data and block hash of a block, as exported."""
+"""The content of an exported block: agent, timestamp, event data and block hash."""
 _Link = tuple[str, str, str | None]
-"""The chain hash below a block, its block hash, and its chain hash."""
+"""A link of a chain: the chain hash below a block, the block hash, and the chain hash of the block."""
 
 
 @dataclass
 class _VerifiedHashes:
-    """A cache of verified hashes. Many agents hold the same block, but its hash is computed only once."""
+    """A cache of verified hashes. Many agents hold the same block, but the checker computes its hash only once."""
 
     blocks: set[_Content] = field(default_factory=set)
     links: set[_Link] = field(default_factory=set)
 
     def is_block(self, block: ExportedBlock) -> bool:
-        """Return true if the block hash is the hash of the block's content."""
+        """Return true if the block hash matches the content of the block."""
         content = block.agent_id, block.timestamp_us, block.event_data, block.block_hash
         if content not in self.blocks:
             if Block(block.agent_id, block.timestamp_us, block.event_bytes).block_hash.hex() != block.block_hash:
@@ -36,7 +36,7 @@ class _VerifiedHashes:
         return True
 
     def is_link(self, link: _Link) -> bool:
-        """Return true if the chain hash follows from the previous chain hash and the block hash (eq. 3.2)."""
+        """Return true if the chain hash matches the previous chain hash and the block hash (eq. 3.2)."""
         if link not in self.links:
             below, block_hash, chain_hash = link
             if next_chain_hash(bytes.fromhex(below), bytes.fromhex(block_hash)).hex() != chain_hash:
@@ -46,15 +46,15 @@ class _VerifiedHashes:
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Compute the hashes in all exports again, and compare the exported blocks with the blocks that each agent
-    completed.
+    """Recompute the hashes in all exports, and compare the exported blocks with the blocks that each agent completed.
+    Return the verdict on characteristic 4.
 
-    In a secured mission the signatures decide, so the check does not need the records of a block's author. A signed
-    block that its author did not complete is still not genuine, because an attacker may have the author's key. The
-    signed head of an export covers the order and the number of its blocks.
+    In a secured mission the signatures decide, so the check does not need the records of the agent that a block names.
+    A signed block that this agent did not complete is still not genuine, because an attacker may have the agent's key.
+    The signed head of an export covers the order and the number of its blocks.
 
-    The result is `not applicable` without an export, if the blocks that an agent completed are unknown, or if no anchor
-    vouches for the public keys of a secured mission.
+    The verdict is `not applicable` without an export, if the completed blocks of an agent are unknown, or if no anchor
+    confirms the public keys of a secured mission.
     """
     findings: list[Finding] = []
     roster = evidence.roster
@@ -128,7 +128,7 @@ def _explain_unknown_makers(evidence: Evidence, unknown: set[int]) -> str:
 
 
 def _describe_arrival(trace: Trace | None, block_hash: str) -> str:
-    """Return the time and the handler with which an agent received a block. The text ends a sentence."""
+    """Return the time and the handler with which an agent received a block, as text for the end of a sentence."""
     came = ("chain+", block_hash)
     for run in trace.runs if trace else ():
         if came in map(tuple, run.changes):

@@ -7,7 +7,8 @@ NAME = "idle implies committed"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge the exported state of each agent, and its state after each handler run in its trace.
+    """Check the exported state of each agent, and its state after each handler run. Return the verdict on
+    characteristic 2.
 
     The verdict is `not applicable` if an agent was not idle at the end, or left no export.
     """

@@ -1,7 +1,7 @@
 """Check liveness: after the last event, the swarm becomes idle with all completed blocks committed.
 
-If a swarm is not idle at the end, it may only need more time, or it may never finish. The check reports an endless
-cycle only if the records prove it. If agents still commit blocks, the rate of these commits gives an estimate of the
+A swarm that is not idle at the end may only need more time, or it may never finish. The check reports an endless cycle
+only if the records prove it. If agents still commit blocks, the rate of these commits gives an estimate of the
 remaining time.
 """
 
@@ -15,8 +15,8 @@ NAME = "liveness"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Return the verdict on liveness: `finished`, `not finished`, `never finishes` or `not applicable`. It is `never
-    finishes` if the records show an endless cycle.
+    """Return the verdict on liveness: `finished`, `not finished`, `never finishes` or `not applicable`. The verdict is
+    `never finishes` if the records show an endless cycle.
     """
     unknown = _explain_unknown(evidence)
     if unknown:

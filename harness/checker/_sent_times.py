@@ -1,8 +1,8 @@
 """Compute the mission second at which an agent sent a message that its trace contains.
 
 A trace contains the time of the handler run. With the setting `answer_spread_s`, the agent sends an answer later, after
-a wait that CONTRACT.md defines. This module computes the wait independently, because the agent under test computes it
-too.
+a wait that CONTRACT.md defines. This module computes the wait independently, because an error of the agent under test
+must not affect the check.
 """
 
 from base64 import b64decode
@@ -18,7 +18,7 @@ ANSWERS = frozenset(
 
 
 def spread_of(trace: Trace) -> float:
-    """Return the maximum random delay of the agent's answers (`answer_spread_s`) in mission seconds. Return 0 if the
+    """Return the maximum delay of the agent's answers (setting `answer_spread_s`) in mission seconds. Return 0 if the
     trace header has no valid value.
     """
     spread_s = trace.header.settings.get("answer_spread_s", 0.0)
@@ -26,7 +26,7 @@ def spread_of(trace: Trace) -> float:
 
 
 def sent_at(run: HandlerRun, message: SentMessage, spread_s: float) -> float:
-    """Return the mission second at which the agent sent this message of the handler run."""
+    """Return the mission second at which the agent sent this message, which the handler run produced."""
     if not spread_s or message.message not in ANSWERS or message.datagram is None:
         return run.t
     try:

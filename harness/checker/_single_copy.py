@@ -9,7 +9,9 @@ NAME = "single copy"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Judge the exports and the states in traces. The verdict is `not applicable` if an export is missing."""
+    """Check the exports, and the states in traces. Return the verdict on characteristic 3. The verdict is `not
+    applicable` if an export is missing.
+    """
     findings: list[Finding] = []
     for agent_id, export in evidence.exports.items():
         copies = Counter(block.block_hash for block in export.blocks())

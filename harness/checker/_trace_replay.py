@@ -1,7 +1,7 @@
 """Replay a trace: apply the changes of each handler run, and compare the result with the state in the same trace line.
 
-The module reads each trace once. It collects the observations for all checks that need the blocks of an agent at each
-step.
+The module reads each trace once. It collects observations for all checks that need to know which blocks an agent held
+at each step.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ COMPLETES = "build_data_block"
 
 @dataclass(frozen=True, slots=True)
 class TraceObservation:
-    """An observation of the checker at one line of a trace. The first line has number 1."""
+    """A fact that the checker observed at one line of a trace. The first line has number 1."""
 
     line: int
     run: HandlerRun
@@ -31,7 +31,7 @@ class TraceObservation:
 
     @property
     def where(self) -> str:
-        """The place of the observation, such as "trace line 7, t=12.5 s, receive_commit_block"."""
+        """The place of the observation as text, such as "trace line 7, t=12.5 s, receive_commit_block"."""
         return f"trace line {self.line}, t={self.run.t:g} s, {self.run.handler}"
 
 
@@ -45,7 +45,7 @@ class ReplayedIncarnation:
 
     trace: Trace
     number: int
-    """Number of the incarnation, from 0."""
+    """Number of the incarnation. The first one has number 0."""
     runs: list[HandlerRun]
     chain: list[str] = field(default_factory=list)
     deque: list[str] = field(default_factory=list)
@@ -53,18 +53,20 @@ class ReplayedIncarnation:
     completed: list[str] = field(default_factory=list)
     sent: int = 0
     unknown: bool = False
-    """True if the trace has unknown operations. From the first on, the held blocks are unknown."""
+    """True if the trace contains unknown operations. After the first of them, the held blocks are unknown."""
     impossible: list[TraceObservation] = field(default_factory=list)
-    """Impossible changes, such as the removal of a block that is not there."""
+    """Changes that are impossible, such as the removal of a block that the agent does not hold."""
     second_copies: list[TraceObservation] = field(default_factory=list)
     idle_too_early: list[TraceObservation] = field(default_factory=list)
-    """Idle states with own blocks outside of the chain, or with blocks in the deque or on the stack."""
+    """States in which the agent reported to be idle, although it had own blocks outside of the chain, or blocks in the
+    deque or on the stack.
+    """
     wrong_lengths: list[TraceObservation] = field(default_factory=list)
-    """The first state whose lengths contradict the changes."""
+    """The first recorded state whose numbers of blocks contradict the changes."""
     wrong_tops: list[TraceObservation] = field(default_factory=list)
-    """The first top chain hash that differs from that of the chain (eq. 3.2)."""
+    """The first recorded top chain hash that differs from the computed one (eq. 3.2)."""
     flags: list[TraceObservation] = field(default_factory=list)
-    """Impossible flags."""
+    """Recorded states with flags that are impossible."""
     back_in_time: list[TraceObservation] = field(default_factory=list)
     out_of_sequence: list[TraceObservation] = field(default_factory=list)
 
@@ -74,7 +76,9 @@ class ReplayedIncarnation:
 
 
 def replay(trace: Trace, inception: str | None) -> list[ReplayedIncarnation]:
-    """Return the replay of each incarnation of an agent. An incarnation is a part of its trace between two restarts."""
+    """Replay a trace. Return the result for each incarnation of the agent, which is a part of the trace between two
+    restarts.
+    """
     bounds = [0, *trace.starts, len(trace.runs)]
     return [
         _replay_incarnation(ReplayedIncarnation(trace, number, trace.runs[start:end]), inception)
@@ -130,7 +134,7 @@ class _HeldBlocks:
         self._copies: dict[str, int] = {}
         self._places = {"chain": incarnation.chain, "deque": incarnation.deque, "stack": incarnation.stack}
         self._chain_hashes = [bytes.fromhex(inception)] if inception is not None else None
-        """Chain hashes of the chain, from the inception block on. None if they are not known."""
+        """Chain hash of each block in the chain, from the inception block on. None if they are not known."""
         self._completed: set[str] = set()
         self._not_in_chain: dict[str, None] = {}
         self.has_blocks_aside = False
@@ -169,7 +173,9 @@ class _HeldBlocks:
                 self._chain_hashes.append(next_chain_hash(self._chain_hashes[-1], _digest(block)))
 
     def _take(self, name: str, place: list[str], block: str) -> str | None:
-        """Remove the block from the chain, deque or stack. Return None, or the reason if the removal is impossible."""
+        """Remove the block from the chain, deque or stack. Return None on success, or the reason why the removal is
+        impossible.
+        """
         end = 0 if name == "deque" else -1
         in_turn = bool(place) and place[end] == block
         if in_turn:
@@ -189,7 +195,9 @@ class _HeldBlocks:
         return f"{block[:12]} leaves the {name}, but is not {'in front' if name == 'deque' else 'on top'}"
 
     def compare(self, line: int, run: HandlerRun) -> bool:
-        """Return true if the state in the trace line equals the result of all changes up to this line."""
+        """Compare the state in the trace line with the result of all changes up to this line. Return true if they are
+        equal.
+        """
         incarnation, state = self._incarnation, run.state
         if (state.chain, state.deque, state.stack) != (
             len(incarnation.chain),
@@ -217,7 +225,7 @@ class _HeldBlocks:
 
 
 def _digest(block_hash: str) -> bytes:
-    """Return the block hash as bytes. Return zeros for an invalid hash, because no block has zeros as its hash."""
+    """Return the block hash as bytes. For an invalid hash, return zeros, which are the hash of no block."""
     try:
         return bytes.fromhex(block_hash)
     except ValueError:

@@ -38,41 +38,43 @@ FURTHER_CHECKS: dict[str, Callable[[Evidence], Judgement]] = {
     "records": records.check,
     "liveness": _liveness.check,
 }
-"""Key of each check that is not in the thesis -> its function. See `harness.scenario.verdict_names`."""
+"""Key of each check that is not a characteristic of the thesis -> its function. See
+`harness.scenario.verdict_names`.
+"""
 
 
 @dataclass(frozen=True)
 class Result:
     """The complete verdict on a run.
 
-    `characteristics` holds the judgement of each characteristic by its number, "1" to "6". `beside` holds the three
-    further judgements `steps`, `records` and `liveness`. `figures` holds the numeric results by name, as in run.json;
-    None means unknown.
+    `characteristics` holds the judgement of each characteristic by its number, "1" to "6". `beside` holds the
+    judgements of the further checks `steps`, `records` and `liveness`. `figures` holds the numeric results by name, as
+    in run.json. A value of None is unknown.
     """
 
     characteristics: dict[str, Judgement]
     figures: dict[str, float | int | None]
     beside: dict[str, Judgement] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
-    """A sentence for each file that could not be read, or only in part."""
+    """One sentence for each file that could not be read completely."""
     chains: dict[int, tuple[str, ...]] = field(default_factory=dict)
     """Agent ID -> block hashes of its chain in hexadecimal, oldest first."""
 
     @property
     def judgements(self) -> dict[str, Judgement]:
-        """All judgements in the order in which the report shows them. The key is the number of a characteristic, or the
-        name of a further check.
+        """All judgements in the order in which the report shows them. The key is the number of a characteristic or the
+        name of another check.
         """
         return {**self.characteristics, **self.beside}
 
     @property
     def bad(self) -> tuple[str, ...]:
-        """The numbers of the characteristics, and the names of the further checks, that have a bad verdict."""
+        """The keys of the checks with a bad verdict: numbers of characteristics, and names of other checks."""
         return tuple(key for key, judgement in self.judgements.items() if judgement.kind == "bad")
 
     @property
     def wrong(self) -> tuple[str, ...]:
-        """The numbers or names of the checks with a bad verdict, except `liveness` if the swarm may only need more
+        """The keys of the checks with a bad verdict. `liveness` is not included if the swarm may only need more
         time.
         """
         return tuple(key for key in self.bad if self.judgements[key].verdict != UNFINISHED)
@@ -85,9 +87,7 @@ class Result:
         return VIOLATED if self.wrong else INCOMPLETE if self.bad else 0
 
     def to_json(self) -> dict[str, Any]:
-        """Return the verdict in the form that the JSON schema `ucp-run/1` requires: one key for each part of the
-        verdict.
-        """
+        """Return the verdict as JSON, in the form of the schema `ucp-run/1`: one key for each part of the verdict."""
         return {
             "characteristics": {
                 number: characteristic.to_json() for number, characteristic in self.characteristics.items()
@@ -101,8 +101,8 @@ class Result:
 def check(run: Evidence | RunArchive) -> Result:
     """Judge the six characteristics (Section 4.3), all steps of agents, the agreement of the records, and liveness.
 
-    `run` is an archive, or the evidence from it. A damaged file raises no error, but adds a sentence to
-    `Result.errors`.
+    `run` is an archive, or the evidence from it. A damaged file raises no error. `Result.errors` then contains a
+    sentence about it.
     """
     evidence = gather(run) if isinstance(run, RunArchive) else run
     chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}

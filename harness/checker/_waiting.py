@@ -1,7 +1,7 @@
 """Check one part of characteristic 1: an agent continues when its own timer expires, and does not wait longer for other
 agents.
 
-A vote and each step of a reconcile end with a timer. An agent that waits longer than its timers run would wait forever.
+A vote and each step of a reconcile end with a timer. An agent that waits longer than its timers would wait forever.
 """
 
 import math
@@ -31,7 +31,7 @@ RECONCILE_STEPS = frozenset(
     )
 )
 NO_STEP = frozenset(("already in progress", "not in phase 3", "another block"))
-"""Branches of these handlers in which a reconcile does not continue."""
+"""Branches in which the handlers of a reconcile do not continue it."""
 
 
 def _continues_reconcile(run: HandlerRun) -> bool:
@@ -47,15 +47,15 @@ ALL_TIMERS = (*VOTE_TIMERS, *RECONCILE_TIMERS)
 
 @dataclass(slots=True)
 class _UnfinishedOperation:
-    """A vote or reconcile of an agent. The agent must continue it within `longest` mission seconds after its
-    last step.
+    """A vote or reconcile in progress. The agent must continue it within `longest` mission seconds after its last
+    step.
     """
 
     what: str
     longest: float
     line: int = 0
     since: float = math.inf
-    """Infinity without a vote or reconcile."""
+    """Mission second of the last step. Infinity if no vote or reconcile is in progress."""
 
     def finding(self, agent_id: int) -> Finding:
         where = f"trace line {self.line}, t={self.since:g} s"
@@ -63,7 +63,9 @@ class _UnfinishedOperation:
 
 
 def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
-    """Yield each vote or reconcile that lasted longer than the agent's timers allow. Paused agents are excluded."""
+    """Yield each vote or reconcile that took longer than the agent's timers allow. Agents that were paused are
+    excluded.
+    """
     for agent_id, trace in evidence.traces.items():
         if evidence.describe_unknown_name("handler", "branch", agent_id=agent_id):
             continue  # only known names show the steps of votes and reconciles
@@ -107,8 +109,8 @@ def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Unfini
 
 
 def longest(trace: Trace, timers: tuple[str, ...]) -> float:
-    """Return the duration of the longest of these timers in mission seconds, plus a tolerance. Return infinity if a
-    duration is unknown.
+    """Return the duration of the longest of these timers in mission seconds, plus a tolerance. Return infinity if the
+    duration of a timer is unknown.
     """
     settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
     if not all(isinstance(setting, int | float) for setting in settings):

@@ -1,7 +1,7 @@
 """Collect the evidence for the checker: exported chains, traces, run.json, network records and packet captures.
 
-Checks read only an `Evidence` object. It caches values that several checks derive from the files. Every part of it
-except the exports may be missing.
+Checks read only an `Evidence` object. It caches values that several checks derive from the files. Every part of the
+evidence except the exports may be missing.
 """
 
 import math
@@ -46,16 +46,21 @@ if TYPE_CHECKING:
 Derived = TypeVar("Derived")
 
 Sending = tuple[tuple[float, SentMessage], ...]
-"""Mission seconds and messages of one agent with one type and sequence number: at most one in each incarnation."""
+"""The messages of one agent with a certain type and sequence number, each with its mission second. Each incarnation
+sends at most one of them.
+"""
 Sendings = dict[Any, dict[Any, Sending]]
-"""The messages that one agent sent: type -> sequence number -> sendings."""
+"""The messages that one agent sent: message type -> sequence number -> messages."""
 
 Watch = Callable[[ReferenceState, HandlerRun | None], None]
-"""A function that gets the state of an agent after each handler run, and the run. The run is None at the start of an
-incarnation."""
+"""A function that receives each handler run of an agent, and the state of the agent after it. The run is None at the
+start of an incarnation.
+"""
 
 MAX_LINK_CHANGES = 20_000_000
-"""Maximum number of links times changes of the network whose losses are computed, which takes some ten seconds."""
+"""Maximum number of link losses to compute (links times changes of the network). The computation takes about ten
+seconds.
+"""
 
 _HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")
 
@@ -87,23 +92,25 @@ class NetworkLogEntry(BaseModel):
     disk: str | None = None
     planned_s: float | None = None
     asked: dict[str, Any] | None = None
-    """The conditions that the scenario asks for, as `NetworkConditions.to_json` writes them."""
+    """The conditions that the scenario requested, in the format of `NetworkConditions.to_json`."""
     counters: Counters | None = None
-    """The counters of the kernel at the end."""
+    """The packet counters of the kernel. Only the last line of the file has them."""
 
 
 @dataclass
 class RogueTraffic:
-    """The messages that a rogue node (a sender outside the swarm) injected, as far as the injection log
-    describes them.
+    """The messages that the rogue node (a sender outside the swarm) injected, as far as the injection log lists
+    them.
     """
 
     messages: set[tuple[Any, Any, Any]] = field(default_factory=set)
-    """Sender, sequence number and type."""
+    """The injected messages, each as (sender, sequence number, type)."""
     counted: bool = False
-    """True if only the number of some messages is on record."""
+    """True if the log contains only the number of some messages."""
     outside_senders: set[int] = field(default_factory=set)
-    """Agents whose datagrams from another place the scenario delivers. The records of that place are missing."""
+    """Agents in whose name the scenario delivers datagrams from another place. The records of that place are
+    missing.
+    """
 
     def add(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
         """Add injected datagrams to this object, and return it."""
@@ -126,7 +133,7 @@ class Evidence:
     """All recorded files of one run that the checker uses.
 
     `record` is the content of `run.json`, or None if there are only exports. `before_final_reconcile` has the exports
-    before the final reconcile. It is empty if there was no final reconcile.
+    before the final reconcile. The latter is empty without a final reconcile.
     """
 
     exports: dict[int, Export]
@@ -136,37 +143,45 @@ class Evidence:
     before_final_reconcile: dict[int, Export] = field(default_factory=dict)
     injected: RogueTraffic = field(default_factory=RogueTraffic)
     conditions: list[NetworkLogEntry] | None = None
-    """The lines of `network.jsonl`. None without this file."""
+    """The lines of `network.jsonl`. None if the file is missing."""
     captures: Captures | None = None
     lag: MeasuredLag | None = None
-    """The measured lag of machine and agents. None if it was not measured."""
+    """The measured delays of machine and agents. None if they were not measured."""
     keys: TrustedKeys | None = None
     """The public keys of a secured mission, which verify the signatures of blocks and exports."""
     verified: "Callable[[UnverifiedSignature], bool] | None" = None
-    """A function that returns true for a valid signature without verifying it, for a swarm played in this process."""
+    """A function that returns true for a valid signature without a computation. It exists only for a swarm that this
+    process simulated.
+    """
     watch: Watch | None = None
-    """A function that gets each step of the step judge."""
+    """A function that receives each step that the step judge examines."""
     scenario: Scenario | None = None
-    """The recorded scenario. None without a record, and for a run in memory, whose scenario nothing can alter."""
+    """The recorded scenario. None without a record. Also None for a run in memory, because its scenario cannot have
+    been edited.
+    """
     link_losses: list[tuple[float, dict[Link, float]]] = field(default_factory=list)
-    """Mission seconds with the losses, 0 to 1, that links have from then on: first all links, then changed ones."""
+    """The loss rates (0 to 1) of links over time: mission seconds, each with the links whose loss changes then. The
+    first entry contains all links.
+    """
     from_field: bool = False
-    """True for files without the record of a run. Nothing counts the lines of their traces, so lines may be missing."""
+    """True for files without the run record run.json. Then no counter shows how many lines their traces should have, so
+    lines may be missing.
+    """
     steps: Judgement | None = None
-    """The judgement on the steps, if it was made before. Else None."""
+    """The judgement on the steps, if it exists already. None otherwise."""
     stores: dict[int, Path] = field(default_factory=dict)
-    """The store of the last incarnation of each agent that has one."""
+    """The path of the store that the last incarnation of an agent wrote. Agents without a store are missing."""
     channel: list[ChannelLine] | None = None
-    """The journal of the shared channel. None without a journal."""
+    """The journal of the shared channel. None if the run has no journal."""
     report_progress: ReportProgress = lambda step: None
-    """A function that gets each long step of the judging in words."""
+    """A function that receives the name of each long step of the checker."""
     _derived: dict[Callable[["Evidence"], Any], Any] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     @cached_property
     def secured(self) -> bool:
-        """True if at least one record shows that the mission was secured with keys and signatures."""
+        """True if a record shows that the mission was secured with keys and signatures."""
         return (
             self.keys is not None
             or (self.scenario is not None and self.scenario.security is not None)
@@ -188,26 +203,26 @@ class Evidence:
 
     @cached_property
     def names(self) -> dict[str, str]:
-        """The short name of each block, such as 4.11 for the eleventh block of agent 4. The key is the block hash."""
+        """Block hash -> short name of the block, such as 4.11 for the eleventh block of agent 4."""
         return name_blocks(self.exports)
 
     def name(self, block_hash: str) -> str:
-        """Return the short name of the block, such as 4.11. If the block has none, return the first 12 digits of its
+        """Return the short name of the block, such as 4.11. If the block has no name, return the first 12 digits of its
         hash.
         """
         return self.names.get(block_hash, block_hash[:12])
 
     @cached_property
     def unknown(self) -> dict[int, UnknownNames]:
-        """The names in each agent's trace that the agent contract does not define. Agents without such names are
-        omitted.
+        """Agent ID -> the names in the agent's trace that the agent contract does not define. Agents without such names
+        are missing.
         """
         words = {agent_id: unknown_names(trace.runs) for agent_id, trace in self.traces.items()}
         return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
 
     def describe_unknown_name(self, *kinds: Kind, agent_id: int | None = None) -> str | None:
         """Return a description of the first undefined name of these kinds (such as "handler") in the agent's trace.
-        Return None if there is none. Without an agent, search all traces.
+        Return None if all names are defined. If `agent_id` is None, search all traces.
         """
         for named, unknown in self.unknown.items():
             if agent_id in (None, named) and (words := first_unknown(unknown, kinds)):
@@ -216,9 +231,7 @@ class Evidence:
 
     @cached_property
     def incarnations(self) -> dict[int, list[ReplayedIncarnation]]:
-        """The replayed trace of each agent, as a list with one part for each incarnation (the time between two
-        restarts).
-        """
+        """Agent ID -> the replayed incarnations of the agent. An incarnation is the time between two restarts."""
         inception = next((export.inception.chain_hash for export in self.exports.values()), None)
         if inception is None:
             states = (run.state for trace in self.traces.values() for run in trace.runs)
@@ -241,7 +254,7 @@ class Evidence:
         return sendings
 
     def cached(self, derive: Callable[["Evidence"], Derived]) -> Derived:
-        """Return `derive(self)`. The function runs once, and later calls return the same value."""
+        """Return `derive(self)`. The function runs only once. Later calls return the stored value."""
         if derive not in self._derived:
             self._derived[derive] = derive(self)
         derived: Derived = self._derived[derive]
@@ -299,12 +312,14 @@ class Evidence:
 
     @cached_property
     def switched_off(self) -> dict[int, float]:
-        """The mission second at which each agent was switched off. Agents that ran until the end are not included."""
+        """Agent ID -> the mission second at which the agent was switched off. Agents that ran until the end are
+        missing.
+        """
         return self.record.switched_off if self.record else {}
 
     @property
     def present(self) -> dict[int, Export]:
-        """The exports of the agents that ran until the end. If all agents were switched off, the exports of
+        """The exports of the agents that ran until the end. If all agents were switched off, these are the exports of
         all agents.
         """
         there = {agent_id: export for agent_id, export in self.exports.items() if agent_id not in self.switched_off}
@@ -312,7 +327,7 @@ class Evidence:
 
     @property
     def presence_s(self) -> tuple[float, float]:
-        """The interval, in mission seconds, in which exactly the agents in `present` ran: its start and its end."""
+        """The interval (start, end) in mission seconds during which exactly the agents in `present` ran."""
         off_s = self.switched_off.values()
         if set(self.exports) <= set(self.switched_off):
             return 0.0, min(off_s, default=math.inf)
@@ -353,7 +368,7 @@ class Evidence:
 
     @cached_property
     def requested_links(self) -> set[LinkConditions] | None:
-        """All network conditions (loss, delay and others) that the scenario requested for any link. None if no record
+        """All network conditions (loss, delay and others) that the scenario requested for links. None if no record
         contains them.
         """
         if self.conditions is None:
@@ -371,7 +386,9 @@ class Evidence:
 
     @property
     def has_fates(self) -> bool:
-        """True if a script in the scenario decided which messages arrive. Otherwise the network decides."""
+        """True if scripted fates in the scenario decided about the arrival of messages. Otherwise only the network
+        decides.
+        """
         return self.record is not None and any(state.what == NO_MORE_FATES for state in self.record.network)
 
     @property
@@ -385,7 +402,7 @@ class Evidence:
         return {agent for agent in unknown if agent not in self.exports or self.was_restarted(agent)}
 
     def completed_blocks(self) -> dict[str, int]:
-        """The agent that completed each recorded block. The key is the block hash."""
+        """Block hash -> the agent that completed the block."""
         return self._completed_blocks
 
     @cached_property

@@ -1,12 +1,12 @@
 """Count how the agents handled injected messages. The sources are the injection log and the traces.
 
 A forged message has a sequence number that no agent uses. Each handler run with this number therefore belongs to the
-rogue node. A copy of a message is equal to its original. Of the handler runs of one agent for this message, the last
-ones therefore count for the copies. Their number is at most the number of copies that were sent before.
+rogue node. A replayed copy of a message is equal to its original. If an agent ran its handler for this message several
+times, the last runs therefore count for the copies, but not more runs than copies were sent before.
 
 A secured agent handles each datagram only once, and handles no altered datagram. Corrupted messages therefore count as
 not handled. A copy that is sent immediately cannot be distinguished from the original. A delayed copy counts as handled
-by the agents that the original had not reached.
+by each agent that handles it for the first time, because the original did not reach this agent.
 """
 
 from collections import Counter, defaultdict
@@ -27,7 +27,7 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 SKEW_S = 0.05
-"""Greatest difference between the clocks of two processes, in mission seconds."""
+"""Maximum difference between the clocks of two processes, in mission seconds."""
 BRANCHES_NAMED = 6
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
@@ -52,7 +52,7 @@ class _RogueLine(BaseModel):
 
 
 _Key = tuple[Any, Any, Any]
-"""Sender, sequence number and type of a message, as in a trace."""
+"""The identity of a message in a trace: sender, sequence number and type."""
 
 
 @dataclass
@@ -68,7 +68,7 @@ class _InjectionTally:
 
 
 def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
-    """Return the effect of each injection that the scenario planned. The order is that of the scenario."""
+    """Return the effect of each injection that the scenario planned, in the order of the scenario."""
     injections = injections_of(scenario)
     if not injections:
         return []
@@ -95,7 +95,7 @@ def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
 
 
 def in_words(injection: RogueInjection) -> str:
-    """Return one line of text that describes the effect of an injection."""
+    """Describe the effect of an injection in one line of text."""
     branches = sum((Counter(of.handled) for of in injection.messages), Counter()).most_common()
     done = [f"{branch} {count}" for branch, count in branches[:BRANCHES_NAMED]]
     if len(branches) > BRANCHES_NAMED:
@@ -109,7 +109,7 @@ def in_words(injection: RogueInjection) -> str:
 
 
 def describe_handling(messages: InjectedMessages) -> str:
-    """Return the number of handler runs with each result, such as "held already 4, committed 1"."""
+    """Return the number of handler runs for each result as text, such as "held already 4, committed 1"."""
     done = [f"{branch} {count}" for branch, count in messages.handled.items()]
     return (
         ", ".join([*done, *([f"{messages.unhandled} handled by no agent"] if messages.unhandled else [])]) or "unknown"
@@ -137,7 +137,7 @@ def _count_line(
 def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
     """Return the handler runs that injected messages may have triggered, grouped by message.
 
-    A copy has the same key as its original, so the handler runs for the original are included.
+    A replayed copy cannot be distinguished from its original, so the handler runs for the original are included.
     """
     triggered: dict[_Key, list[HandlerRun]] = defaultdict(list)
     for run in trace.runs:
@@ -153,7 +153,7 @@ def _pair_with_copies(
     copies: Sequence[tuple[float, int]] | None, key: _Key, runs: list[HandlerRun]
 ) -> Iterator[tuple[int, int, HandlerRun]]:
     """Yield each handler run that an injected message triggered, with the number of the injection and the index of the
-    copy. The last handler runs are assigned to the last copies.
+    copy. The last runs of a handler are assigned to the last copies.
     """
     forged = injection_of(key[1])
     if copies is None and forged is not None:

@@ -9,13 +9,13 @@ from typing import Any
 from harness.scenario.verdict_names import Kind, Verdict, kind_of
 
 MAX_EVIDENCE = 50
-"""Maximum number of listed pieces of evidence. The reason has the number of all."""
+"""Maximum number of findings that a judgement lists. Its reason contains the total number."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One piece of evidence for a verdict: an agent, an observation, and the block that the observation concerns, if
-    any.
+    """One piece of evidence for a verdict: an agent, an observation, and the block that the observation concerns or
+    None.
     """
 
     agent_id: int
@@ -23,7 +23,7 @@ class Finding:
     block: str | None = None
     block_hash: str | None = None
     handler: str | None = None
-    """Name of the handler that the evidence concerns, one of the 20. None if it concerns no handler."""
+    """Name of the handler that the evidence concerns. None if it concerns none of the 20 handlers."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,7 @@ class Judgement:
 
     @property
     def kind(self) -> Kind:
-        """The class of the verdict: `good`, `bad` or `unknown`. The command ends with a nonzero exit status after a bad
-        verdict.
-        """
+        """The class of the verdict: `good`, `bad` or `unknown`. A bad verdict leads to a nonzero exit status."""
         return kind_of(self.verdict)
 
     def to_json(self) -> dict[str, Any]:
@@ -53,7 +51,7 @@ class Judgement:
 
 
 def violated(name: str, what: str, findings: list[Finding]) -> Judgement:
-    """Return a judgement with the verdict `violated`. Its reason is the number of findings, followed by `what`, as in
+    """Return a judgement with the verdict `violated`. Its reason consists of the number of findings and `what`, as in
     "1 time: an idle agent ...".
     """
     return Judgement(name, "violated", f"{times(len(findings))}: {what}", findings[:MAX_EVIDENCE])

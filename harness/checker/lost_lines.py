@@ -1,16 +1,16 @@
 """Find the places at which a trace contradicts itself because lines are lost or in the wrong order.
 
-A file from the field may have lost lines without any mark at their place. A correct agent then seems to do something
-impossible, so a judge must know these places. Four kinds of contradiction prove them:
+A file from the field may have lost lines, and nothing marks their place. A correct agent then seems to do something
+impossible, so the judge must know these places. Four kinds of contradiction prove that lines are lost:
 
 - The sequence numbers of sent messages jump. The lost line comes after the last message before the jump.
-- The time goes back.
+- The time decreases from one line to the next.
 - A handler run names as its trigger a handler that did not run since the last input.
 - The state before a handler run differs from the state at the end of the previous line. The state before the run
   follows from the recorded state after it and from its changes.
 
-If one kind of contradiction occurs often, the agent probably writes its trace in its own way. This kind then proves
-nothing.
+If one kind of contradiction occurs often, the agent probably interprets the trace format differently. This kind of
+contradiction then proves nothing.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,14 +21,15 @@ from ucp.trace import HandlerRun, StateSummary
 from ucp.trigger import BootTrigger, LocalTrigger
 
 MAX_PLACES, MAX_SHARE = 3, 0.1
-"""Limits for each kind of fact: the number of places, and their share of the lines that could show the fact. With more
-places the agent writes its trace in its own way."""
+"""Limits for each kind of contradiction: the number of places, and their share of the lines that could show it. Above
+both limits, the agent probably interprets the trace format differently.
+"""
 
 
 def lost_lines(trace: Trace) -> dict[int, str]:
     """Return the handler runs whose errors a lost line may explain, each with a reason such as "lines are missing ...".
 
-    The key is the position of the handler run: the number of runs before it, as in `Trace.gaps`.
+    The key is the number of handler runs before this one, as in `Trace.gaps`.
     """
     found: dict[int, str] = {}
     kinds = _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces()
@@ -44,7 +45,7 @@ def lost_lines(trace: Trace) -> dict[int, str]:
 
 
 class _ContradictionPlaces:
-    """The places in a trace with one kind of contradiction. `possible` is the number of lines at which it
+    """The places in a trace at which one kind of contradiction occurs. `possible` is the number of lines at which it
     could occur.
     """
 

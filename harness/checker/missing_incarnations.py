@@ -6,11 +6,11 @@ incarnation. The other parts of its trace then look complete, and the agent seem
 have completed blocks in that time. Three facts prove that an incarnation is missing:
 
 - The trace begins with a boot, or the agent boots from a disk with completed blocks that are on no earlier line.
-- Another agent received a message of this agent that no line has, or that no line has with this content. Every
-  incarnation numbers its messages from 0, so the number alone proves nothing.
+- Another agent received a message of this agent, and no line of this agent contains the message with this content. The
+  sequence number alone proves nothing, because every incarnation numbers its messages from 0.
 - A block of the agent has a timestamp outside all recorded incarnations.
 
-The third fact concerns a single block, so `was_running` checks it for one timestamp.
+The third fact concerns a single block. The function `was_running` checks it for the timestamp of this block.
 """
 
 from bisect import bisect_left
@@ -27,9 +27,7 @@ from ucp.trigger import BootTrigger, MessageTrigger
 
 
 def lacking_traces(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
-    """Yield each agent whose trace seems complete but lacks lines or an incarnation. Each agent comes with
-    the reason.
-    """
+    """Yield each agent whose trace seems complete but lacks lines or an incarnation, with the reason."""
     for agent_id, trace in traces.items():
         if not trace.problem and (why := _boots_from_unknown(trace)):
             yield agent_id, why
@@ -37,9 +35,7 @@ def lacking_traces(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
 
 
 def _boots_from_unknown(trace: Trace) -> str | None:
-    """Return the reason why an incarnation is missing, if the agent booted from the disk of an incarnation that is not
-    recorded. Return None otherwise.
-    """
+    """Return a reason if the agent booted from a disk that an unrecorded incarnation wrote. Return None otherwise."""
     completed: set[str] = set()
     for start, end in pairwise([0, *trace.starts, len(trace.runs)]):
         runs = trace.runs[start:end]
@@ -52,9 +48,7 @@ def _boots_from_unknown(trace: Trace) -> str | None:
 
 
 def _unsent(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
-    """Yield each agent whose trace lacks a message that another agent received from it. Each agent comes with the
-    reason.
-    """
+    """Yield each agent whose trace lacks a message that another agent received from it, with the reason."""
     sent: dict[int, dict[tuple[str, int], list[RecordedBytes | None]]] = {}
     for agent_id, trace in traces.items():
         sent[agent_id] = defaultdict(list)
@@ -80,7 +74,7 @@ def _unsent(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
 
 
 def was_running(trace: Trace, timestamp_us: int) -> bool:
-    """Return true if this timestamp lies within a recorded incarnation of the agent, by the agent's clock."""
+    """Return true if a recorded incarnation of the agent was running at this timestamp of the agent's clock."""
     at_s = mission_s(timestamp_us, trace.header)
     if at_s is None:
         return False
@@ -92,10 +86,10 @@ def was_running(trace: Trace, timestamp_us: int) -> bool:
 
 
 def may_be_of_missing_incarnation(evidence: Evidence, block: ExportedBlock) -> bool:
-    """Return true if the author may have completed the block in an incarnation that is not recorded.
+    """Return true if the author of the block may have completed it in an unrecorded incarnation.
 
-    Only the record of a run lists all incarnations. Without it, the trace of an agent shows the times of its
-    incarnations, and an export lists the blocks of the last incarnation only.
+    Only run.json lists all incarnations. Without it, the trace of an agent shows the times of its incarnations, and an
+    export lists only the blocks of the last incarnation.
     """
     if evidence.record is not None:
         return False

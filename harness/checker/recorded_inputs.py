@@ -14,7 +14,7 @@ from ucp.store import StoredState
 from ucp.trace import RecordedBytes
 
 KEPT = 4096
-"""Number of decoded datagrams in the cache. One datagram reaches many agents."""
+"""Number of decoded datagrams in the cache. Many agents receive the same datagram."""
 
 LENGTH_BYTES = 2
 
@@ -24,7 +24,7 @@ class NotOnRecordError(Exception):
 
 
 def decoded(record: RecordedBytes | None) -> Datagram:
-    """Return the decoded datagram. Raises MalformedDatagramError if the bytes are invalid."""
+    """Decode a recorded datagram. Raises MalformedDatagramError if the bytes are invalid."""
     if record is None:
         return _decoded("")
     content = record.content
@@ -41,7 +41,7 @@ def _decoded(text: str) -> Datagram:
 
 
 def event_of(record: RecordedBytes | None) -> LoggableEvent:
-    """Return the event in this record. Raises MalformedEventsError if the bytes are invalid."""
+    """Decode a recorded event. Raises MalformedEventsError if the bytes are invalid."""
     if record is not None and isinstance(record.content, LoggableEvent):
         return record.content
     try:
@@ -55,7 +55,7 @@ def event_of(record: RecordedBytes | None) -> LoggableEvent:
 
 
 def sealed_of(record: RecordedBytes | None) -> bytes | None:
-    """Return the encrypted data that an agent recorded. Return None if there is none, or if it is not valid base64."""
+    """Return the encrypted event data that an agent recorded. Return None if it recorded none, or no valid base64."""
     try:
         return None if record is None else base64.b64decode(record.text, validate=True)
     except ValueError:
@@ -87,7 +87,7 @@ class BlockIndex:
         self._blocks: dict[str, Block] = {}
 
     def add(self, block: Block) -> None:
-        """Add a complete block to the index."""
+        """Add a block with its content to the index."""
         self._blocks[block.block_hash.hex()] = block
 
     def add_from(self, message: Message) -> None:

@@ -1,8 +1,8 @@
-"""Find the cycle that agents repeat forever. Evidence is a proof in virtual time, or the traces.
+"""Find the cycle that agents repeat forever. The evidence is a proof in virtual time, or the traces.
 
-A trace shows a cycle if it ends with several repetitions of the same sequence of handler runs, each time with the same
-chain and the same numbers of blocks in deque and stack. It shows a standstill if an agent is not idle and ran no
-handler for longer than its longest timer. If agents still make progress, their chains change, so their traces show
+A trace shows a cycle if it ends with several repetitions of the same sequence of handler runs. In each repetition, the
+chain and the numbers of blocks in deque and stack are the same. A trace shows a standstill if the agent is not idle and
+ran no handler for longer than its longest timer. Agents that make progress change their chains, so their traces show
 neither a cycle nor a standstill.
 """
 
@@ -19,22 +19,22 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 SEVERAL = 5
-"""Number of repetitions in a row that count as a cycle."""
+"""Number of consecutive repetitions that count as a cycle."""
 LAST_RUNS = 20_000
-"""Number of last handler runs of an agent that are searched for a cycle."""
+"""Number of an agent's last handler runs in which the checker searches for a cycle."""
 COUNTED = {
     "receive_phase_1_response": ("yes", "no"),
     "receive_response_next_in_sequence": ("new candidate", "counted"),
 }
 """Handler of an answer in a reconcile -> the branches in which the answer counts."""
 ALREADY = "already in progress"
-"""Branch of Algorithm 7 in an agent that already reconciles."""
+"""Branch of Algorithm 7 in an agent that is already in a reconcile."""
 REFUSED = ("receive_vote_add_block", "no")
 ASKS = ("reconcile_phase_1", "reconcile_phase_2")
 MAX_NAMED = 10
 PERIOD_TOLERANCE_S = 0.01
 SHORTEST_PAUSE_S = 0.05
-"""A shorter pause between two handler runs is not mentioned."""
+"""Mission seconds. The description of a cycle does not mention shorter pauses between handler runs."""
 
 
 def cycle_of(evidence: Evidence) -> Cycle | None:
@@ -58,8 +58,8 @@ def cycle_of(evidence: Evidence) -> Cycle | None:
 
 
 def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
-    """Return the mission second of the last handler run of the agents that stand still. Received messages without an
-    effect do not count.
+    """Return the mission second of the last handler run of the agents in a standstill. Received messages without effect
+    do not count.
     """
     traces = [evidence.traces.get(agent_id) for agent_id in standstill.agents]
     ran_at = [runs[-1].t for trace in traces if trace is not None and (runs := _own_runs(trace))]
@@ -126,7 +126,7 @@ def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | N
 def _own_runs(trace: Trace) -> list[HandlerRun]:
     """Return the last handler runs of an agent since its last restart.
 
-    Runs that a message triggered and that changed no blocks are left out.
+    Runs for messages that changed no blocks are omitted.
     """
     start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
     runs = (run for run in trace.runs[start:] if run.changes or not isinstance(run.trigger, MessageTrigger))
@@ -135,7 +135,7 @@ def _own_runs(trace: Trace) -> list[HandlerRun]:
 
 def _round(runs: Sequence[HandlerRun], times: int) -> _CyclePart | None:
     """Return the shortest sequence of handler runs that is repeated at least `times` times at the end of `runs`. Return
-    None if there is none.
+    None if no sequence is repeated.
     """
     keys = [_key(run) for run in reversed(runs)]
     for length, matching in enumerate(_matches(keys)):
@@ -153,8 +153,8 @@ def _key(run: HandlerRun) -> tuple[object, ...]:
 
 
 def _matches(keys: Sequence[object]) -> list[int]:
-    """Return the Z-function of a sequence. For each position, it is the length of the longest common prefix of the
-    whole sequence and its part from this position on.
+    """Return the Z-function of a sequence. For each position, this is the length of the longest common prefix of the
+    whole sequence and the part that begins at this position.
     """
     matching = [0] * len(keys)
     left = right = 0
@@ -169,8 +169,8 @@ def _matches(keys: Sequence[object]) -> list[int]:
 
 
 def _waits(evidence: Evidence, rounds: dict[int, _CyclePart], period_s: float) -> Iterator[CycleWait]:
-    """Yield, for each agent, the peers that gave it no counted answer in the last period, and the peers that rejected
-    its blocks.
+    """Yield for each agent the reasons why it waits: the peers that gave it no counted answer in the last period, and
+    the peers that rejected its blocks.
     """
     for agent_id, each in rounds.items():
         heard, refused_by = set[int](), set[int]()
@@ -193,7 +193,7 @@ def _waits(evidence: Evidence, rounds: dict[int, _CyclePart], period_s: float) -
 
 
 def in_short(cycle: Cycle) -> str:
-    """Return a short phrase: the agents that never finish, and the start of their cycle."""
+    """Return a short phrase about a cycle: the agents that never finish, and the start of the cycle."""
     many = len(cycle.agents) > 1
     goes = "repeated the same cycle" if cycle.period_s is not None else "hung"
     return f"{named(cycle.agents)} {'have' if many else 'has'} {goes} since {cycle.since_s:.0f} s"
@@ -232,7 +232,7 @@ def _each_other(peers: Mapping[int, tuple[int, ...]]) -> bool:
 
 
 def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ...], list[int]]]:
-    """Yield each distinct set of peers together with the agents to which it belongs."""
+    """Yield each distinct set of peers, together with the agents that have this set."""
     alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for agent_id, whom in peers.items():
         alike[whom].append(agent_id)

@@ -1,8 +1,8 @@
 """The signatures in the exports of a secured mission, and the trust in the public keys that verify them.
 
-A signature proves nothing if the attacker may choose the key. A reader of exports therefore needs an *anchor*: a copy
-of the public keys, or their fingerprint, that does not come from the attacker. Without an anchor, a reader can find
-edited exports, but it cannot vouch for any export.
+A signature proves nothing if an attacker could choose the key that verifies it. A user who checks exports therefore
+needs an *anchor*: a copy of the public keys, or their fingerprint, that cannot come from the attacker. Without an
+anchor, the checker can detect some edited exports, but it cannot confirm that an export is genuine.
 """
 
 import base64
@@ -20,23 +20,21 @@ if TYPE_CHECKING:
     from ucp.secure.export_head import ExportHead
 
 _Content = tuple[int, int, str, str, str | None]
-"""Agent, timestamp, event data, block hash and signature of a block, as exported."""
+"""The signed content of an exported block: agent, timestamp, event data, block hash and signature."""
 MAX_U64 = 2**64 - 1
 
 
 @dataclass(frozen=True)
 class TrustedKeys:
-    """Public keys of a mission. `anchor` names the source that vouches for the keys. It is None if no source vouches
-    for them.
-    """
+    """Public keys of a mission. `anchor` names the source that confirms the keys. It is None without such a source."""
 
     public: "PublicKeys"
     anchor: str | None
 
 
 def unanchored(exports: Iterable[Export], keys: TrustedKeys | None) -> str | None:
-    """Return the reason why valid signatures do not prove the exports of a secured mission. Return None if they prove
-    them.
+    """Return the reason why valid signatures do not prove that the exports of a secured mission are genuine. Return
+    None if they do.
     """
     if keys is None:
         return "unsigned: no public keys are known that verify the signatures; name the key directory with --keys"
@@ -71,8 +69,8 @@ def are_signed(exports: Iterable[Export]) -> bool:
 def vouch(exports: Iterable[Export], keys: TrustedKeys | None) -> tuple[list[str], str | None]:
     """Return a sentence for each export with a wrong signature, and the reason why correct signatures prove nothing.
 
-    The reason is None if correct signatures prove the exports. The exports may be unsigned if no keys are given. They
-    then count as exports of a mission without keys.
+    The reason is None if correct signatures prove that the exports are genuine. Without `keys`, the exports may be
+    unsigned. They then count as exports of a mission without keys.
     """
     exports = list(exports)
     if keys is None and not are_signed(exports):
@@ -141,7 +139,7 @@ class SignatureChecks:
 
 
 def _head_of(export: Export, head: ExportedHead) -> "ExportHead | None":
-    """Return the signed head that fits the content of an export. Return None if no agent could have signed it."""
+    """Return the signed head if it matches the content of the export. Return None if no agent can have signed it."""
     from ucp.secure.export_head import ExportHead, completed_digest, held_digest
 
     if export.exported_at_us > MAX_U64:

@@ -12,8 +12,8 @@ from harness.scenario.verdict_names import ALL_CHECKS, CHARACTERISTICS
 
 
 def differences(record: RunRecord, result: Result, survived: Survival) -> Iterator[str]:
-    """Yield a sentence for each stored verdict or numeric result that differs from the new one. Yield nothing for a run
-    without a stored verdict.
+    """Yield a sentence for each stored verdict or numeric result that differs from the new one. A run without a stored
+    verdict has no difference.
     """
     if not record.characteristics:
         return

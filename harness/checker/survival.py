@@ -1,7 +1,7 @@
 """Decide which blocks survive when vehicles are lost (thesis, Chapter 1 and Section 3.3).
 
 A block survives if any remaining vehicle holds it, in the chain, in the deque or on the reconcile stack. Traces show
-the blocks of each vehicle at the time of a loss. Exports show them at the end.
+which blocks each vehicle held at the time of a loss. Exports show the blocks at the end.
 """
 
 import math
@@ -34,7 +34,7 @@ def survival(evidence: Evidence) -> Survival:
 
 
 def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
-    """Return the vehicles that hold each block in their chain, deque or reconcile stack. The key is the block hash."""
+    """Block hash -> the vehicles that hold the block in their chain, deque or reconcile stack."""
     holders: dict[str, list[int]] = {}
     for agent_id, export in sorted(exports.items()):
         for block_hash in dict.fromkeys(block.block_hash for block in export.blocks()):
@@ -43,8 +43,8 @@ def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def _least_held(evidence: Evidence, exports: Mapping[int, Export]) -> LeastHeld | None:
-    """Return the block that the fewest vehicles hold. Of several such blocks, return the oldest. Return None if there
-    is no block.
+    """Return the block that the fewest vehicles hold. Of several such blocks, return the oldest. Return None if no
+    vehicle holds a block.
     """
     holders = _holders(exports)
     if not holders:
@@ -136,7 +136,9 @@ def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) 
 
 
 def in_words(survived: Survival) -> list[str]:
-    """Return sentences about the first losses of vehicles, the end of the run, and the smallest further loss."""
+    """Describe in sentences the first losses of vehicles, the blocks at the end of the run, and the smallest further
+    loss that would destroy a block.
+    """
     sentences = [_loss_in_words(loss) for loss in survived.losses[:MAX_SENTENCES]]
     if len(survived.losses) > MAX_SENTENCES:
         sentences.append(f"{len(survived.losses) - MAX_SENTENCES} more losses of vehicles are in run.json")

@@ -8,13 +8,13 @@ from harness.archive.lag import MeasuredLag
 from harness.archive.traces import Trace
 
 ENOUGH = 20
-"""Minimum number of timers for an estimate."""
+"""Minimum number of vote timers for an estimate."""
 TOLERATED = 0.05
 
 
 @dataclass(frozen=True)
 class TimerLag:
-    """The lateness of vote timers. Of the timers with a duration of `asked_s` mission seconds, one in twenty was more
+    """The lateness of vote timers. One in twenty of these timers, whose duration is `asked_s` mission seconds, was more
     than `late_s` mission seconds late.
     """
 
@@ -23,7 +23,7 @@ class TimerLag:
 
     @property
     def tolerable(self) -> bool:
-        """True if the lateness is at most one twentieth of the timer's duration."""
+        """True if the lateness is at most one twentieth of the duration of the timer."""
         return self.late_s <= TOLERATED * self.asked_s
 
 
@@ -44,14 +44,14 @@ def timer_lag(traces: Iterable[Trace], lag: MeasuredLag | None = None) -> TimerL
 
 
 def _of_machine(trace: Trace, ended_s: float, late_s: float, lag: MeasuredLag | None) -> float:
-    """Return the part of the lateness, in mission seconds, that the measured delays of the machine explain."""
+    """Return the part of the lateness, in mission seconds, that the measured delays of the machine cause."""
     speedup = trace.header.clock.get("speedup")
     explained_s = lag.explains(trace.header.agent_id, ended_s - max(0.0, late_s), ended_s) if lag else None
     return late_s if explained_s is None or not speedup else min(late_s, explained_s * speedup)
 
 
 def _votes(trace: Trace) -> Iterator[tuple[float, float]]:
-    """Yield the end and the duration of each vote. Votes that a reconcile interrupted are left out."""
+    """Yield the end and the duration of each vote. Votes that a reconcile interrupted are omitted."""
     for life in trace.incarnations():
         began: float | None = None
         for _, run in life:

@@ -1,4 +1,4 @@
-"""Check characteristic 6: all agents of a connected system have the same chain, once all of them had a chance to
+"""Check characteristic 6: all agents of a connected system have the same chain, after each of them had a chance to
 reconcile.
 """
 
@@ -55,7 +55,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def common_prefix(chains: list[tuple[str, ...]]) -> int:
-    """Return the number of blocks with which all chains begin alike."""
+    """Return the length of the longest common beginning of all chains, in blocks."""
     length = 0
     for level in zip(*chains, strict=False):
         if len(set(level)) > 1:

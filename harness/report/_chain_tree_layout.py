@@ -1,9 +1,10 @@
 """Compute the positions of all marks in a picture of the chain tree. Time grows upwards, and columns do not overlap.
 
-Each subtree is packed against the subtrees to its left by its outline, row by row (after Reingold and Tilford, "Tidier
-Drawings of Trees", 1981). A block stands below the middle of its successors. If more than half of the agents follow one
-successor, this successor stands straight above the block, and the others branch off to the side. An oval stands on top
-of its block, or to the right of the block if other chains continue above it.
+Each subtree is placed as close as possible to the subtrees on its left. Their outlines are compared row by row (after
+Reingold and Tilford, "Tidier Drawings of Trees", 1981). A block is below the middle of its successors. If more than
+half of the agents have the same successor, this successor is exactly above the block, and the others are at its sides.
+An oval marks the end of chains. It is above the last block of these chains, or on its right if other chains continue
+above it.
 """
 
 import math
@@ -14,7 +15,8 @@ from harness.report.chain_tree import ChainTreeMark
 
 FONT_SIZE = 13
 CHARACTER_WIDTH = 0.66 * FONT_SIZE
-"""Upper limit of the width of a digit or lower-case letter in common system fonts (0.64 em in DejaVu Sans and Verdana).
+"""Upper limit for the width in pixels of a digit or lower-case letter in common system fonts (0.64 em in DejaVu Sans
+and Verdana).
 """
 SMALL_FONT_SIZE = 12
 BOX_HEIGHT = 26
@@ -29,7 +31,7 @@ MARGIN = 8
 
 @dataclass(slots=True)
 class PlacedMark:
-    """A mark of the picture with its position in CSS pixels. `x` is its centre, and `y` is its top. y grows
+    """A mark of the picture with its position in CSS pixels. `x` is its centre, and `y` is its top. `y` increases
     downwards.
     """
 
@@ -48,7 +50,7 @@ class PlacedMark:
         return range(self.row, self.row + math.ceil((self.height + ROW_GAP) / ROW_HEIGHT))
 
     def walk(self) -> Iterator["PlacedMark"]:
-        """Yield this mark and all marks above it. Each mark follows the mark on which it stands."""
+        """Yield this mark and all marks above it. A mark is yielded after the mark below it."""
         to_visit = [self]
         while to_visit:
             placed = to_visit.pop()
@@ -87,8 +89,8 @@ class _SubtreeOutline:
         )
 
     def merged_with(self, other: "_SubtreeOutline", x: float) -> "_SubtreeOutline":
-        """Merge two outlines, and return the result. The root of `other` is at `x`, relative to this root. Both
-        outlines must not be used afterwards.
+        """Merge two outlines, and return the result. The root of `other` is at `x`, relative to this root. Afterwards,
+        neither of the two outlines may be used.
         """
         other.shift += x
         large, small = (self, other) if len(self._rows) >= len(other._rows) else (other, self)
@@ -120,7 +122,7 @@ def lay_out(root: ChainTreeMark) -> ChainTreeLayout:
 def _sized(root: ChainTreeMark) -> PlacedMark:
     """Return the marks of the picture with their sizes and rows, but without positions.
 
-    All boxes are as wide as the longest label, except the inception block's.
+    All boxes are as wide as the longest label, except the box of the inception block.
     """
     names = [0]
     to_measure = list(root.children)

@@ -26,7 +26,7 @@ from harness.scenario.changes import RANGE
 from sitl.vehicle import VehicleType
 
 MOVES_M = 1.0
-"""A vehicle that stays within this number of metres counts as standing still."""
+"""Number of metres. A vehicle that stays within this distance counts as standing still."""
 MOMENTS = 6
 
 
@@ -34,7 +34,7 @@ MOMENTS = 6
 class MapMoment:
     """A small map that shows the swarm at one moment.
 
-    `at` is the time, `what` the event at this time or "", and `network` the network's state.
+    `at` is the time, `what` is the event at this time or "", and `network` is the state of the network.
     """
 
     at: str
@@ -49,7 +49,7 @@ class MapSection:
 
     tracks: Markup | None
     legend: list[tuple[Markup, str]]
-    """Pairs of a sample and its meaning."""
+    """The legend, as pairs of a sample and its meaning."""
     moments: list[MapMoment]
     notes: list[str]
 
@@ -57,8 +57,8 @@ class MapSection:
 def section(
     tracks: VehicleTracks, network: Connectivity, ink: Mapping[int, AgentColours], types: Mapping[int, VehicleType]
 ) -> MapSection | None:
-    """Return the map section. Return None if no vehicle moved and no file is damaged. `types` contains the vehicle
-    types that are known.
+    """Return the map section. Return None if no vehicle moved and no file is damaged. `types` contains the known types
+    of vehicles.
     """
     if not any(_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
         return MapSection(None, [], [], tracks.problems) if tracks.problems else None
@@ -102,7 +102,7 @@ def _drawn(
 def _notable_moments(
     known: Sequence[NetworkDivision], network: Connectivity, tracks: VehicleTracks, end_s: float
 ) -> list[tuple[float, NetworkDivision | None]]:
-    """Return up to `MOMENTS` + 1 moments to show. Each has the groups of connected vehicles at that moment.
+    """Return up to `MOMENTS` + 1 moments to show. Each moment has the groups of vehicles that are connected then.
 
     The moments are the start, the end, the most important network changes and the time of the worst losses. The
     importance of a change is the number of affected vehicles multiplied by the duration of the new state.
@@ -154,7 +154,7 @@ def _moment(
 
 
 def _legend(flown: Sequence[FlightPath], *, rebooted: bool) -> list[tuple[Markup, str]]:
-    """Return a legend of all marks that this map contains."""
+    """Return a legend for the marks that this map contains."""
     parts: dict[str, set[int]] = {}
     for flight in flown:
         for segment in flight.segments:
@@ -179,7 +179,7 @@ def _legend(flown: Sequence[FlightPath], *, rebooted: bool) -> list[tuple[Markup
 
 
 def _in_words(losses: Collection[float]) -> str:
-    """Return a phrase with the smallest and the largest loss rate. Return "" if both are negligible."""
+    """Describe the losses by their smallest and largest rate. Return an empty text if both are negligible."""
     least, most = min(losses, default=0.0), max(losses, default=0.0)
     if not quality(most):
         return ""
@@ -188,7 +188,9 @@ def _in_words(losses: Collection[float]) -> str:
 
 
 def _legend_of_moments(moments: Sequence[MapMoment], types: set[VehicleType]) -> list[tuple[Markup, str]]:
-    """Return the part of the legend about links with losses, and about vehicle types if there are several types."""
+    """Return the part of the legend about links with losses. If the swarm has several types of vehicles, it also
+    explains their shapes.
+    """
     drawn = "".join(moment.picture for moment in moments)
     entries = [
         (map_svg.sample(f"q{which}"), words)

@@ -14,7 +14,7 @@ from harness.report import _network_strip
 from harness.report.map_parts import divisions
 
 MOST_PAIRS = 10
-"""Maximum number of lanes with pairs of vehicles. The lanes with the largest losses are kept."""
+"""Maximum number of rows for pairs of vehicles. The pairs with the largest losses are kept."""
 NAMED_PAIRS = 3
 REASONS = {
     "collision": "collision with other frames",
@@ -25,7 +25,7 @@ REASONS = {
     "queue": "full queue",
     "too_long": "message too long for the radio",
 }
-"""Reason of a loss on a channel -> its description."""
+"""Reason of a loss on a shared channel -> description."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +58,8 @@ def strip(
 
 
 def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.ConditionSpan]:
-    """Return the load of the shared channel over time. Neighbouring intervals that have the same load in percent become
-    one.
+    """Return the load of the shared channel over time. Neighbouring intervals with the same load in percent are
+    joined.
     """
     loads = [round(share, 2) for share in channel.load] + [0.0]
     changes = [number for number, load in enumerate(loads) if number == 0 or load != loads[number - 1]]
@@ -99,7 +99,7 @@ def _pairs(network: Connectivity, end_s: float) -> list[tuple[str, list[_network
     """Return one row for each group of vehicle pairs that have equal losses over time. The row with the largest losses
     is first.
 
-    Return no rows if all pairs have equal losses.
+    Return no rows if all pairs have the same losses.
     """
     alike: defaultdict[tuple[tuple[float, float], ...], list[Pair]] = defaultdict(list)
     for pair, history in network.pair_losses.items():

@@ -23,12 +23,12 @@ class ConditionSpan:
     to_s: float
     text: str
     level: float = 1.0
-    """The filled share of the lane's height, 0 to 1."""
+    """The filled share of the row's height, from 0 to 1."""
 
 
 def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[ConditionSpan]:
-    """Convert changes, each as (at_s, text, level), to intervals. An interval lasts until the next change. A change to
-    level 0 gives no interval.
+    """Convert changes to intervals. A change is (at_s, text, level), and lasts until the next change. A change to level
+    0 gives no interval.
     """
     spans: list[ConditionSpan] = []
     in_time = sorted(changes, key=lambda change: change[0])
@@ -71,7 +71,7 @@ def draw(lanes: Sequence[tuple[str, list[ConditionSpan]]], ticks: Sequence[tuple
 
 
 def _span(lane: str, span: ConditionSpan, y: float, end_s: float) -> Markup:
-    """Draw an interval as a nested <svg>, which cuts off a text that is too long."""
+    """Draw an interval as a nested <svg> element, which cuts off a text that is too long."""
     filled = max(2.0, _LANE * span.level)
     return Markup(
         '<svg x="{}" y="{}" width="{}" height="{}"><title>{}</title><rect class="span" y="{:.1f}" width="100%"'

@@ -50,9 +50,7 @@ class ReportSource:
 
     @property
     def unmet_expectations(self) -> list[str]:
-        """Sentences about results that the scenario expects and that the run did not show. Expected verdicts are not
-        included.
-        """
+        """Sentences about expected results that the run did not show. The expected verdicts are not included."""
         if not self.record.characteristics:
             return []
         return [sentence for _, unmet in self.record.unmet_expectations(self.chains) for sentence in unmet]

@@ -1,4 +1,6 @@
-"""Show injected messages in the report: the datagrams that the rogue node sent, and how the agents reacted."""
+"""Show injected messages in the report: the datagrams that the rogue node (a sender outside the swarm) sent, and how
+the agents reacted.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +15,7 @@ MAX_ROWS = 500
 @dataclass(frozen=True, slots=True)
 class InjectionRow:
     """A table row about one result of an injection. `message` is a message type. For refused datagrams, it is the
-    reason.
+    reason of the refusal.
     """
 
     at: str
@@ -27,7 +29,7 @@ class InjectionRow:
 
 @dataclass(frozen=True, slots=True)
 class RogueSection:
-    """The table of injections. `left_out` is the number of rows that were left out because of `MAX_ROWS`."""
+    """The table of injections. `left_out` is the number of rows that exceed `MAX_ROWS` and are omitted."""
 
     rows: list[InjectionRow]
     left_out: int

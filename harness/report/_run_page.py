@@ -1,7 +1,7 @@
 """Create the HTML page of a run, and write all files of its report.
 
-The page loads nothing. Its Content-Security-Policy allows only its own style sheet and the script of its timeline. The
-page also works without the script. The template escapes all text from agents and scenarios.
+The page loads no other files. Its Content-Security-Policy allows only its own style sheet and the script of its
+timeline. The page also works without the script. The template escapes all text from agents and scenarios.
 """
 
 from collections.abc import Mapping
@@ -35,13 +35,13 @@ EVIDENCE_SHOWN = 3
 LONG_TEXT = 240
 SCENARIO_FILE = "scenario.yaml"
 MAX_SCENARIO = 100_000
-"""Characters of a scenario on the page. The run directory has longer scenarios."""
+"""Maximum number of characters of the scenario that the page shows. The complete scenario is in the run directory."""
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 
 def draw(left: ReportSource) -> str:
-    """Return the page of a run as HTML."""
+    """Return the HTML page of a run."""
     record, exports, ink = left.record, left.exports, left.ink
     judged, outcome = verdict_section.verdicts(record), facts.outcome(record)
     timeline_section = timeline.section(left, name_blocks(exports.by_agent))
@@ -86,7 +86,9 @@ def draw(left: ReportSource) -> str:
 
 
 def _again(left: ReportSource, scenario: str) -> str:
-    """Return the command that repeats the run. Return an empty text if the record does not contain the scenario."""
+    """Return the command that repeats the run. Return an empty text if the record of the run does not contain the
+    scenario.
+    """
     if not scenario:
         return ""
     given = SCENARIO_FILE if len(scenario) <= MAX_SCENARIO else str(left.run_dir)
@@ -96,7 +98,7 @@ def _again(left: ReportSource, scenario: str) -> str:
 def _pictures(
     exports: Mapping[int, Export], before: Mapping[int, Export], ink: Mapping[int, AgentColours]
 ) -> list[dict[str, Any]]:
-    """Return a picture of the chains at the end of the mission and one after the final reconcile. If the chains are
+    """Return two pictures of the chains: at the end of the mission, and after the final reconcile. If the chains are
     equal, return one picture.
     """
     if not exports:
@@ -138,7 +140,7 @@ def write_report(archive: RunArchive) -> Path:
 
 
 def write(left: ReportSource) -> Path:
-    """Write the report of a run from input that was already read. See `write_report`."""
+    """Write the report of a run whose files were already read. See `write_report`."""
     _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
     _write(left.run_dir / "report.md", to_markdown(left))
     _write(left.run_dir / "junit.xml", to_junit(left.record, left.chains))

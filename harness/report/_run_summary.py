@@ -72,9 +72,7 @@ def _happened(happened: Sequence[tuple[str, str, str]]) -> Iterator[str]:
 
 
 def _listed(sentences: Iterable[str]) -> list[str]:
-    """Return the sentences as a Markdown list of at most `SENTENCES_SHOWN` entries. Return no lines if there are no
-    sentences.
-    """
+    """Format sentences as a Markdown list of at most `SENTENCES_SHOWN` entries. Without sentences, return no lines."""
     all_sentences = list(sentences)
     items = [f"- {_short(sentence)}" for sentence in all_sentences[:SENTENCES_SHOWN]]
     if len(all_sentences) > SENTENCES_SHOWN:

@@ -12,7 +12,7 @@ from harness.report.chain_tree import ranges
 
 @dataclass(frozen=True, slots=True)
 class LostBlockRow:
-    """A table row about a block. A lost vehicle completed this block, or no vehicle holds it any more."""
+    """A table row about a block that a lost vehicle completed, or that no vehicle holds any more."""
 
     name: str
     ink: AgentColours | None
@@ -26,7 +26,7 @@ class LossRow:
     what: str
     vehicles: str
     counts: list[str]
-    """Numbers of blocks: completed before the loss, survived, gone after the loss, gone at the end."""
+    """Numbers of blocks: completed before the loss, survived, destroyed by the loss, and missing at the end."""
     blocks: list[LostBlockRow]
 
 

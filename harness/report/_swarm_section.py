@@ -14,9 +14,9 @@ from harness.report.agent_programs import programs
 from harness.report.chain_tree import holders, ranges
 
 IN_THE_RECORD_ONLY = {"binary_sha256", "parameters_file"}
-"""Fields of a vehicle in run.json that the table omits."""
+"""Fields of a vehicle that are in run.json but not in the table."""
 MAX_PARAMETERS = 10
-"""Maximum number of vehicle parameters in a cell."""
+"""Maximum number of vehicle parameters in one table cell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,8 @@ VEHICLE_FAULTS_KEY = "befallen"
 
 
 def agents_table(archive: RunArchive, ink: Mapping[int, AgentColours]) -> dict[str, Any]:
-    """Return the column titles and a row for each agent with its vehicle. A row is (agent ID, colour, cells by
-    column).
+    """Return the column titles and a row for each agent with its vehicle. A row consists of agent ID, colour, and the
+    cells by column.
     """
     record, exports = archive.record, archive.exports.by_agent
     mixed = bool(programs(record))
@@ -98,7 +98,7 @@ def agents_table(archive: RunArchive, ink: Mapping[int, AgentColours]) -> dict[s
 
 
 def _vehicle_faults(recorded: Any) -> str:
-    """Return a text about the faults of a vehicle, such as "lose_gps at 40 s, wind at 80 s: not simulated"."""
+    """Describe the faults of a vehicle, such as "lose_gps at 40 s, wind at 80 s: not simulated"."""
     try:
         return ", ".join(
             f"{it['what']} at {it['at_s']:g} s{'' if it['parameters'] else ': not simulated'}" for it in recorded
@@ -120,8 +120,8 @@ def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
 
 
 def counts(exports: Mapping[int, Export], record: RunRecord) -> str | None:
-    """Return a sentence about completed blocks that are in no chain, and about held blocks that no record lists as
-    completed.
+    """Return a sentence about completed blocks that are in no chain, and about blocks that agents hold although no
+    record lists them as completed.
 
     Return None if the completed blocks are exactly the blocks in the chains.
     """
@@ -146,7 +146,7 @@ def _count_are(count: int) -> str:
 
 
 def block_rows(exports: Mapping[int, Export], ink: Mapping[int, AgentColours]) -> list[BlockRow]:
-    """Return a row for each block that is in a chain. The oldest is first."""
+    """Return a table row for each block that is in a chain. The oldest block is first."""
     names, held_by = name_blocks(exports), holders(exports)
     blocks = {block.block_hash: block for export in exports.values() for block in export.chain}
     return [

@@ -25,7 +25,7 @@ Figure = Callable[[ReplicationFigures], float | None]
 
 @dataclass(frozen=True, slots=True)
 class TimelineChart:
-    """A chart with its legend. Each element of `lines` is a sample of a line and the meaning of this line."""
+    """A chart with its legend. Each element of `lines` is a sample of a line, and its meaning."""
 
     name: str
     lines: list[tuple[Markup, str]]
@@ -41,13 +41,13 @@ _CHARTS: tuple[tuple[str, tuple[tuple[str, Figure], ...]], ...] = (
     ("copies in chains", (("mean", lambda spread: spread.copies_mean), ("fewest", lambda spread: spread.copies_min))),
 )
 _LINE_CLASSES = ("broken", "whole")
-"""CSS classes of two lines. A single line uses the last one."""
+"""CSS classes of the two lines in a chart. A chart with one line uses the last class."""
 
 
 def draw(
     spreads: Sequence[ReplicationFigures], faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], end_s: float
 ) -> list[TimelineChart]:
-    """Return a chart for each group of numeric results. `spreads` contains the spread of the blocks over time, with at
+    """Return a chart for each group of numeric results. `spreads` contains the copies of blocks over time. It has at
     least one entry.
     """
     moments = thin_states(spreads, end_s)
@@ -56,9 +56,9 @@ def draw(
 
 
 def thin_states(spreads: Sequence[ReplicationFigures], end_s: float) -> Sequence[ReplicationFigures]:
-    """Shorten a long list of states. Return the states that are visible when the whole run is shown.
+    """Shorten a long list of states to those that are visible when the picture shows the whole run.
 
-    Each interval of one picture column keeps the state with the shortest mutual chain and the last state.
+    For each column of the picture, it keeps the last state and the state with the shortest mutual chain.
     """
     if len(spreads) <= MAX_MOMENTS:
         return spreads
@@ -114,7 +114,7 @@ def _chart(
 
 
 def _steps(moments: Sequence[ReplicationFigures], figure: Figure, per_px: float, end_s: float) -> str:
-    """Return a step line as an SVG path, which starts at the first known value."""
+    """Return a stepped line as an SVG path. It starts at the first known value."""
     path = ""
     last: float | None = None
     for moment in moments:
@@ -133,7 +133,9 @@ def _tip(moment: ReplicationFigures, figures: Sequence[tuple[str, Figure]], name
 
 CYCLE_HEIGHT = 34
 MAX_ROUNDS = 400
-"""Maximum number of brackets. More could not be distinguished, so only the last ones are drawn."""
+"""Maximum number of brackets that mark repetitions. A larger number could not be distinguished, so only the last ones
+are drawn.
+"""
 MOST_ROUNDS = 1_000_000
 MAX_TEXT = 1000
 

@@ -1,10 +1,10 @@
 """Draw the timeline. Each agent has a row with its votes at the top, commits in the middle, and reconciles at the
 bottom.
 
-No information depends on colour alone. Votes without approval are hollow, phases have different heights, faults have
-different shapes, and each mark has a tooltip.
+No information depends on colour alone. Votes without approval are hollow, phases of a reconcile have different heights,
+faults have different shapes, and each mark has a tooltip.
 
-Frequent marks are formatted with `%`. It escapes like `format`, and takes a third of the time.
+Frequent marks are formatted with `%`. It escapes text like `format`, but takes a third of the time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ OUTCOMES = {
 """Outcome of a vote -> description."""
 PHASE_HEIGHTS = {"phase 1": 4, "phase 2": 7, "phase 3": 10, "finalize": 2}
 BAR_HEIGHT = 7
-"""Height of a whole reconcile, if there are too many phases to draw."""
+"""Height in pixels of a reconcile that is drawn without its phases, because there are too many."""
 
 MAX_BARS = 6000
 MAX_COMMITS = 4000
@@ -61,9 +61,9 @@ class TimelinePicture:
     drawing: Markup
     lane_height: int
     legend: list[tuple[Markup, str]]
-    """Pairs of a sample and its meaning."""
+    """The legend, as pairs of a sample and its meaning."""
     notes: list[str]
-    """Sentences about marks that were left out."""
+    """Sentences about marks that are omitted."""
 
 
 Span = TypeVar("Span", AgentVote, AgentReconcile)
@@ -120,7 +120,7 @@ def draw(
 def _legend(
     history: MissionHistory, faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], *, by_phase: bool
 ) -> list[tuple[Markup, str]]:
-    """Return a legend of all marks in the timeline picture."""
+    """Return a legend for the marks in the timeline picture."""
     outcomes = {vote.outcome for vote in history.votes}
     phases = {phase.name for reconcile in history.reconciles for phase in reconcile.phases}
     entries = [
@@ -160,12 +160,12 @@ def _legend(
 
 
 def block_label(block: str, names: Mapping[str, str]) -> str:
-    """Return the name of a block. If no export contains the block, return the first 12 digits of its hash."""
+    """Return the name of a block. If no export contains the block, use the first 12 digits of its hash."""
     return names.get(block, block[:12])
 
 
 def phases_in_words(reconcile: AgentReconcile) -> str:
-    """Return the phases of a reconcile in the order in which they began. Each has its number of rounds."""
+    """List the phases of a reconcile in the order in which they began, each with its number of rounds."""
     rounds: dict[str, int] = {}
     for phase in reconcile.phases:
         rounds[phase.name] = rounds.get(phase.name, 0) + phase.rounds
@@ -173,10 +173,7 @@ def phases_in_words(reconcile: AgentReconcile) -> str:
 
 
 def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[BlockCommit]]:
-    """Combine commits of the same agent that are close in time, so that about `MAX_COMMITS` marks remain.
-
-    Commits in one group lie close together.
-    """
+    """Combine commits of an agent that are close in time, so that at most about `MAX_COMMITS` marks remain."""
     groups = [[commit] for commit in commits]
     within_s = end_s / 4000
     while len(groups) > MAX_COMMITS:
@@ -191,7 +188,7 @@ def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[Blo
 
 
 def _longest(spans: Sequence[Span]) -> list[Span]:
-    """Return the `MAX_BARS` longest intervals in order of time. If two intervals are equally long, the earlier one is
+    """Return the `MAX_BARS` longest intervals in order of time. Of equally long intervals, the earlier ones are
     kept.
     """
     kept = sorted(spans, key=lambda span: (round(span.start_s - span.end_s, 3), span.start_s))[:MAX_BARS]
@@ -199,7 +196,7 @@ def _longest(spans: Sequence[Span]) -> list[Span]:
 
 
 def _css_class(outcome: str) -> str:
-    """Return the CSS class of a vote with this result. Any result other than approval and disapproval counts as
+    """Return the CSS class of a vote with this result. A result other than approval and disapproval counts as
     undecided.
     """
     return {"approved": "approved", "not approved": "refused"}.get(outcome, "undecided")
@@ -277,9 +274,7 @@ def _tie(tie: Phase2Tie, lane_height: int) -> Markup:
 
 
 def _running_background(agent: int, faults: Sequence[FaultRecord], lane_height: int, end_s: float) -> list[Markup]:
-    """Draw the background of an agent's row for the times at which the agent runs. Draw a broken line for the times at
-    which it is paused.
-    """
+    """Draw the background of an agent's row while the agent runs. While the agent is paused, draw a broken line."""
     ran: list[tuple[float, float]] = []
     paused: list[tuple[float, float]] = []
     since_s: float | None = 0.0

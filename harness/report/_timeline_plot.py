@@ -1,8 +1,8 @@
 """Provide the common parts of all pictures over mission time: the zoomable view, marks, and the axis.
 
 In a view, one horizontal unit is a mission second and one vertical unit is a pixel. Zooming changes the viewBox of the
-view. Shapes in the view are stretched, but strokes are not (`vector-effect` in `timeline.css`). Marks that must keep
-their shape are pinned outside the view.
+view. Zooming stretches shapes in the view, but not strokes (`vector-effect` in `timeline.css`). Marks that must keep
+their shape are drawn outside the view with `pin`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -49,7 +49,7 @@ def plot(view: Iterable[Markup], pinned: Iterable[Markup], height: float, end_s:
 
 
 def pin(at_s: float, end_s: float, y: float, shape: Markup) -> Markup:
-    """Place a shape at this mission second, and keep its size when the user zooms."""
+    """Place a shape at this mission second. The shape keeps its size when the user zooms."""
     return Markup('<svg class="pin" data-at="{}" x="{}%" y="{}">{}</svg>').format(
         format_number(at_s), format_number(100 * at_s / end_s), n(y), shape
     )

@@ -45,7 +45,7 @@ MAX_FAULTS = 500
 
 @dataclass(frozen=True, slots=True)
 class TimelineTable:
-    """The rows of a table. `left_out` is the number of rows that were left out because of `MAX_ROWS`."""
+    """The rows of a table. `left_out` is the number of rows that exceed `MAX_ROWS` and are omitted."""
 
     rows: list[list[str]]
     left_out: int
@@ -53,8 +53,8 @@ class TimelineTable:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """The timeline. `messages` is JSON from which the script of the page draws arrows. It is "null" if no messages are
-    drawn.
+    """The timeline picture. `messages` is JSON from which the script of the page draws arrows. It is "null" if the page
+    shows no messages.
     """
 
     end_s: float
@@ -71,7 +71,7 @@ class Timeline:
 
 @dataclass(frozen=True, slots=True)
 class TimelineSection:
-    """The timeline with its tables and charts, and notes about the parts that were left out."""
+    """The timeline with its tables and charts, and notes about omitted parts."""
 
     drawn: Timeline
     notes: list[str]
@@ -142,7 +142,7 @@ def _planned_s(record: RunRecord) -> float:
 
 
 def _shades(network: Connectivity, end_s: float) -> tuple[list[PartitionShade], int]:
-    """Return the longest partitions, at most `MAX_SHADES`, and the number of shorter partitions that were left out."""
+    """Return the longest partitions, at most `MAX_SHADES`, and the number of omitted shorter partitions."""
     known = divisions(network.states)
     ends = [*(division.at_s for division in known[1:]), end_s]
     shades = [
@@ -157,10 +157,10 @@ def _shades(network: Connectivity, end_s: float) -> tuple[list[PartitionShade], 
 def _messages(
     messages: Sequence[BroadcastMessage] | None, agents: Sequence[int], names: Mapping[str, str]
 ) -> tuple[str, list[str]]:
-    """Return the messages that were received as JSON, and notes about messages that were left out.
+    """Return the received messages as JSON, and notes about omitted messages.
 
-    The JSON holds the message names, the agent IDs, and one list for each message: time, lane of the sender, index of
-    the name, block, and a pair [lane, time] for each receipt.
+    The JSON holds the message names, the agent IDs, and one list for each message: time, row of the sender, index of
+    the message name, block, and a pair [row, time] for each receipt.
     """
     if messages is None:
         return "null", ["Messages are not drawn, because the traces are too large"]

@@ -1,4 +1,4 @@
-"""List the programs that ran as agents in a run, if they are not the harness's own agent."""
+"""List the programs that ran as agents in a run, if any of them is not the harness's own agent."""
 
 import shlex
 from collections.abc import Iterable, Mapping
@@ -34,8 +34,8 @@ class AgentProgram:
 
 
 def programs(record: RunRecord) -> list[AgentProgram]:
-    """Return the programs, ordered by the first agent that ran each. The list is empty if all agents ran the harness's
-    own program.
+    """Return the programs, ordered by the lowest agent ID that ran each program. The list is empty if all agents ran
+    the harness's own program.
     """
     return [] if record.scenario is None else asked_for(record.scenario, record.agents)
 
@@ -43,7 +43,7 @@ def programs(record: RunRecord) -> list[AgentProgram]:
 def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[AgentProgram]:
     """Return the programs that a scenario names for its agents.
 
-    `agents` are the records of the agents, if the scenario was played.
+    If the scenario was played, `agents` are the recorded agents.
     """
     if not scenario.foreign:
         return []

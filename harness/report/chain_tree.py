@@ -1,8 +1,8 @@
 """Combine the chains of all agents into a tree. Chains that begin with the same blocks share the marks of these blocks.
 
-A block appears once for each history that it follows. If diverged agents hold the same block, it is therefore on two
-branches (Figure 4.4). `marks` turns the tree into marks to draw: a box for each block, an oval where chains end and, on
-request, an ellipsis for the middle of a long stretch without branches.
+A block appears once for each sequence of blocks below it. If agents with diverged chains hold the same block, the block
+is therefore on two branches (Figure 4.4). `marks` converts the tree to the marks of a picture: a box for each block, an
+oval where chains end, and on request an ellipsis for the middle of a long sequence without branches.
 
 A chain can be longer than Python's recursion limit. All functions here use loops instead of recursion.
 """
@@ -15,9 +15,9 @@ from typing import Literal
 from harness.archive.exports import Export, ExportedBlock
 
 KEPT_AT_EACH_END = 3
-"""Number of blocks that are drawn before and after the ellipsis of a stretch."""
+"""Number of blocks that are drawn before and after an ellipsis."""
 FEWEST_HIDDEN = 3
-"""Minimum number of blocks behind an ellipsis. An ellipsis for fewer blocks would save no room."""
+"""Minimum number of blocks that an ellipsis hides. For fewer blocks, it would save no space."""
 
 OVAL_LINE_CHARACTERS = 14
 
@@ -28,7 +28,7 @@ class ChainTreeNode:
 
     block: ExportedBlock | None
     holders: list[int] = field(default_factory=list)
-    """Agents whose chains contain this history up to this block."""
+    """Agents whose chains contain this block after the same earlier blocks."""
     ends: list[int] = field(default_factory=list)
     """Agents whose chains end at this block."""
     children: dict[str, "ChainTreeNode"] = field(default_factory=dict)
@@ -41,16 +41,18 @@ class ChainTreeNode:
 
 @dataclass(slots=True)
 class ChainTreeMark:
-    """A mark of the picture, together with all marks above it."""
+    """A mark of the picture, together with all marks that are above it."""
 
     kind: Literal["block", "ellipsis", "oval"]
     nodes: list[ChainTreeNode]
-    """The block of a box, the hidden blocks of an ellipsis, or the last block of an oval's agents."""
+    """The nodes of this mark: the block of a box, the hidden blocks of an ellipsis, or the last block before an
+    oval.
+    """
     lines: list[str]
     holders: list[int]
     children: list["ChainTreeMark"] = field(default_factory=list)
     beside: "ChainTreeMark | None" = None
-    """The oval of a block at which some chains end and others continue."""
+    """The oval beside the box of a block at which some chains end and others continue. None without such an oval."""
 
 
 def chain_tree(exports: Mapping[int, Export]) -> ChainTreeNode:
@@ -67,7 +69,7 @@ def chain_tree(exports: Mapping[int, Export]) -> ChainTreeNode:
 
 
 def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
-    """Return, for each block hash, the agents whose chains contain the block."""
+    """Return block hash -> the agents whose chains contain the block."""
     held_by: dict[str, list[int]] = {}
     for agent_id, export in sorted(exports.items()):
         for block_hash in dict.fromkeys(export.chain_of_block_hashes):
@@ -76,10 +78,10 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool) -> ChainTreeMark:
-    """Return the mark of the inception block. All other marks stand above it. `names` contains the names of blocks by
+    """Return the mark of the inception block, with all other marks above it. `names` contains the names of blocks by
     hash.
 
-    The marks above a block are ordered by their lowest agent ID.
+    The marks above a block are ordered by the lowest agent ID that they concern.
     """
     root = ChainTreeMark("block", [inception], ["inception block"], inception.holders)
     to_grow = [(root, inception)]
@@ -101,8 +103,8 @@ def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool)
 def _stretch(
     below: ChainTreeMark, first: ChainTreeNode, names: Mapping[str, str], abridged: bool
 ) -> tuple[ChainTreeMark, ChainTreeNode]:
-    """Add the marks of consecutive blocks above the mark `below`. They begin with `first` and end where the tree
-    branches or a chain ends.
+    """Add marks for consecutive blocks above the mark `below`. The first block is `first`. The last one is where the
+    tree branches or a chain ends.
 
     Return the topmost mark and its node.
     """
@@ -134,7 +136,7 @@ def _name(node: ChainTreeNode, names: Mapping[str, str]) -> str:
 def ranges(agent_ids: list[int]) -> list[str]:
     """Return agent IDs as ranges: [1, 2, 3, 5, 6] gives "1 to 3", "5", "6", with an en dash for "to".
 
-    A range has three or more consecutive IDs.
+    Three or more consecutive IDs become a range.
     """
     runs: list[list[int]] = []
     for agent_id in sorted(agent_ids):

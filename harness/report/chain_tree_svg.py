@@ -34,9 +34,9 @@ _DOTS_LENGTH = 2 * _DOT_SPACING + 1  # three dots; the last one lies just before
 
 
 class ChainTreePicture:
-    """A picture of the tree of chains. It can be drawn shortened or with all blocks.
+    """A picture of the tree of chains. It can be drawn in an abridged form or with all blocks.
 
-    `key` keeps the identifiers of several pictures on one page distinct. `names` maps block hashes to names, if the
+    `key` makes the identifiers unique on a page with several pictures. `names` maps block hashes to names, if the
     caller knows more names than these exports contain.
     """
 
@@ -59,7 +59,7 @@ class ChainTreePicture:
         """Number of blocks that the abridged form omits."""
 
     def draw(self, form: Literal["abridged", "full"]) -> Markup:
-        """Return the picture as SVG. The page around it must include STYLE, and may contain both forms of the
+        """Return the picture as SVG. The page that contains it must include STYLE, and may show both forms of the
         picture.
         """
         if form == "abridged":
@@ -67,7 +67,7 @@ class ChainTreePicture:
         return self._draw(lay_out(marks(self._tree, self._names, abridged=False)), form, Markup(""))
 
     def standalone(self) -> str:
-        """Return the shortened picture as the text of an SVG file."""
+        """Return the abridged picture as the text of an SVG file."""
         paper = Markup('<style>{}</style><rect class="ground" width="100%" height="100%" fill="#ffffff"/>').format(
             STYLE
         )
@@ -131,7 +131,7 @@ class ChainTreePicture:
         )
 
     def _shape(self, placed: PlacedMark) -> Markup:
-        """Draw one mark. Its tooltip lists the agents that hold the block."""
+        """Draw one mark. The tooltip of the mark lists the agents that hold the block."""
         mark = placed.mark
         text = _text(placed, "#1c2126")
         if mark.kind == "ellipsis":
@@ -191,7 +191,7 @@ def _path(below: PlacedMark, above: PlacedMark) -> str:
 
 
 def _path_beside(block: PlacedMark, oval: PlacedMark) -> str:
-    """Return an SVG path from the right side of a block to the oval on its right."""
+    """Return an SVG path from the right side of a block to the oval beside it."""
     middle = block.y + block.height / 2
     return f"M{_n(block.x + block.width / 2)} {_n(middle)}H{_n(oval.x - oval.width / 2)}"
 

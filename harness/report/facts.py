@@ -1,5 +1,5 @@
-"""Collect the facts that both report.html and report.md contain: settings, result, numeric results, and missing frames
-of captures.
+"""Collect the facts that both report.html and report.md contain: settings, result, numeric results, and frames that
+packet captures lack.
 """
 
 import shlex
@@ -73,7 +73,7 @@ def summary(record: RunRecord, exports: Exports) -> list[str]:
 
 
 def outcome(record: RunRecord) -> tuple[str, str] | None:
-    """Return a headline and details about a run that was not completed. Return None if the run was completed."""
+    """Return a headline and details if the run was not completed. Return None if it was completed."""
     if record.outcome == "completed":
         return None
     detail = record.outcome_detail
@@ -90,7 +90,7 @@ def figures(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
-    """Return a sentence about frames that are missing in packet captures. Return None if no frames are missing."""
+    """Return a sentence about frames that packet captures lack. Return None if no frames are missing."""
     lacking = sorted(int(vehicle) for vehicle, frames in captured.items() if frames.dropped)
     if not lacking:
         return None
@@ -101,7 +101,7 @@ def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
 
 
 def link_qualities() -> list[str]:
-    """Return the legend texts for the qualities of a link. The text at index 0 describes the best quality."""
+    """Return the legend texts for the qualities of a link. The first text describes the best quality."""
     limits = map(text.percent, QUALITY_LIMITS)
     return ["link", *(f"link that loses {low} to {high}" for low, high in pairwise(limits))]
 
@@ -109,7 +109,7 @@ def link_qualities() -> list[str]:
 def command_again(record: RunRecord, scenario: str) -> str:
     """Return the command that repeats the run. `scenario` is the path of its scenario file.
 
-    In virtual time, the command gives the same exports and traces, to the byte.
+    In virtual time, the command produces exports and traces that are equal to the last byte.
     """
     words = ["ucp-harness", "run", scenario, "--backend", str(record.backend), "--seed", str(record.seed)]
     words += ["--watch"] if record.all_delivered else []

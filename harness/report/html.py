@@ -1,4 +1,5 @@
-"""Create a page in one file. Its Content-Security-Policy allows only the styles and the script inside it.
+"""Create an HTML page that consists of one file. Its Content-Security-Policy allows only the styles and the script in
+the page itself.
 
 The template escapes every text except Markup.
 """
@@ -16,12 +17,12 @@ from harness.present import text as words
 
 _HERE = Path(__file__).parent
 PALETTE = (_HERE / "palette.css").read_text(encoding="utf-8")
-"""Colours that the report and the live page share."""
+"""The colours that the report and the live page share."""
 PAGE_STYLE = PALETTE + (_HERE / "page.css").read_text(encoding="utf-8")
 
 
 def render(template: Path, *, styles: Sequence[str], script: str = "", **content: Any) -> str:
-    """Return the page made from `template`. The Content-Security-Policy of the page permits its styles and its script
+    """Fill in a template and return the page. The Content-Security-Policy of the page permits its styles and its script
     by their digests.
     """
     environment = Environment(
@@ -42,5 +43,5 @@ def render(template: Path, *, styles: Sequence[str], script: str = "", **content
 
 
 def _digest(text: str) -> str:
-    """Return the SHA-256 digest in the form for a Content-Security-Policy."""
+    """Return the SHA-256 digest in the form that a Content-Security-Policy needs."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

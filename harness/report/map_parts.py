@@ -1,7 +1,8 @@
-"""Compute the geometry of the map, and which vehicles were connected at each time.
+"""Compute the geometry of the map, and the groups of connected vehicles at each time.
 
-A part is a group of two or more vehicles that reach each other but not the whole swarm. A vehicle that reaches no other
-vehicle is alone. A part keeps its letter in the next state if more than half of its vehicles stay together.
+A *part* of the swarm is a group of two or more vehicles that reach each other but not all vehicles. A vehicle that
+reaches no other vehicle is alone. Parts have letters. A part keeps its letter in the next state if more than half of
+its vehicles stay together.
 """
 
 import math
@@ -18,17 +19,17 @@ from harness.present import svg
 from harness.report.chain_tree import ranges
 
 MAX_SEGMENTS = 4000
-"""Maximum number of track segments of all vehicles together. More could not be distinguished."""
+"""Maximum number of track segments of all vehicles together. More segments could not be distinguished."""
 MAX_NAMED = 6
-"""Maximum number of parts that a text lists one by one."""
+"""Maximum number of parts of the swarm that a text lists."""
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkDivision:
-    """The division of the vehicles into numbered groups (`parts`) from `at_s` on. The vehicles of a group are
-    connected. All other living vehicles are alone.
+    """The division of the swarm into parts from `at_s` on. The vehicles of a part are connected. All other living
+    vehicles are alone.
 
-    If all vehicles reach each other, all are in `together`, and there are no parts.
+    If all vehicles reach each other, `together` contains all of them, and `parts` is empty.
     """
 
     at_s: float
@@ -42,11 +43,11 @@ class NetworkDivision:
         return self.together | self.alone | frozenset().union(*self.parts.values())
 
     def place_of(self, vehicle: int) -> tuple[int | None, frozenset[int]]:
-        """Return the number of a vehicle's group, and the vehicles that this vehicle reaches."""
+        """Return the number of the part to which a vehicle belongs, and the vehicles that it reaches."""
         return self.part_of(vehicle), self.reachable_from(vehicle)
 
     def part_of(self, vehicle: int) -> int | None:
-        """Return the number of the vehicle's group. Return None if the vehicle is in no group."""
+        """Return the number of the part to which the vehicle belongs. Return None if it belongs to no part."""
         return next((number for number, members in self.parts.items() if vehicle in members), None)
 
     def reachable_from(self, vehicle: int) -> frozenset[int]:
@@ -57,10 +58,10 @@ class NetworkDivision:
         return self.together if vehicle in self.together else frozenset({vehicle})
 
     def changed_since(self, before: "NetworkDivision") -> int:
-        """Return the number of vehicles that differ from the division `before`: they were lost, came back, or reach
+        """Return the number of vehicles that differ from the division `before`: they were lost, replaced, or reach
         different vehicles.
 
-        Vehicles that live in only one of the two states are ignored in the comparison of reached vehicles.
+        The comparison of reached vehicles ignores vehicles that live in only one of the two states.
         """
         both = self.living & before.living
         moved = sum(self.reachable_from(vehicle) & both != before.reachable_from(vehicle) & both for vehicle in both)
@@ -82,9 +83,9 @@ class NetworkDivision:
 
 @dataclass(frozen=True, slots=True)
 class TrackSegment:
-    """A section of a flight path on which the vehicle stays in the same group.
+    """A section of a flight path on which the vehicle stays in the same part of the swarm.
 
-    `division` is the division of the network at its start.
+    `division` is the division of the swarm at the start of the section.
     """
 
     vehicle: int
@@ -94,8 +95,8 @@ class TrackSegment:
 
 @dataclass(frozen=True, slots=True)
 class FlightPath:
-    """The path of a vehicle from its start to its loss or the end of the run. If the start is unknown, it begins at the
-    first known position.
+    """The path of a vehicle from its start to its loss or the end of the run. If the start is unknown, the path begins
+    at the first known position.
     """
 
     vehicle: int
@@ -136,8 +137,8 @@ def divisions(states: Sequence[Topology]) -> list[NetworkDivision]:
 
 
 def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]) -> dict[int, frozenset[int]]:
-    """Number the groups. A group gets the number of an earlier group if it contains more than half of the earlier
-    group's vehicles.
+    """Number the parts of the swarm. A part gets the number of an earlier part if it contains more than half of its
+    vehicles.
 
     Other parts get the lowest free numbers.
     """
@@ -153,8 +154,8 @@ def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]
 
 
 def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, most: int) -> list[NetworkDivision]:
-    """Return the first division of the vehicles into groups and the divisions that lasted longest, at most `most`
-    divisions in total. Each is then shown until the next one in the result.
+    """Return at most `most` divisions of the swarm: the first one, and those that lasted longest. The map shows each of
+    them until the next one.
     """
     if len(all_divisions) <= most:
         return list(all_divisions)
@@ -166,7 +167,7 @@ def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, mo
 def flights(
     vehicle: int, tracks: VehicleTracks, network: Connectivity, all_divisions: Sequence[NetworkDivision], end_s: float
 ) -> Iterator[FlightPath]:
-    """Yield the path of a vehicle. If vehicles replaced it after a loss, yield their paths too."""
+    """Yield the path of a vehicle, and the paths of the vehicles that replaced it after a loss."""
     wreck: PositionFix | None = None
     for begin_s, until_s, lost in network.airborne_intervals(vehicle, end_s):
         flown = [fix for fix in tracks.by_vehicle[vehicle] if begin_s <= fix.at_s <= until_s]
@@ -195,16 +196,16 @@ def _segments(
 
 
 Point = tuple[float, float]
-"""x and y in CSS pixels. y grows downwards."""
+"""A point in CSS pixels. `x` increases to the right, and `y` increases downwards."""
 
 MIN_SPAN_M = 20.0
-"""Minimum size of a map. On a smaller map, drift in the wind would look like a flight."""
+"""Minimum size of a map in metres. In a smaller map, drift in the wind would look like a flight."""
 MIN_ASPECT = 0.45
 """Minimum ratio of the shorter side of a map to the longer side."""
 MARGIN = 0.05
-"""Margin around the tracks, as a share of each side."""
+"""Margin around the tracks, as a share of the length of each side."""
 INVISIBLE_PX = 0.5
-"""Deviation in pixels that is not visible."""
+"""Number of pixels up to which a deviation is invisible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +227,7 @@ class GroundRectangle:
 
 
 def extent(fixes: Sequence[PositionFix]) -> GroundRectangle:
-    """Return a rectangle around the positions. There must be at least one position."""
+    """Return a rectangle on the ground around at least one position."""
     north, east = [fix.north_m for fix in fixes], [fix.east_m for fix in fixes]
     shortest = max(MIN_SPAN_M, MIN_ASPECT * max(max(north) - min(north), max(east) - min(east)))
     return GroundRectangle(*_widen(min(north), max(north), shortest), *_widen(min(east), max(east), shortest))
@@ -272,8 +273,8 @@ class MapProjection:
         return self.x(fix.east_m), self.y(fix.north_m)
 
     def ticks_m(self) -> tuple[list[float], list[float]]:
-        """Return round numbers of metres for the ticks of both axes, first north and then east. The steps of both axes
-        are equal.
+        """Return round numbers of metres for the ticks of both axes, first north and then east. Both axes have the same
+        step.
         """
         every = svg.step(max(self.land.width_m, self.land.height_m), 9)
         return _multiples(every, self.land.south_m, self.land.north_m), _multiples(
@@ -302,7 +303,9 @@ def thin(lines: Sequence[Sequence[Point]], most: int) -> list[list[Point]]:
 
 
 def simplify(line: Sequence[Point], tolerance: float) -> list[Point]:
-    """Remove points from the line. The line moves by at most `tolerance` (Douglas and Peucker, 1973)."""
+    """Remove points from a line. The simplified line deviates by at most `tolerance` from the original (Douglas and
+    Peucker, 1973).
+    """
     half = tolerance / 2
     apart = [line[0]]
     for point in line[1:-1]:

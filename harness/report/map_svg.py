@@ -30,11 +30,11 @@ from sitl.vehicle import VehicleType
 
 HEIGHT, DIGIT, PADDING = 16, 7.5, 8
 NEAR, FAR = 14, 34
-"""Distances in pixels from a place to the middle of its tag, if the tag is above the place."""
+"""Two possible distances in pixels from a place to the middle of a tag above it."""
 _DIRECTIONS = ((0, -1), (0, 1), (1, -1), (-1, -1), (1, 1), (-1, 1), (1, 0), (-1, 0))
 
 Box = tuple[float, float, float, float]
-"""Left, top, right, bottom."""
+"""A rectangle in pixels: left, top, right, bottom."""
 
 
 def tags(
@@ -56,7 +56,7 @@ def tags(
 
 
 def _boxes(digits: int, place: Point) -> list[Box]:
-    """Return possible rectangles for a tag. The best one is first."""
+    """Return possible rectangles for a tag beside a place. The best rectangle is first."""
     width = digits * DIGIT + PADDING
     boxes = []
     for distance in (NEAR, FAR):
@@ -107,13 +107,13 @@ def _overlap(first: Box, second: Box) -> bool:
 STYLE = (Path(__file__).parent / "map.css").read_text(encoding="utf-8")
 
 PART_CLASSES = 4
-"""Number of different line styles for parts. Further parts reuse the styles with other letters."""
+"""Number of different line styles for parts of the swarm. Further parts have the same styles and other letters."""
 TRACK_CLASSES = ("unknown", "whole", *(f"part{number}" for number in range(PART_CLASSES)), "alone")
 MAX_POINTS = 20_000
 MAX_LINKS = 1500
-"""Maximum number of links at one moment. The shortest links are kept."""
+"""Maximum number of links that are drawn at one moment. The shortest links are kept."""
 MOST_TAGGED_AT_A_MOMENT = 15
-"""Maximum number of vehicles in a small map with ID tags."""
+"""Maximum number of vehicles with ID tags in a small map."""
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 14, 62
 _ROOM_WIDTH, _ROOM_HEIGHT = 900, 600
@@ -121,7 +121,7 @@ _MOMENT_WIDTH, _MOMENT_HEIGHT = 300, 240
 
 
 def css_class(division: NetworkDivision | None, vehicle: int) -> str:
-    """Return the CSS class of a vehicle. It depends on the group of the vehicle in this division of the network."""
+    """Return the CSS class of a vehicle. It depends on the part of the swarm to which the vehicle belongs."""
     if division is None:
         return "unknown"
     if vehicle in division.together:
@@ -214,7 +214,7 @@ def _dot(
 
 
 def _shape(vehicle_type: VehicleType, place: Point) -> str:
-    """Return the outline of a vehicle type: a circle for a copter, a triangle for a plane, a square for a rover."""
+    """Return the shape for a type of vehicle: a circle for a copter, a triangle for a plane, a square for a rover."""
     x, y = place
     match vehicle_type:
         case "copter":
@@ -250,7 +250,7 @@ def sample(which: str) -> Markup:
 
 
 def frame(to_px: MapProjection) -> Markup:
-    """Draw the grid with labels in metres, the scale bar, and a north arrow."""
+    """Draw the frame of the map: a grid with labels in metres, the scale bar, and a north arrow."""
     left, top = to_px.left, to_px.top
     right, bottom = left + to_px.width, top + to_px.height
     north, east = to_px.ticks_m()
@@ -286,7 +286,9 @@ def frame(to_px: MapProjection) -> Markup:
 
 
 def _track_paths(segments: Sequence[TrackSegment], to_px: MapProjection) -> Markup:
-    """Draw the flight paths. Path sections in which the vehicle belongs to a group are on top."""
+    """Draw the flight paths. Sections in which the vehicle belongs to a part of the swarm are drawn last, above the
+    others.
+    """
     lines = thin([[to_px(fix) for fix in segment.fixes] for segment in segments], MAX_POINTS)
     classes = [css_class(segment.division, segment.vehicle) for segment in segments]
     drawn = sorted(zip(classes, segments, lines, strict=True), key=lambda way: TRACK_CLASSES.index(way[0]))

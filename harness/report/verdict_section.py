@@ -20,7 +20,7 @@ STATEMENTS = {
 }
 ICONS = {"good": "✓", "bad": "✗", "unknown": "\u2013"}
 KINDS = {"good": "holds", "bad": "violated", "unknown": "unknown"}
-"""Kind of a verdict -> CSS class."""
+"""Class of a verdict -> CSS class."""
 EVIDENCE_KEPT = 200
 
 
@@ -28,19 +28,21 @@ EVIDENCE_KEPT = 200
 class VerdictEntry:
     key: str
     number: str
-    """The number of the characteristic, or "" for a further check."""
+    """The number of the characteristic. Empty for a further check."""
     name: str
     statement: str
     verdict: str
     icon: str
     kind: str
-    """CSS class."""
+    """CSS class of the verdict."""
     reason: str
     evidence: list[dict[str, Any]]
-    """Label -> value, for each piece of evidence."""
+    """The pieces of evidence, each as label -> value."""
     evidence_left_out: int
     remark: str = ""
-    """How the verdict relates to the expected one, such as "as expected". Empty if there is nothing to say."""
+    """The relation between the verdict and the expected one, such as "as expected". Empty if no verdict was
+    expected.
+    """
 
     @property
     def in_words(self) -> str:
@@ -53,7 +55,7 @@ class VerdictEntry:
 
     @property
     def topic(self) -> str:
-        """The name of the check in a sentence, such as "characteristic 6" or "steps"."""
+        """The name of the check for use in a sentence, such as "characteristic 6" or "steps"."""
         return f"characteristic {self.number}" if self.number else self.name
 
     @property
@@ -95,7 +97,7 @@ def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None, ex
 def headline(verdicts: list[VerdictEntry], *, completed: bool) -> tuple[str, str]:
     """Return a one-line summary of the verdicts, and the CSS class of this summary.
 
-    A run that did not complete is never "holds". A run whose bad verdicts are all expected is "unknown".
+    The class is never "holds" for a run that did not complete. It is "unknown" if all bad verdicts were expected.
     """
     characteristics = [verdict for verdict in verdicts if verdict.number]
     violated, holding = (sum(verdict.kind == kind for verdict in characteristics) for kind in ("violated", "holds"))

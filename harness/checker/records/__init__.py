@@ -50,8 +50,9 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
 )
 
 NEEDS_ALL_LINES = (_heard_vs_sent.compare,)
-"""Comparisons that need complete traces. A restarted agent numbers its messages again, and its first incarnation may
-be missing."""
+"""Comparisons that need complete traces. A restarted agent numbers its messages from 0 again, and the trace of its
+first incarnation may be missing.
+"""
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,9 @@ class RecordComparisons:
 
     contradictions: list[Contradiction]
     short: dict[int, str]
-    """Agent with an incomplete trace -> reason."""
+    """Agent with an incomplete trace -> the reason why the trace is incomplete."""
     unsent: dict[int, int]
-    """Agent -> number of messages that it could not send, by its own count."""
+    """Agent -> number of messages that the agent could not send, as the agent counted them."""
 
     def touching(self, number: str) -> list[Finding]:
         """Return the contradictions that affect the characteristic with this number."""

@@ -16,10 +16,10 @@ from harness.checker.records.contradiction import Contradiction, of_agent, slack
 from ucp.trigger import MessageTrigger
 
 COUNTS_DATAGRAMS = "nftables"
-"""The engine that counts each broadcast once. Other engines also count duplicates."""
+"""The engine that counts each broadcast once. Other engines also count duplicated packets."""
 
 Datagrams = Counter[tuple[object, object]]
-"""(sender, sequence number) -> number of datagrams."""
+"""A count of datagrams by (sender, sequence number)."""
 
 
 def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
@@ -51,9 +51,7 @@ def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams]]:
-    """Return two tables with a row for each vehicle: the datagrams that left the vehicle, and the datagrams that
-    reached it.
-    """
+    """Return two tables by vehicle: the datagrams that left the vehicle, and the datagrams that reached it."""
     left: dict[int, Datagrams] = defaultdict(Counter)
     reached: dict[int, Datagrams] = defaultdict(Counter)
     by_number = {capture.number: capture for capture in captures.used}
@@ -71,8 +69,8 @@ def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams
 
 
 def _not_sent(evidence: Evidence, agent_id: int) -> int:
-    """Return the maximum number of traced messages that the agent did not send, because of an error or because it
-    ended.
+    """Return the maximum number of messages that are in the agent's trace but were not sent, because of an error or
+    because the agent ended.
 
     A killed agent does not send the messages of its last input. An agent that ends does not send its delayed answers.
     """
@@ -95,7 +93,7 @@ def _not_sent(evidence: Evidence, agent_id: int) -> int:
 def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield each agent for which the kernel counted fewer packets than the traces show as sent or handled.
 
-    On a shared channel, datagrams bypass the engine that counts them, so nothing is compared there.
+    On a shared channel, datagrams bypass the engine that counts packets. The function then yields nothing.
     """
     record = evidence.record
     if evidence.has_channel:
@@ -123,7 +121,7 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _sent_by(evidence: Evidence, agent_id: int, mission_s: float) -> int:
-    """Return the smallest number of messages that the agent can have sent when the kernel's counters were read."""
+    """Return the minimum number of messages that the agent had sent when the kernel's counters were read."""
     trace = evidence.traces[agent_id]
     by = mission_s - slack_s(trace)
     spread_s = spread_of(trace)

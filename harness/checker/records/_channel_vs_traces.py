@@ -1,7 +1,7 @@
 """Compare the log of a shared radio channel with run.json and with the traces.
 
-Until a final reconcile ends the channel, each message reaches an agent over the channel only. Two messages of a
-restarted sender can have the same sequence number, so the messages of this sender are not compared.
+Until the final reconcile, messages reach an agent only over the channel. Two messages of a restarted sender can have
+the same sequence number, so the messages of this sender are not compared.
 """
 
 from collections import Counter
@@ -53,8 +53,8 @@ def _fates(lines: list[ChannelLine]) -> dict[tuple[int, int], ChannelLine]:
 
 
 def _counted(lines: list[ChannelLine]) -> Counter[tuple[str, int]]:
-    """Return the counts that run.json must contain: the number of all frames, and the numbers of lost and dropped
-    messages of each vehicle.
+    """Return the counts that run.json must contain according to the channel's log: the number of all frames, and the
+    numbers of lost and dropped messages of each vehicle.
     """
     counted: Counter[tuple[str, int]] = Counter()
     for line in lines:

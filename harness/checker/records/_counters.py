@@ -16,11 +16,11 @@ from ucp.trace import RecordedBytes
 from ucp.trigger import BootTrigger
 
 ROUNDED_S = 5e-4
-"""run.json has milliseconds."""
+"""Rounding error in seconds of the times in run.json, which have milliseconds."""
 
 
 def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each counter of an agent that differs from the number of matching lines in its trace."""
+    """Yield each counter of an agent that differs from the number of such lines in its trace."""
     for agent_id, trace in evidence.traces.items():
         recorded = evidence.recorded(agent_id)
         if recorded is None or trace.problem:
@@ -48,7 +48,7 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _ran_nothing_since(recorded: AgentRecord, incarnation: ReplayedIncarnation) -> bool:
-    """Return true if the agent ran no handler after its last report of its counters."""
+    """Return true if the agent ran no handler after it last reported its counters."""
     counted = recorded.handler_runs[-1] if recorded.handler_runs else None
     return counted is None or counted.counted == len(incarnation.runs)
 
@@ -93,9 +93,7 @@ def _handler_runs(
 
 
 def _lines_by(incarnation: ReplayedIncarnation, counted: HandlerRuns) -> tuple[int, int]:
-    """Return the smallest and the largest possible number of trace lines at the time when the agent reported its
-    counters.
-    """
+    """Return the minimum and maximum number of trace lines that existed when the agent reported its counters."""
     if in_virtual_time(incarnation.trace):
         return len(incarnation.runs), len(incarnation.runs)
     slack = ROUNDED_S + (slack_s(incarnation.trace) if counted.from_s < counted.until_s else 0.0)
@@ -108,8 +106,8 @@ def _lines_by(incarnation: ReplayedIncarnation, counted: HandlerRuns) -> tuple[i
 def _counted(
     evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
-    """Compare the counters in run.json with the sums over all incarnations of the agent (the times between its
-    restarts).
+    """Compare the counters in run.json with the traces. Each counter is the sum over all incarnations of the agent (the
+    times between its restarts).
     """
     sent = sum(incarnation.sent for incarnation in incarnations)
     if recorded.messages_sent is not None and recorded.messages_sent != sent:
@@ -155,7 +153,7 @@ def _bytes_sent(trace: Trace) -> int:
 
 
 def _bytes(datagram: RecordedBytes) -> int:
-    """Return the size of a datagram in bytes, computed from the length of its base64 text."""
+    """Return the size of a datagram in bytes. It is computed from the length of the base64 text."""
     if isinstance(datagram.content, Datagram):
         return datagram_bytes(datagram.content.message)
     return len(datagram.text) // 4 * 3 - datagram.text.count("=", -2)
@@ -217,8 +215,8 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
 def _over_brown_outs(
     evidence: Evidence, agent_id: int, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
-    """Yield a contradiction for each restart after which the agent has other completed blocks on its disk than before.
-    One line before the power loss may be missing in the trace.
+    """Yield a contradiction for each restart after which the agent's disk has different completed blocks than before.
+    One line before the power failure may be missing in the trace.
     """
     for before, after in pairwise(incarnations):
         if not after.runs or not isinstance(after.runs[0].trigger, BootTrigger):
@@ -231,7 +229,9 @@ def _over_brown_outs(
 
 
 def _out_of_order(exported: list[str], traced: list[str]) -> bool:
-    """Return true if the blocks that occur in both lists have a different order, or occur in one list more often."""
+    """Return true if the blocks that occur in both lists have different orders, or if one list contains such a block
+    more often.
+    """
     both = {*exported} & {*traced}
     return [block for block in exported if block in both] != [block for block in traced if block in both]
 

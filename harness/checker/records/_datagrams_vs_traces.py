@@ -1,12 +1,13 @@
 """Compare the number of datagrams that the kernel delivered to an agent with the datagrams in traces.
 
 A trace has a line for each datagram that its agent handled or dropped. The agent also reads its own broadcasts, which
-it ignores. Any further datagram that it read is missing in its trace. A datagram that was read at the end of an
+it ignores. If it read more datagrams, they are missing in its trace. A datagram that was read at the end of an
 incarnation may be missing, because the agent ended before it handled the datagram. An agent may also use other sockets,
-for example between its processes. Datagrams that are not broadcasts therefore do not count.
+for example between its processes, so only broadcasts count.
 
-The trace of an agent that reads no datagrams also looks complete. The kernel therefore also counts the broadcasts that
-arrived at each vehicle. A broadcast that neither the agent read nor the kernel discarded is left in the socket.
+An agent that stops reading its socket also has a trace that looks complete. The module therefore uses the kernel's
+count of broadcasts that arrived at each vehicle. If neither the agent read a broadcast nor the kernel discarded it, it
+is still in the socket.
 """
 
 from bisect import bisect_left, bisect_right
@@ -19,9 +20,13 @@ from harness.checker.records.contradiction import Contradiction, of_agent
 from ucp.trigger import MessageTrigger
 
 UNDER_WAY_WALL_S = 0.25
-"""Seconds of wall time before the end of an incarnation, in which a datagram may be read and not handled."""
+"""Seconds of wall time before the end of an incarnation. A datagram that was read in this time may not have been
+handled.
+"""
 UNREAD_WALL_S = 1.0
-"""Seconds of wall time before the end of an incarnation, in which a datagram may be delivered and not read."""
+"""Seconds of wall time before the end of an incarnation. A datagram that was delivered in this time may not have been
+read.
+"""
 
 
 def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
@@ -75,7 +80,7 @@ def _sentence(counted: DatagramsRead, unrecorded: int, handled: int, dropped: in
 
 
 def _at_the_end(evidence: Evidence, agent_id: int, trace: Trace, wall_s: float) -> int:
-    """Return the maximum number of datagrams that were on their way to the agent when it stopped, as a sum over all its
+    """Return the maximum number of datagrams that were in transit to the agent when it stopped, added over all its
     stops.
     """
     before_s = _mission_s(trace, wall_s)

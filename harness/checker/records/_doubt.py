@@ -1,16 +1,18 @@
-"""Change the verdict on a characteristic if records contradict each other or are incomplete."""
+"""Change the verdict on a characteristic if records contradict each other or are incomplete. This puts the
+characteristic in doubt.
+"""
 
 from harness.checker.judgement import MAX_EVIDENCE, Judgement, agents, times
 from harness.checker.records import RecordComparisons, describe_incomplete
 
 NEEDS_TRACES = frozenset("123")
-"""Characteristics that must hold at every step. They do not hold if steps are missing on record."""
+"""Characteristics that must hold at every step. Without complete traces, they are not known to hold."""
 NEEDS_CONNECTIVITY = frozenset("56")
-"""Characteristics that must hold under full connectivity. An agent that could not send was not connected."""
+"""Characteristics that require full connectivity. An agent that could not send its messages was not connected."""
 
 
 def in_doubt(number: str, judgement: Judgement, examination: RecordComparisons) -> Judgement:
-    """Return the judgement on the characteristic with this number. The result of the record comparisons may change its
+    """Return the judgement on the characteristic with this number. Contradictory or incomplete records change its
     verdict.
     """
     touching = examination.touching(number)

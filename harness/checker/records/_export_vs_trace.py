@@ -1,7 +1,7 @@
 """Check that each trace is consistent, and that each export equals the state at the end of its trace.
 
-An export contains the time at which it was written. The trace up to this time ends in a state. The top chain hash of
-this state covers all blocks of the chain and their order.
+An export contains the time at which it was written. The agent's state at this time follows from the trace. The top
+chain hash of the state covers all blocks of the chain and their order.
 """
 
 from bisect import bisect_left, bisect_right
@@ -69,8 +69,8 @@ def _state(export: Export) -> StateSummary:
 
 
 def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
-    """Return all states in which the agent may have been when it wrote its export. There are several if handlers ran at
-    the same time.
+    """Return all states in which the agent may have been when it wrote its export. Several states are possible if
+    handlers ran at this time.
     """
     at_s = mission_s(export.exported_at_us, trace.header)
     if at_s is None:
@@ -84,8 +84,8 @@ def _states_when(export: Export, trace: Trace) -> list[StateSummary]:
 
 
 def _completed_when(export: Export, incarnations: list[ReplayedIncarnation]) -> list[list[str]]:
-    """Return the blocks that the agent had completed when it wrote its export: one list for each incarnation (the time
-    between two restarts).
+    """Return the blocks that the agent had completed when it wrote its export, as one list for each incarnation (the
+    time between two restarts).
     """
     at_s = mission_s(export.exported_at_us, incarnations[0].trace.header)
     if at_s is None:
@@ -121,8 +121,8 @@ def _value(value: object) -> str:
 
 
 def _contents(agent_id: int, export: Export, incarnation: ReplayedIncarnation) -> Iterator[Contradiction]:
-    """Yield differences between the blocks of an export and the blocks of the trace. Both must have the same lengths
-    and top chain hash.
+    """Yield the differences between the blocks of an export and the blocks of the trace. The caller has checked that
+    lengths and top chain hash are equal.
     """
     if incarnation.wrong_lengths or incarnation.wrong_tops or incarnation.impossible or incarnation.unknown:
         return
@@ -140,7 +140,7 @@ def _contents(agent_id: int, export: Export, incarnation: ReplayedIncarnation) -
 
 
 def compare_with_itself(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each contradiction inside one trace: within an incarnation, or between the end of an incarnation and the
+    """Yield each contradiction in a trace itself: inside an incarnation, or between the end of an incarnation and the
     start of the next one.
     """
     for agent_id, incarnations in evidence.incarnations.items():

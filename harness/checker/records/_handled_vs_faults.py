@@ -2,12 +2,12 @@
 
 An agent runs no handler while it is killed, rebooting, switched off or paused. If a link loses all messages when the
 sender sends a message, the receiver does not handle this message. The time of sending decides, because messages that
-are already under way arrive.
+are already in transit still arrive.
 
-The harness records a stop after it took effect, and a start before the agent runs again. `CLOCK_SLACK_WALL_S` therefore
-covers only the difference between two readings of the machine's clock. Links are different: a busy machine may change
-the network conditions between the time of a trace line and its datagram. A link therefore counts as cut only if it was
-cut for the slack of processes before and after the time of sending.
+The harness records a stop after the agent has stopped, and a start before the agent runs again. `CLOCK_SLACK_WALL_S`
+therefore covers only the difference between two readings of the machine's clock. Links are different: a busy machine
+may change the network conditions between the time of a trace line and its datagram. A link therefore counts as cut only
+if it was cut for the slack of processes before and after the time of sending.
 """
 
 from bisect import bisect_right
@@ -29,7 +29,9 @@ CLOCK_SLACK_WALL_S = 0.1
 """Tolerance, in seconds of wall time, for the clocks of the harness and of an agent on one machine."""
 
 Stop = tuple[float, float, str]
-"""An interval in mission seconds, without its ends, and the fault that began it."""
+"""An interval during which an agent was stopped: start and end in mission seconds, and the fault that stopped it. The
+agent may still run at the start and the end.
+"""
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
@@ -58,8 +60,8 @@ def _clock_slack_s(trace: Trace) -> float:
 
 
 def stopped(evidence: Evidence, agent_id: int, slack_s: float) -> list[Stop]:
-    """Return the intervals in which the agent was killed, rebooting, switched off or paused. Each is shortened by
-    `slack_s` at both ends.
+    """Return the intervals in which the agent was killed, rebooting, switched off or paused. Each interval is shortened
+    by `slack_s` at both ends.
     """
     stops: list[Stop] = []
     since: tuple[float, str] | None = None
@@ -94,7 +96,7 @@ class _CutIntervals:
     def __init__(self, link_losses: list[tuple[float, dict[Link, float]]], slack_s: float) -> None:
         self.slack_s = slack_s
         self._times: dict[Link, list[float]] = defaultdict(list)
-        """Mission seconds at which a link was cut, joined, cut again, and so on."""
+        """Link -> the mission seconds at which the link was cut, restored, cut again, and so on."""
         for at_s, losses in link_losses:
             for link, loss in losses.items():
                 times = self._times[link]
@@ -112,8 +114,8 @@ class _CutIntervals:
 def _cuts(evidence: Evidence) -> _CutIntervals | None:
     """Return the intervals in which links were cut. Return None if no link was cut, or if a cut link may pass messages.
 
-    Three conditions let messages pass: scripted fates deliver them regardless of the loss, netem may pass a second copy
-    of a lost message, and on a shared channel a message waits before it is sent.
+    A cut link may pass messages in three cases. Scripted fates deliver messages regardless of the loss. netem may pass
+    the second copy of a lost message. On a shared channel a message waits before it is sent.
     """
     if evidence.has_fates or evidence.has_channel or any(link.duplicate > 0 for link in evidence.requested_links or ()):
         return None

@@ -1,8 +1,8 @@
 """Compare the headers of all traces with each other, and check that the Algorithm number of each trace line belongs to
 the handler's name.
 
-A scenario may give the agents timers of different durations (`stagger`). The comparison therefore subtracts the stagger
-of each agent from its timers.
+With the key `stagger`, a scenario gives each agent a different addition to its timers. The comparison therefore
+subtracts this addition.
 """
 
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ MAX_VALUE = 40
 
 
 def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each trace header with a different roster, settings, clock or inception block than the other headers."""
+    """Yield each trace header whose roster, settings, clock or inception block differs from the other headers."""
     first: dict[str, tuple[object, str]] = {}
     if evidence.record is not None:
         first["roster"] = sorted(evidence.record.roster), "run.json"
@@ -62,9 +62,7 @@ ALGORITHM = {name: handler.algorithm for name, handler in HANDLERS.items()}
 
 
 def compare_algorithms(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each trace line whose Algorithm number does not belong to its handler. Other checks use only the handler's
-    name.
-    """
+    """Yield each trace line whose Algorithm number does not belong to its handler. No other check reads this number."""
     for agent_id, trace in evidence.traces.items():
         said = dict.fromkeys((run.handler, run.algorithm) for run in trace.runs)
         for handler, number in said:

@@ -19,7 +19,7 @@ CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each handled message whose content differs from the sent message, that arrived too early, or that was
+    """Yield each handled message that differs from the sent message, that was handled before it was sent, or that was
     handled twice.
     """
     slack = max(map(slack_s, evidence.traces.values()), default=0.0)
@@ -87,8 +87,8 @@ def _is_unchanged(datagram: RecordedBytes, sent: Sending) -> bool:
 
 
 def _another_block(run: HandlerRun, trigger: MessageTrigger, sent: Sending) -> str | None:
-    """Return the block that the agent added to its chain, if the message carried a different block. Return None
-    otherwise.
+    """Return the block that the agent added to its chain if the message carried a different block. Otherwise return
+    None.
     """
     if trigger.message not in CARRY_A_BLOCK:
         return None

@@ -1,18 +1,18 @@
 """Compare the share of lost messages with the loss rate that the network was set to.
 
 Each receiver of a message loses it independently, with a known probability. The number of lost messages is therefore a
-sum of independent draws. By Hoeffding's bound (1963, Theorem 1) the probability that the share of n draws is a or more,
-at a mean of q < a, is at most exp(-n KL(a, q)), where KL is the relative entropy of two draws. The same holds below the
-mean. A share contradicts the records only if its probability is below `MAX_CHANCE`, so that chance practically never
-causes a contradiction.
+sum of independent draws. Hoeffding's bound (1963, Theorem 1) limits the probability of an unusual share. If n draws
+have the mean q, their share is a or more, for a > q, with a probability of at most exp(-n KL(a, q)). KL is the relative
+entropy of two draws. The same bound holds for shares below the mean. A share contradicts the records only if this
+probability is below `MAX_CHANCE`, so chance practically never causes a contradiction.
 
 Only messages count that a correct agent handles if they arrive:
 
-- With processes and containers: all messages. Their agents may handle fewer messages than arrive, because they were
-  stopped or a socket was full. Handled messages therefore contradict the loss rate only if there are too many. An
-  engine that counts packets shows whether too few or too many were lost.
-- In virtual time: three types of messages, to an agent that runs and does not reconcile. Virtual time withholds other
-  messages if they have no effect.
+- With processes and containers: all messages. These agents may handle fewer messages than arrive, because they were
+  stopped or a socket was full. Handled messages therefore contradict the loss rate only if their number is too high. If
+  the engine counts packets, its counts can also be too low.
+- In virtual time: messages of three types, if the agent runs and does not reconcile. Virtual time does not deliver
+  other messages without effect.
 """
 
 from bisect import bisect_right
@@ -35,15 +35,19 @@ from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 from ucp.trigger import MessageTrigger
 
 NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitBlock, ChainContainQuery))
-"""Messages that virtual time delivers to each agent that does not reconcile. Others it withholds without effect."""
+"""Types of messages that virtual time always delivers to an agent that does not reconcile. It omits other messages
+without effect.
+"""
 
 MAX_CHANCE = 1e-12
-"""Highest probability of an observation that counts as impossible."""
+"""Probability below which an observation counts as impossible."""
 
 
 @dataclass
 class _ExpectedDeliveries:
-    """The messages to one receiver: their number, and the sums of their smallest and largest loss probabilities."""
+    """The messages that one receiver should get: their number, and the sums of their smallest and largest loss
+    probabilities.
+    """
 
     messages: int = 0
     least: float = 0.0
@@ -51,11 +55,11 @@ class _ExpectedDeliveries:
     handled: int = 0
 
     def loss_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest possible mean loss rate of these messages."""
+        """Return the minimum and maximum of the mean loss rate of these messages."""
         return self.least / self.messages, self.most / self.messages
 
     def pass_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest possible mean probability that one of these messages arrives."""
+        """Return the minimum and maximum of the mean probability that these messages arrive."""
         return 1 - self.most / self.messages, 1 - self.least / self.messages
 
     def add(self, losses: tuple[float, float]) -> None:
@@ -77,9 +81,7 @@ class _LossHistory:
                 self._losses[link].append(loss)
 
     def range_at(self, link: Link, sent_s: float) -> tuple[float, float]:
-        """Return the smallest and the largest loss rate of the link between shortly before and shortly after
-        this time.
-        """
+        """Return the minimum and maximum loss rate of the link around this time."""
         times, losses = self._times[link], self._losses[link]
         if len(losses) == 1:
             return losses[0], losses[0]
@@ -137,10 +139,10 @@ def _is_impossible_at(seen: _ExpectedDeliveries, sides: tuple[bool, ...]) -> boo
 
 
 def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) -> dict[int, _ExpectedDeliveries]:
-    """Return, for each receiver, the number of messages that a correct agent handles if they arrive, with their loss
+    """Return, for each receiver, the messages that a correct agent handles if they arrive, with their loss
     probabilities.
 
-    If `over_cuts` is given, it contains the smallest and the largest loss probability of a message whose link is cut.
+    If `over_cuts` is given, it contains the minimum and maximum loss probability for messages over cut links.
     """
     slack = max([SAME_TIME_S, *map(slack_s, evidence.traces.values())])
     history = _LossHistory(evidence.link_losses, slack)
@@ -169,7 +171,7 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
 
 
 class _ReadyTimes:
-    """The times at which an agent in virtual time would handle a message of certain types if it arrived."""
+    """The times at which an agent in virtual time handles a message of certain types, if such a message arrives."""
 
     def __init__(self, evidence: Evidence, agent_id: int) -> None:
         self._latest_s = LATENCY.mean_s + LATENCY.jitter_s
@@ -200,8 +202,8 @@ class _ReadyTimes:
 def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterator[Contradiction]:
     """Yield each receiver for which the kernel lost more or fewer packets than the loss rates can explain.
 
-    The kernel counts packets that a partition cut separately from lost packets. It counts packets to a killed vehicle
-    like any others.
+    The kernel counts lost packets separately from packets that a partition cut. It also counts packets to killed
+    vehicles.
     """
     record = evidence.record
     if record is None or record.engine != COUNTS_DATAGRAMS or record.counters is None:
@@ -228,9 +230,10 @@ def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterato
 
 
 def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer: bool) -> bool:
-    """Return true if this count, or a more extreme one, is practically impossible in `number` random draws.
+    """Return true if this count is practically impossible in `number` random draws.
 
-    `means` contains the smallest and the largest possible mean of the draws.
+    `means` contains the minimum and maximum of the mean of the draws. If `fewer` is true, the function tests whether
+    the count is too low, and otherwise whether it is too high.
     """
     share = min(1.0, count / number)
     mean = min(1.0, max(0.0, means[0] if fewer else means[1]))

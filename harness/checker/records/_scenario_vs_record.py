@@ -1,8 +1,8 @@
 """Compare the scenario with the changes, agents and duration that run.json records.
 
-The scenario determines all network changes, faults and injections before the run. If a record lacks one of them, or has
-a further one, it describes a different run. The scenario does not contain three kinds of changes: those by the movement
-of vehicles, the end of scripted fates, and the network without loss during the final reconcile.
+The scenario determines all network changes, faults and injections before the run. If a record lacks one of them or has
+an additional one, it belongs to a different run. Three kinds of changes are not in the scenario: changes by the
+movement of vehicles, the end of scripted fates, and the lossless network during the final reconcile.
 """
 
 from collections.abc import Iterator
@@ -28,10 +28,12 @@ USUAL = Settings()
 NOT_IN_A_SCENARIO = (RANGE, NO_MORE_FATES, FINAL_RECONCILE)
 
 LATE_WALL_S = 60.0
-"""Greatest lateness, in seconds of wall time, of a change of processes whose record lacks the planned time."""
+"""Maximum lateness of a change in seconds of wall time. It applies to runs with processes, whose records lack the
+planned time.
+"""
 
 Made = tuple[str, str]
-"""Name and description of a change."""
+"""The name and the description of a change."""
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
@@ -53,7 +55,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 def _compare_changes(
     evidence: Evidence, scenario: Scenario, record: JudgedRecord, mission_s: float
 ) -> Iterator[Contradiction]:
-    """Yield each planned change that is not recorded at its time, and each recorded change that was not planned."""
+    """Yield each planned change that the record lacks at its time, and each recorded change that was not planned."""
     first = min(record.roster, default=0)
     latest = max(map(slack_s, evidence.traces.values()), default=ROUNDED_S)
     late_s = 0.0 if any(map(in_virtual_time, evidence.traces.values())) else LATE_WALL_S * scenario.speedup

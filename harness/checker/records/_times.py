@@ -2,7 +2,7 @@
 
 An agent exports its chain at its own end: when it is switched off, or when the run ends. An event has the timestamp of
 its logging. Virtual time has one clock, so these times are equal. Processes export one after another and on a machine
-that may be busy, so their exports and last handler runs may be later than the end of the run, by `END_WALL_S` at most.
+that may be busy, so their exports and last handler runs may be up to `END_WALL_S` later than the end of the run.
 """
 
 from collections.abc import Iterator
@@ -20,13 +20,13 @@ from ucp.trace import HandlerRun
 from ucp.trigger import EventTrigger
 
 END_WALL_S = 60.0
-"""Seconds of wall time in which the harness ends all agents, at most."""
+"""Maximum number of seconds of wall time that the harness takes to end all agents."""
 ROUNDED_END_S = 0.1
-"""run.json has tenths of a second, except in virtual time."""
+"""Rounding error in seconds of the end time in run.json, which has tenths of a second except in virtual time."""
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each export, handler run and event whose time contradicts the end of the run or the agent's clock."""
+    """Yield each export, handler run and event whose time contradicts the end time of the run or the agent's clock."""
     as_logged = not _has_recorded_events(evidence)
     for agent_id, trace in evidence.traces.items():
         end_s = evidence.end_of(agent_id)
@@ -71,7 +71,7 @@ def _compare_export(
 
 
 def _has_recorded_events(evidence: Evidence) -> bool:
-    """Return true if the events of the scenario keep the timestamps of an earlier run."""
+    """Return true if the events of the scenario keep the timestamps of a recorded run."""
     return evidence.scenario is None or any(event.timestamp_us is not None for event in evidence.scenario.events.script)
 
 

@@ -12,8 +12,8 @@ from ucp.clock import MICROSECONDS
 class Contradiction:
     """A contradiction between two records.
 
-    `touches` is the number of the characteristic that depends on these records. None means that no characteristic
-    depends on them. `short` is true if the contradiction shows that the agent's trace lacks lines.
+    `touches` is the number of the characteristic that depends on these records. It is None if no characteristic depends
+    on them. `short` is true if the contradiction shows that the agent's trace lacks lines.
     """
 
     finding: Finding
@@ -22,12 +22,12 @@ class Contradiction:
 
 
 def of_agent(agent_id: int, detail: str, touches: str | None = None, *, short: bool = False) -> Contradiction:
-    """Return a contradiction that concerns an agent, but no particular block."""
+    """Return a contradiction about an agent that concerns no particular block."""
     return Contradiction(Finding(agent_id, detail), touches, short)
 
 
 ROUNDED_S = 2e-6
-"""Rounding error in seconds of the times in traces, which have microseconds."""
+"""Rounding error in seconds of the times in traces. These times have microseconds."""
 
 
 def in_virtual_time(trace: Trace) -> bool:

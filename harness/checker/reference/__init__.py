@@ -1,8 +1,9 @@
 """The independent implementation of the protocol with which the steps of an agent are compared.
 
 `algorithms` is a transcription of Algorithms 1-20. Its author worked from the thesis and from
-`docs/reference/readings.md`, the interpretations of its ambiguous passages, and did not see `ucp`. It shares only the
-message codec and the hashes with `ucp`. An edit of `ucp` therefore changes the agents and not the judge.
+`docs/reference/readings.md`, the interpretations of its ambiguous passages, and did not see `ucp`. The two
+implementations share only the message codec and the hashes. An edit of `ucp` therefore changes the agents, but not the
+judge.
 """
 
 from collections.abc import Container

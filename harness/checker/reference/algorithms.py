@@ -1,14 +1,14 @@
 """The reference implementation: a literal transcription of Algorithms 1-20 (Chapter 3 of the thesis).
 
-This module judges recorded runs of other implementations, so it favours the order and the words of the pseudo-code over
-short code. Its author worked from the thesis and the interpretations of its ambiguous passages ("readings"), and did
-not see `ucp`. "Reading 4" in a docstring means number 4 of docs/reference/readings.md.
+This module judges recorded runs of other implementations, so it follows the order and the words of the pseudo-code,
+even if shorter code were possible. Its author worked from the thesis and the interpretations of its ambiguous passages
+("readings"), and did not see `ucp`. "Reading 4" in a docstring means number 4 of docs/reference/readings.md.
 
 Each algorithm is one function. It reads and changes a `ReferenceState` and returns the name of the branch that it took.
 An input is a message, an expired timer, a logged event or a command. A handler is atomic: it runs to its end, then the
-local events that it triggered run in order, then the next input follows. Therefore the locks of the thesis are absent
-(reading 15). Nothing here does I/O or reads a clock. Messages collect in `ReferenceState.outbox`. Each input brings the
-time.
+local events that it triggered run in order, then the next input follows. The locks of the thesis are therefore not
+needed (reading 15). The functions do no I/O and read no clock. They append messages to `ReferenceState.outbox`. The
+time comes with each input.
 """
 
 from collections.abc import Callable
@@ -143,10 +143,11 @@ def receive_vote_add_block(state: ReferenceState, sender: int, message: BlockAdd
 def vote_timer_expiration(state: ReferenceState) -> str:
     """Algorithm 5, Vote Timer Expiration (Section 3.6.2): commit the proposed block, vote again or reconcile.
 
-    By reading 4, the agent votes again if its chain changed during an approved vote. Reading 5 defines the order of the
-    two tests; a tied vote is not approved. By reading 10, the handler does nothing during a reconcile. The block leaves
-    the deque before it is committed, because the agent contract requires this order of recorded changes. The thesis
-    removes the block last. The setting `asks_after_commit` extends the thesis.
+    By reading 4, the agent votes again if its chain changed during an approved vote. By reading 5, the agent tests the
+    result of the vote before the change of the chain, and a tied vote is not approved. By reading 10, the handler does
+    nothing during a reconcile. The block leaves the deque before it is committed, because the agent contract requires
+    this order of recorded changes. The thesis removes the block last. The setting `asks_after_commit` extends the
+    thesis.
     """
     if state.reconcile_in_progress:
         return "reconcile in progress"
@@ -404,7 +405,7 @@ def reconcile_finalize(state: ReferenceState) -> str:
     """Algorithm 20, Reconcile Finalize (Section 3.6.3): commit the remaining blocks of the reconcile stack again.
 
     By reading 14, the agent pauses between two commits, and the flag `reconcile_in_progress` stays set during the
-    pause. The setting `asks_after_commit` extends the thesis.
+    pause. The setting `asks_after_commit` is an extension of the thesis.
     """
     if state.settings.asks_after_commit and not state.reconcile_in_progress:
         state.send(ChainHashSuccessorQuery(state.chain.top_chain_hash))
@@ -422,7 +423,7 @@ def reconcile_finalize(state: ReferenceState) -> str:
 
 
 def tally_of(state: ReferenceState, handler: Handler) -> Tally | None:
-    """Return a copy of the votes or candidates that a handler counts, or the candidate that it chose. Hashes are
+    """Return the counters of a handler: a copy of its votes or candidates, or the candidate that it chose. Hashes are
     hexadecimal text.
     """
     dictionary = state.reconcile_response_dictionary

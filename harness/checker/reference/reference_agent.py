@@ -50,7 +50,7 @@ class ReferenceAgent:
         self.receive_message(sender, sequence, message, now)
 
     def receive_message(self, sender: int, sequence: int, message: Message, now: float) -> None:
-        """Handle a message. Messages for other agents are dropped."""
+        """Handle a message. Messages that the agent must ignore are dropped."""
         if why_not_handled(self.agent_id, self.roster, sender, message) is None:
             trigger = MessageTrigger(message.NAME, sender, sequence)
             self._handle(now, trigger, ON_MESSAGE[type(message)], sender, message)
@@ -75,7 +75,7 @@ class ReferenceAgent:
         self._handle(now, TimerTrigger(timer.name), ON_TIMER[timer.name])
 
     def boot(self, stored: StoredState, now: float) -> None:
-        """Start with the state that the agent stored on disk before it lost power."""
+        """Start the agent with the state that it stored on disk before the power failure."""
         self.state.now = now
         self.state.restore(stored.completed, stored.chain, stored.deque, stored.stack)
         self._handle(now, BootTrigger(len(self.state.chain)), ON_LOCAL_EVENT["Reconcile Finalize"])
@@ -87,12 +87,12 @@ class ReferenceAgent:
     # Outputs
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
-        """Return the messages to broadcast with their sequence numbers, and empty the list of waiting messages."""
+        """Return the messages to broadcast with their sequence numbers. Then forget them."""
         sent, self._outbox = self._outbox, []
         return sent
 
     def datagrams_to_send(self) -> list[bytes]:
-        """Return the datagrams to broadcast, and empty the list of waiting messages."""
+        """Return the datagrams to broadcast. Then forget them."""
         return [encode(self.agent_id, sequence, message) for sequence, message in self.messages_to_send()]
 
     def trace(self) -> list[HandlerRun]:

@@ -34,9 +34,7 @@ class Settings:
 
     @classmethod
     def of(cls, settings: object) -> "Settings":
-        """Return the settings of an agent as an object of this class. `settings` can be any object with the same
-        attributes.
-        """
+        """Convert any object with the same attributes to settings of this class."""
         return cls(**{setting.name: getattr(settings, setting.name) for setting in fields(cls)})
 
 
@@ -52,7 +50,7 @@ class Timer:
 
     @property
     def active(self) -> bool:
-        """True if the timer was started and has not been stopped. A paused timer is active."""
+        """True if the timer was started and neither expired nor was stopped. A paused timer is active."""
         return self.deadline is not None
 
     def start(self, now: float, duration_s: float) -> None:
@@ -66,7 +64,7 @@ class Timer:
             self._paused_at = now
 
     def resume(self, now: float) -> None:
-        """Continue a paused timer. The deadline of the timer moves by the duration of the pause."""
+        """Continue a paused timer. Its deadline is later by the duration of the pause."""
         if self.deadline is not None and self._paused_at is not None:
             self.deadline, self._paused_at = self.deadline + (now - self._paused_at), None
 
@@ -100,7 +98,7 @@ class Chain:
 
     def successor(self, chain_hash: bytes) -> Block | None:
         """Return the block that follows `chain_hash`. Return None if the chain does not contain this chain hash, or if
-        no block follows it.
+        it is the top of the chain.
         """
         return self._successors.get(chain_hash)
 
@@ -144,10 +142,10 @@ class Handler:
 
 
 class ReferenceState:
-    """The state of one agent: the variables of the pseudo-code, and the recorded effects of the current handler."""
+    """The state of one agent: the variables of the pseudo-code, and the effects of the handler that is running."""
 
     running: Handler
-    """The handler that runs. The driver sets it before each run."""
+    """The handler that is running. The caller sets it before each run."""
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Settings) -> None:
         self.agent_id = agent_id
@@ -204,11 +202,11 @@ class ReferenceState:
         return block_hash in self.chain or block_hash in self._off_chain
 
     def note_held(self) -> None:
-        """Update the set of held blocks. Call this method after a replacement of the deque or the reconcile stack."""
+        """Update the set of held blocks. Call this method after replacing the deque or the reconcile stack."""
         self._off_chain = {block.block_hash for block in (*self.blocks_to_be_committed, *self.reconcile_stack)}
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Return the event data of the block under construction, which gets the timestamp `timestamp_us`."""
+        """Return the event data of the block under construction. `timestamp_us` will be the timestamp of the block."""
         return bytes(self.current_block)
 
     def send(self, message: Message) -> None:
@@ -253,7 +251,7 @@ class ReferenceState:
         self.changed("stack+", block)
 
     def pop_stack(self, index: int = -1) -> Block:
-        """Remove a block from the reconcile stack and return it. The default is the top block."""
+        """Remove the block at `index` from the reconcile stack and return it. By default this is the top block."""
         block = self.reconcile_stack.pop(index)
         self._off_chain.discard(block.block_hash)
         self.changed("stack-", block)
@@ -262,11 +260,11 @@ class ReferenceState:
     def restore(
         self, completed: Iterable[bytes], chain: Iterable[Block], deque: Iterable[Block], stack: Iterable[Block]
     ) -> None:
-        """Load the state that the agent stored before it lost power, and start the agent as if a reconcile were in
+        """Load the state that the agent stored before a power failure, and start the agent as if a reconcile were in
         progress.
 
-        `completed` holds block hashes. Recording "complete" bypasses `changed`, since the agent may no longer hold
-        these blocks.
+        `completed` contains block hashes. The method records the change "complete" for them without calling `changed`,
+        because the agent may no longer hold these blocks.
         """
         self.reconcile_in_progress = True
         self.completed = list(completed)

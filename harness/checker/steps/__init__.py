@@ -29,8 +29,8 @@ NAME = "every step"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Return the verdict on all steps. It is `deviates` after any difference from the reference, `not applicable` if a
-    step could not be judged, and `as specified` otherwise.
+    """Return the verdict on all steps. The verdict is `deviates` after any difference from the reference, `not
+    applicable` if a step could not be judged, and `as specified` otherwise.
     """
     if evidence.steps is not None:
         return evidence.steps
@@ -99,7 +99,9 @@ def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: 
 
 
 def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[StepComparer]) -> None:
-    """Compare each incarnation of the agent with the reference, up to the first step with an undefined name."""
+    """Compare each incarnation of the agent with the reference, up to the first step that contains an undefined
+    name.
+    """
     understood = not evidence.unknown.get(agent_id, {}).keys() - IGNORED_KINDS
     for follower, life in zip(followers, trace.incarnations(), strict=True):
         if evidence.watch is not None:

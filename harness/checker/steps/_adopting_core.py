@@ -1,9 +1,8 @@
-"""An agent core that can take over the state that another agent recorded. A comparison can then continue after a
-deviation.
+"""An agent core that can adopt the state that another agent recorded. A comparison can then continue after a deviation.
 
 After a deviation the judge continues from the agent's own state. `AdoptingCore` adds this ability to any core that has
-the attributes of the reference's `ReferenceState`. There are two such cores: the reference, which judges the agents,
-and the core in use, for a debugger and for `bisect` (`harness.checker.steps.core_in_use`).
+the attributes of the reference's `ReferenceState`. Two cores use this: the reference, which judges the agents, and the
+installed core, for a debugger and for `bisect` (`harness.checker.steps.core_in_use`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -30,7 +29,7 @@ class StateBeforeStep(NamedTuple):
 
     stack: list[Block]
     current_block: bytes | None
-    """None unless the step logs an event."""
+    """The block under construction before the step. None unless the step logs an event."""
     phase_three_ends: float | None
 
 
@@ -41,21 +40,22 @@ else:
 
 
 class AdoptingCore(_Core):
-    """An agent core that can undo its last step (`undo`) and take over the recorded step of another agent instead
+    """An agent core that can undo its last step (`undo`) and adopt the recorded step of another agent instead
     (`adopt`).
     """
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Any) -> None:
         super().__init__(agent_id, initial_data, settings)
         self.told_sealed: bytes | None = None
-        """The sealed event data of this step, as the agent recorded it. Without the agent's keys nothing can seal it
-        again."""
+        """The encrypted event data of this step, as the agent recorded it. The core cannot encrypt it without the
+        agent's keys.
+        """
         self._seals = sealed_to(initial_data) is not None
         self._moved: dict[str, Block] = {}
-        """Every block that the core has held, by hash."""
+        """Block hash -> block, for all blocks that the core has held so far."""
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Return the event data of a completed block. If the mission encrypts event data, return the encrypted data
+        """Return the event data of the completed block. If the mission encrypts event data, return the encrypted data
         that the agent recorded.
         """
         events = bytes(self.current_block)
@@ -83,8 +83,8 @@ class AdoptingCore(_Core):
         self.step_is_over()
 
     def before(self, run: HandlerRun) -> StateBeforeStep | None:
-        """Return the data that `undo` needs in addition to the recorded changes of the step. Return None if it needs no
-        such data.
+        """Return the data that `undo` needs in addition to the recorded changes of the step. Return None if the
+        recorded changes are sufficient.
         """
         logs, phase_three_ends = run.handler == "build_data_block", self.phase_three_timer.deadline
         if not (logs or self.reconcile_stack or phase_three_ends is not None):
@@ -94,7 +94,7 @@ class AdoptingCore(_Core):
         )
 
     def step_is_over(self) -> None:
-        """Forget the recorded changes, messages and timers of the last step."""
+        """Forget the changes, messages and timers of the last step."""
         if self.changes:
             self.changes = []
         if self.outbox:
@@ -120,13 +120,13 @@ class AdoptingCore(_Core):
         return True
 
     def sent_in_full(self) -> list[SentMessage]:
-        """Return the messages of the last step in the format of a trace."""
+        """Return the messages of the last step in the format of a trace line."""
         return [SentMessage.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
-        """Set the block to request in phase 3 to the block in the agent's recorded run.
+        """Choose the same block for phase 3 as the agent's recorded run.
 
-        This is necessary after a deviation, because the agent alone chose to start phase 3.
+        This is necessary after a deviation, if the agent started phase 3 but the core did not.
         """
         if run.handler == "reconcile_phase_3":
             hashes = [block_hash for operation, block_hash in run.changes if operation == "chain+"]
@@ -135,7 +135,8 @@ class AdoptingCore(_Core):
                 self.majority_response_block_hash = bytes.fromhex(hashes[0])
 
     def undo(self, before: StateBeforeStep | None) -> None:
-        """Undo the last step's changes of blocks and timers. The votes stay as they are, because `adopt` replaces them.
+        """Undo the changes that the last step made to blocks and timers. The votes are not restored, because `adopt`
+        replaces them.
 
         `before` is None if the recorded changes are sufficient to undo the step.
         """
@@ -167,8 +168,8 @@ class AdoptingCore(_Core):
         self.step_is_over()
 
     def adopt(self, run: HandlerRun, blocks: BlockIndex) -> None:
-        """Set the state to the one that the agent recorded after `run`. Raises NotOnRecordError if the records are
-        insufficient.
+        """Set the state of this core to the state that the agent recorded after `run`. Raises NotOnRecordError if the
+        records are insufficient.
         """
         for operation, block_hash in run.changes:
             self._adopt_change(operation, self._moved.get(block_hash) or blocks.get(block_hash))
@@ -222,7 +223,7 @@ class AdoptingCore(_Core):
             self.chain.top_chain_hash = chain_hash
 
     def _adopt_sent(self, sent: Iterable[SentMessage]) -> None:
-        """Start the timers that belong to the queries and requests in these sent messages."""
+        """Start the timers for the queries and requests among these sent messages."""
         for announced in sent:
             self.sequence = announced.seq + 1
             try:
@@ -233,8 +234,8 @@ class AdoptingCore(_Core):
                 timer.start(self.now, self._duration(timer))
 
     def _asked(self, message: Message) -> Timer | None:
-        """Prepare to count the answers to `message`, and return the timer that limits the wait. Return None if the
-        message asks for no answer.
+        """Prepare to count the answers to `message`. Return the timer that limits the wait for them, or None if the
+        message needs no answer.
         """
         match message:
             case BlockAddRequest():

@@ -1,9 +1,9 @@
 """Find timers of an agent that expired later than the measured delays of the machine can explain.
 
 A correct agent runs a timer late only if the machine wakes it late, or if its process is busy or waits for a processor.
-The harness measures both delays during a run (`lag.jsonl`). The measured lag is an upper bound, so a single timer shows
-only a large error. A wrong duration makes all timers of one type late. Their mean lateness over the run then shows a
-smaller error.
+The harness measures both delays during a run (`lag.jsonl`). The measured delay is an upper bound, so a single timer
+reveals only a large error. If the duration of a timer is wrong, all expiries of this timer are late. Their mean
+lateness over the run then reveals smaller errors, too.
 """
 
 from collections import defaultdict
@@ -18,11 +18,11 @@ from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import RecordedTimerExpiry
 
 SINGLE_WALL_S = 0.03
-"""Wall time that a single timer may be late without an explanation."""
+"""Seconds of wall time by which a single timer may be late without an explanation."""
 MEAN_WALL_S = 0.01
-"""Wall time that the timers of a kind may be late on average without an explanation."""
+"""Seconds of wall time by which all expiries of one timer may be late on average without an explanation."""
 ENOUGH = 8
-"""Minimum number of timers for a mean."""
+"""Minimum number of expiries for which a mean is computed."""
 
 
 @dataclass
@@ -36,7 +36,7 @@ class JudgedTimers:
 
     @property
     def remark(self) -> str:
-        """A remark about timers that could not be judged. It is empty if all timers were judged."""
+        """A remark about timers that could not be judged. It is an empty text if all timers were judged."""
         if not self.unmeasured:
             return ""
         which = "timers" if self.unmeasured == self.expiries else f"{self.unmeasured} of {self.expiries} timers"
@@ -45,7 +45,7 @@ class JudgedTimers:
     def judge(
         self, evidence: Evidence, trace: Trace, expiries: Sequence[RecordedTimerExpiry]
     ) -> Iterator[StepDeviation]:
-        """Yield the timers of an agent that expired later than the machine's measured delays explain."""
+        """Yield the expiries of an agent's timers that were later than the measured delays of the machine explain."""
         speedup = trace.header.clock.get("speedup")
         if in_virtual_time(trace) or not isinstance(speedup, int | float) or speedup <= 0:
             return
@@ -67,7 +67,7 @@ def _of_kind(
     agent_id: int, timer: str, expiries: list[tuple[RecordedTimerExpiry, float]], speedup: float
 ) -> Iterator[StepDeviation]:
     """Yield each expiry of this timer that was too late. If only the mean lateness of all expiries is too high, yield
-    the last expiry.
+    the last of them.
     """
     late = [(expiry, lag_s) for expiry, lag_s in expiries if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
     for expiry, lag_s in late:

@@ -1,7 +1,7 @@
 """Make the installed agent core `ucp.agent` comparable with the records of an agent.
 
-The verdict on agents comes from the reference. The core in use also follows a record in two cases in which its own
-behaviour matters: in a debugger, which stops in the handlers of `ucp`, and in `bisect`, which compares the cores of
+The verdict on agents comes from the reference. The installed core follows a record in two cases in which its own
+behaviour matters: for a debugger, which stops in the handlers of `ucp`, and for `bisect`, which compares the cores of
 commits.
 """
 
@@ -39,4 +39,4 @@ def _core(header: CheckedHeader) -> AdoptingCore:
 
 
 IN_USE = CoreImplementation(_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)
-"""The core of this installation."""
+"""The agent core `ucp.agent` of this installation."""

@@ -9,12 +9,12 @@ from ucp.messages import MalformedDatagramError
 from ucp.trace import HandlerRun, SentMessage, Tally
 
 NameOf = Callable[[str], str]
-"""A function from the hash of a block to its name."""
+"""A function that returns the name of the block with a given hash."""
 
 CHOOSES = 15
-"""The Algorithm whose tally is its choice."""
+"""The number of the Algorithm that records its choice instead of counters."""
 SHOWN = 3
-"""Maximum number of listed changes or messages of a step. Further ones are counted."""
+"""Maximum number of changes or messages that the description of a step lists. It only counts further ones."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class StepDeviation:
 
 
 def differences(run: HandlerRun, expected: HandlerRun, name: NameOf) -> Iterator[tuple[str, str]]:
-    """Yield the actual and the expected behaviour for each part of the step in which they differ."""
+    """Compare two handler runs. Yield the actual and the expected behaviour for each part in which they differ."""
     if run.branch != expected.branch:
         yield f"took the branch '{run.branch[:60]}'", f"taken '{expected.branch}'"
     as_changed = run.changes == expected.changes

@@ -1,8 +1,8 @@
-"""Describe the end of a record that stops without a regular end of the agent. An agent that dies leaves no line for its
+"""Describe the end of a record that stops without a regular end of the agent. An agent that dies writes no line for its
 last handler.
 
 If `run.json` exists, it contains the reason. A crash in a handler is a deviation, because no Algorithm ends in an
-error. For records from the field, only the records of other agents show that the mission continued after the last line.
+error. For records from the field, only other agents' records can show that the mission continued after the last line.
 They do not show whether the agent died in a handler or lost its power, so the sentence names the next input and both
 possibilities.
 """
@@ -19,13 +19,13 @@ from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import StepComparer
 
 FAILED = ("crashed", "hung", "broken")
-"""Outcomes of agents that ended against their will."""
+"""The outcomes in run.json of agents that ended without a request."""
 _NAMED = re.compile(r"Algorithm \d+, (\w+)")
 _OF_MESSAGE = {message.NAME: handler for message, handler in ON_MESSAGE.items()}
 
 
 class MessageArrival(NamedTuple):
-    """A message to the agent: mission seconds, type, sender and sequence number.
+    """A message to the agent: mission second, type, sender and sequence number.
 
     If `arrived` is true, a capture shows that the message reached the agent's vehicle at this time. Otherwise the
     sender sent it at this time, and it may have been lost.
@@ -52,7 +52,7 @@ def crash(trace: Trace, recorded: AgentRecord | None) -> StepDeviation | None:
 
 
 def failure(recorded: AgentRecord | None) -> str | None:
-    """Return the reason why the trace of an agent ends early. Return None if run.json has no such reason."""
+    """Return the reason in run.json why the trace of an agent ends early. Return None without such a reason."""
     if recorded is None or recorded.outcome not in FAILED:
         return None
     return f"its record ends early: it {recorded.detail or recorded.outcome}"
@@ -69,10 +69,10 @@ def last_line(trace: Trace) -> tuple[int, float]:
 def unfinished(
     follower: StepComparer, trace: Trace, others_until_s: float, arrivals: Iterator[MessageArrival] | None
 ) -> str | None:
-    """Return a sentence if a trace without an export ends before the mission ended. Return None otherwise.
+    """Return a sentence if the trace ends before the mission ended and the agent left no export. Return None otherwise.
 
-    `others_until_s` is a mission second until which other agents certainly continued. `arrivals` are the messages to
-    the agent, or None if messages prove nothing.
+    Other agents certainly continued until mission second `others_until_s`. `arrivals` contains the messages to the
+    agent, or is None if messages prove nothing.
     """
     line, t = last_line(trace)
     if others_until_s <= t:
@@ -102,7 +102,7 @@ def unfinished(
 
 
 def sent_to(agent_id: int, traces: Mapping[int, Trace]) -> Iterator[MessageArrival]:
-    """Yield the messages that the traces of other agents contain as sent."""
+    """Yield the messages to the agent that other agents sent according to their traces."""
     for sender, trace in traces.items():
         if sender != agent_id:
             for run in trace.runs:

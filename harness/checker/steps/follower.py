@@ -36,15 +36,17 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
 COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted", "block", "tie: block"))
-"""Branches that begin a tally, count in it, or choose from it. After other branches the tally is not compared."""
+"""Branches in which a handler starts, changes or uses a tally. After other branches the tally is not compared."""
 
 LOGS = ON_LOCAL_EVENT["Build Data Block"].name
-"""Handler of Algorithm 1, which only a logged event triggers."""
+"""Name of the handler of Algorithm 1, which only logged events trigger."""
 PAUSES = "receive_response_block_for_hash"
-"""Handler that pauses the timer of phase 3 and continues it. No record shows this."""
+"""Name of the handler that pauses and continues the phase 3 timer. No record shows this pause."""
 
 TOUCH_A_TIMER = frozenset((PAUSES,))
-"""Message handlers that change a timer. Other message handlers are undone from their recorded changes."""
+"""Message handlers that change a timer. The effects of other message handlers can be undone from their recorded
+changes.
+"""
 
 Paused = Callable[[float, float], bool]
 """A function that returns true if the agent was paused at any time between two mission seconds."""
@@ -69,7 +71,7 @@ class RecordedTimerExpiry(NamedTuple):
 
 
 class OptionalTraceFields(NamedTuple):
-    """The optional fields that occur in a trace: the handlers with recorded vote counts, and whether the trace records
+    """The optional fields that this trace contains: the handlers with recorded tallies, and whether the trace records
     timers.
     """
 
@@ -91,7 +93,9 @@ class AnotherHandlerError(NotHandledError):
 
 
 class StepComparer:
-    """Compares the handler runs of one agent between two restarts with the reference implementation."""
+    """A comparison of the handler runs of one agent with the reference implementation, between two restarts of the
+    agent.
+    """
 
     def __init__(
         self,
@@ -102,11 +106,11 @@ class StepComparer:
         implementation: CoreImplementation = REFERENCE,
     ) -> None:
         self.deviations: list[StepDeviation] = []
-        """The differences, in order."""
+        """The differences found so far, in order."""
         self.expiries: list[RecordedTimerExpiry] = []
         """Each expiry of a timer of the reference that the agent handled, in order."""
         self.lost: str | None = None
-        """The reason, with a trace line, why the agent cannot be followed any further. None while it can."""
+        """The reason, with a trace line, why the comparison cannot continue. None while it can."""
         self.stops_before_handler = False
         """Call `breakpoint()` before each handler. A debugger steps from there into the handler."""
         self._header = header
@@ -118,20 +122,22 @@ class StepComparer:
         self._core = implementation.core(header)
         self._timers = {timer.name: timer for timer in self._core.timers}
         self._ran: dict[str, tuple[int, float]] = {}
-        """Handler runs since the last input: trace line and mission second."""
+        """Handler -> trace line and mission second of its run since the last input."""
         self._adopted = False
-        """True if a difference was found since the last input. Handlers triggered since then are not compared."""
+        """True if a difference was found since the last input. The handlers that were triggered since then are not
+        compared.
+        """
         self._began = False
         self._none_ends_before = math.inf
-        """Time of the next timer expiry of the reference, by the agent's clock."""
+        """Time of the next timer expiry of the reference, on the agent's clock."""
         self._paused = 0, -math.inf
-        """Last pause of the phase 3 timer: trace line, and time by the agent's clock."""
+        """The last pause of the phase 3 timer: trace line, and time on the agent's clock."""
         self._top, self._top_hex = b"", ""
         self._state: StateSummary | None = None
-        """The last recorded state, while the reference is still in this state."""
+        """The last recorded state, as long as the reference is still in this state."""
 
     def follow(self, line: int, run: HandlerRun) -> None:
-        """Compare this handler run with the reference, and also check that the agent skipped no run before it."""
+        """Compare this handler run with the reference. Also check that the agent omitted no handler run before it."""
         if self.lost is not None:
             return
         core, trigger = self._core, run.trigger
@@ -194,7 +200,7 @@ class StepComparer:
 
     @property
     def state(self) -> ReferenceState:
-        """The present state of the reference implementation. Callers must not change it."""
+        """The current state of the reference implementation. Callers must not change it."""
         return self._core
 
     @property
@@ -212,8 +218,8 @@ class StepComparer:
     # Lines that may be lost
 
     def has_effect(self, sender: int, message: Message, at_s: float) -> bool:
-        """Handle a message that is missing in the trace. Return true if it had an effect: a change, a counted answer, a
-        message, a timer or a local event.
+        """Give the reference a message that is missing in the trace. Return true if it has an effect: a change, a
+        counted answer, a message, a timer or a local event.
         """
         core = self._core
         core.now = self._header.local(at_s)
@@ -222,14 +228,14 @@ class StepComparer:
         return bool(core.changes or core.outbox or core.started or core.triggered) or branch in COUNTING
 
     def play_lost_message(self, sender: int, message: Message, at_s: float) -> bool:
-        """Handle a message that has no line in the trace. Return true if such a line could be lost unnoticed, because
-        the message changed no block.
+        """Give the reference a message that has no line in the trace. Return true if the loss of its line would be
+        invisible, because the message changed no block.
         """
         return self._play_lost(self._on_message[type(message)], at_s, sender, message)
 
     def play_lost_expiry(self, timer_name: str, at_s: float) -> bool:
-        """Run the handler of a timer whose expiry has no line in the trace. Return true if the timer was due, and if
-        such a line could be lost unnoticed.
+        """Let a timer of the reference expire whose expiry has no line in the trace. Return true if the timer was due,
+        and if the loss of its line would be invisible.
         """
         timer = self._timers[timer_name]
         if timer.deadline is None or timer.deadline > self._header.local(at_s) + self._header.early_s:
@@ -238,8 +244,8 @@ class StepComparer:
         return self._play_lost(self._implementation.on_timer[timer_name], at_s)
 
     def play_lost_local_event(self, at_s: float) -> bool:
-        """Run the handler of the next local event. Return true if there was such an event, and if its line could be
-        lost unnoticed.
+        """Run the handler of the next local event. Return true if such an event waited, and if the loss of its line
+        would be invisible.
         """
         if not self._core.triggered:
             return False
@@ -267,7 +273,7 @@ class StepComparer:
         return is_hidden
 
     def copy(self) -> "StepComparer":
-        """Return an independent copy of this object, without the differences found so far."""
+        """Return an independent copy of this object. The copy does not contain the differences found so far."""
         keep = [self._header, self._parts, self._blocks, self._was_paused, self._state, self._implementation]
         keep.append(self._on_message)
         keep += (*self._implementation.handlers.values(), *self._core.unchanging())
@@ -277,8 +283,8 @@ class StepComparer:
         return deepcopy(self, memo)
 
     def foresee(self, line: int, run: HandlerRun) -> list[StepDeviation]:
-        """Return the differences in triggered handlers that are visible in the next handler run. No handler runs for
-        this.
+        """Return the missing or additional triggered handlers that the next handler run reveals. The method runs no
+        handler.
         """
         foreseeing = self.copy()
         if foreseeing.lost is None:
@@ -297,7 +303,7 @@ class StepComparer:
     # Runs that should have come before
 
     def _triggered(self, line: int, run: HandlerRun, by: str | None) -> None:
-        """Report triggered handlers that did not run, and handlers that ran although no handler triggered them."""
+        """Report triggered handlers that did not run, and handlers that ran without a trigger."""
         self._state = None
         triggered = self._core.triggered
         if self._adopted:
@@ -328,7 +334,7 @@ class StepComparer:
         self._adopted = True
 
     def _not_run(self) -> None:
-        """Report a triggered handler that did not run before the agent's next input."""
+        """Report a handler that was triggered but did not run before the agent's next input."""
         triggered = self._core.triggered
         if triggered and not self._adopted:
             event, by = triggered[0]
@@ -362,7 +368,7 @@ class StepComparer:
     def _callback_is_lost(self, line: int, run: HandlerRun, due: Iterable[Timer]) -> bool:
         """Report timers that the agent stopped or restarted after their expiry without running their handlers.
 
-        The missing handler is the cause of the differences that follow. Return true if such a timer was found.
+        Such a missing handler run causes the differences that follow. Return true if such a timer was found.
         """
         is_lost = False
         for timer in due:
@@ -374,8 +380,8 @@ class StepComparer:
         return is_lost
 
     def _after_a_pause(self, deadline: float) -> str:
-        """Return the end of a sentence that names the handler which paused the phase 3 timer after its start. It is
-        empty without a pause.
+        """Return a phrase with the handler that paused the phase 3 timer after its start, for the end of a sentence.
+        The phrase is empty without a pause.
         """
         line, paused_at = self._paused
         if paused_at < deadline - self._header.settings.phase3_timeout_s:
@@ -393,8 +399,8 @@ class StepComparer:
     # Inputs
 
     def _input(self, line: int, run: HandlerRun, now: float) -> tuple[Handler, tuple[Any, ...]]:
-        """Return the handler for an input that is not a message, with its arguments. Raises NotHandledError if no
-        handler fits.
+        """Return the handler for an input that is not a message, with the handler's arguments. Raises NotHandledError
+        if no handler matches.
         """
         trigger, on_local_event = run.trigger, self._implementation.on_local_event
         handler: Handler
@@ -425,8 +431,8 @@ class StepComparer:
         return handler
 
     def _message(self, run: HandlerRun, trigger: MessageTrigger) -> tuple[Handler, int, Message]:
-        """Return the handler for a message, its sender, and the decoded message. Raises NotHandledError if no handler
-        fits.
+        """Return the handler for a message, the sender, and the decoded message. Raises NotHandledError if no handler
+        matches.
         """
         try:
             sender, sequence, message = decoded(run.input)
@@ -473,7 +479,7 @@ class StepComparer:
         return (event,)
 
     def _boot(self, run: HandlerRun) -> None:
-        """Load the recorded blocks from the agent's disk into the reference before the first handler runs."""
+        """Load the blocks that the agent had on its disk into the reference, before the first handler run."""
         if self._began:
             raise NotHandledError("booted after other steps; a boot must be the first step")
         try:

@@ -29,4 +29,4 @@ def _reference_core(header: CheckedHeader) -> AdoptingCore:
 
 
 REFERENCE = CoreImplementation(_reference_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)
-"""The independent reference, by which agents are judged."""
+"""The reference implementation, with which agents are judged."""

@@ -1,13 +1,13 @@
 """Decide whether damage to one line of a trace explains a difference from the reference.
 
-A file from the field may lack a line, or contain a damaged line that is still readable. The difference then proves no
-mistake of the agent. The module tries three kinds of damage:
+A file from the field may lack a line, or contain a damaged line that is still readable. The difference then does not
+prove a mistake of the agent. The module tries three kinds of damage:
 
 - One character of the line is wrong.
 - The line and the next line are in the wrong order.
-- The line before is missing. It was a handler run that changed no block, so no recorded state shows it.
+- The line before it is missing. The missing handler run changed no block, so no recorded state reveals it.
 
-An explanation counts only if the reference then agrees with the lines that follow.
+An explanation counts only if the reference, after this correction, agrees with the lines that follow.
 """
 
 import base64
@@ -38,7 +38,7 @@ Line = tuple[int, HandlerRun]
 
 
 class OtherRecords(Protocol):
-    """The records of a flight that belong to agents other than the judged agent."""
+    """The records of a flight from all agents other than the judged agent."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
         """Return the recorded datagrams with this sender and this sequence number."""
@@ -48,9 +48,9 @@ class OtherRecords(Protocol):
 
 
 LINES_AFTER = 8
-"""Number of lines after the difference with which the explanation must agree."""
+"""Number of lines after the difference that must agree with an explanation."""
 MAX_LOCAL = 4
-"""Maximum number of handlers that one lost line may trigger in turn."""
+"""Maximum number of handlers that the handler of one lost line may trigger in turn."""
 
 
 def damage_that_explains(
@@ -59,7 +59,7 @@ def damage_that_explains(
     """Return a phrase for the damage to a trace that explains the difference, such as "a line is missing". Return None
     if no damage explains it.
 
-    `before` compares steps and is in the state before the line. It stays unchanged.
+    `before` is the comparison in its state before the line. The function does not change it.
     """
     following = following[:LINES_AFTER]
     if _is_one_character_off(before, deviation, line, following, others):
@@ -135,9 +135,9 @@ def _as_it_may_have_been(
 
 
 def _was_received(before: StepComparer, expected: HandlerRun, run: HandlerRun, others: OtherRecords) -> bool:
-    """Return true if another record contains a sent message of this line that the reference does not send.
+    """Return true if another agent received a message that this line contains and that the reference does not send.
 
-    The line is then not damaged at this message.
+    The line is then correct about this message.
     """
     sent_by_both = [sent.datagram for sent in expected.sent]
     for sent in run.sent:
@@ -157,8 +157,8 @@ def _has_impossible_top(before: StepComparer, deviation: StepDeviation, line: Li
     """Return true if only the top chain hash differs from the expected state, and the next lines agree with the
     expected hash.
 
-    A line whose end was lost can join the end of a later line. Such a line can therefore also be the last line before
-    lost lines.
+    Damage can join the beginning of a line with the end of a later line. Such a line can therefore also be the last one
+    before lost lines.
     """
     number, run = line
     expected = deviation.expected
@@ -184,7 +184,7 @@ def _is_malformed(run: HandlerRun) -> bool:
 
 
 def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
-    """Return the damage to a trace line that explains why a completed block has other events than the logged ones.
+    """Return the damage to a trace line that explains why a completed block has different events than the logged ones.
     Return None if no damage explains it.
     """
     completed = next((block_hash for operation, block_hash in run.changes if operation == "complete"), None)
@@ -206,7 +206,7 @@ def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
 
 
 def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
-    """Yield copies of the reference, each in a state that one lost trace line may have led to."""
+    """Yield copies of the reference. Each one is in a state to which one lost trace line could have led."""
     trial = before.copy()
     for _ in range(MAX_LOCAL):
         if not trial.play_lost_local_event(run.t):
@@ -229,7 +229,7 @@ def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecord
 
 
 def _answers(state: ReferenceState, run: HandlerRun) -> Iterator[Message]:
-    """Yield the possible answers to the query or request that the agent has sent."""
+    """Yield the possible answers to the query or request that the agent has sent last."""
     top = state.chain.top_chain_hash
     if state.voting_timer.active and state.candidate_block is not None:
         named = state.top_chain_hash_at_initiation if state.settings.vote_names_chain else None

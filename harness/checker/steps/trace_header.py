@@ -13,9 +13,9 @@ from ucp.core import Seal
 from ucp.settings import Settings
 
 EARLY_WALL_S = 0.001
-"""Seconds of wall time by which a timer may end early, because an agent reads its clock more than once."""
+"""Seconds of wall time by which a timer may expire early, because an agent reads its clock more than once."""
 ROUNDING_S = 2e-3
-"""Rounding error of times in a trace, which may have milliseconds."""
+"""Rounding error in seconds of times in a trace, which may be rounded to milliseconds."""
 
 _SETTINGS = {setting.name for setting in fields(Settings)}
 
@@ -44,7 +44,9 @@ class CheckedHeader:
     late_s: float
     secured: bool = False
     seal: Seal | None = field(default=None, repr=False, compare=False)
-    """A function that seals event data as the agent did, as far as it is on record. None without sealing."""
+    """A function that returns the encrypted event data as far as the agent recorded it. None if the mission does not
+    encrypt event data.
+    """
 
     def local(self, mission_s: float) -> float:
         """Return the time that the agent's clock shows at this mission second."""
@@ -52,7 +54,9 @@ class CheckedHeader:
 
 
 def checked(header: TraceHeader) -> CheckedHeader:
-    """Return the mission that the trace header describes. Raises ImpossibleHeaderError if its values are invalid."""
+    """Check a trace header. Return the mission that it describes. Raises ImpossibleHeaderError if its values are
+    invalid.
+    """
     try:
         initial_data = base64.b64decode(header.initial_data or "", validate=True)
         settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})
@@ -79,7 +83,7 @@ def checked(header: TraceHeader) -> CheckedHeader:
 
 
 def _unknown_to_reference(settings: Settings) -> list[str]:
-    """Return the settings that the reference does not implement and that differ from their defaults."""
+    """Return those settings that the reference does not implement and that do not have their default value."""
     lacking = _SETTINGS - {setting.name for setting in fields(ReferenceSettings)}
     usual = Settings()
     return sorted(name for name in lacking if getattr(settings, name) != getattr(usual, name))

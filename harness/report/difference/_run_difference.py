@@ -17,11 +17,11 @@ from ucp.trigger import Trigger
 
 @dataclass(frozen=True)
 class ComparedStep:
-    """A handler run in a form in which it can be compared. The mission second `t` and the line number `line` are not
-    compared.
+    """A handler run in the form in which two runs are compared. The mission second `t` and the line number `line` are
+    not compared.
 
-    `changes` holds (operation, block) and `sent` holds (message, block). A block is given by its name, None for no
-    block.
+    `changes` holds (operation, block) and `sent` holds (message, block). A block is represented by its name. None
+    stands for no block.
     """
 
     life: int
@@ -37,7 +37,7 @@ class ComparedStep:
     def of(cls, line: HandlerRunLine, names: Mapping[str, str]) -> "ComparedStep":
         """Return the comparable form of a trace line.
 
-        `names` maps block hashes to names; other blocks get 12 digits of their hash.
+        `names` maps block hashes to names. Other blocks are represented by 12 digits of their hash.
         """
         run = line.parse()
         return cls(
@@ -57,7 +57,7 @@ def name(block_hash: str, names: Mapping[str, str]) -> str:
 
 
 def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str, str]:
-    """Return the names, such as 3.2, of the blocks that the agent completed, by block hash."""
+    """Return block hash -> name, such as 3.2, for the blocks that the agent completed."""
     names: dict[str, str] = {}
     for line in lines:
         if b'"complete"' in line.text:
@@ -71,7 +71,7 @@ def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str
 class KeyDifference:
     """A scenario key with different values in the two runs, such as `network.loss` or `timeline.0.at_s`.
 
-    A missing key has the value None.
+    If a run lacks the key, its value is None.
     """
 
     key: str
@@ -80,8 +80,8 @@ class KeyDifference:
 
 
 def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
-    """Yield a difference for each innermost key whose values differ, in the order of `a`. Two lists of different length
-    give one difference.
+    """Yield a difference for each innermost key whose values differ, in the order of `a`. Two lists with different
+    lengths give one difference for the whole list.
     """
     if isinstance(a, dict) and isinstance(b, dict):
         pairs = [(name, a.get(name), b.get(name)) for name in {**a, **b}]
@@ -97,8 +97,8 @@ def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
 
 @dataclass(frozen=True)
 class FirstDifference:
-    """The first position at which the two traces of an agent differ, with the handler run of each trace. A trace that
-    ended earlier has None.
+    """The first position at which the two traces of an agent differ, with the handler run of each trace. For a trace
+    that ended earlier, the handler run is None.
     """
 
     number: int
@@ -116,7 +116,7 @@ class ChainDifference:
     """The first position (from 1) at which the exported chains of an agent differ, with the name of the block that each
     chain has there.
 
-    A chain that ended before has None. An agent without an export has an empty chain.
+    For a chain that ended earlier, the name is None. An agent without an export has an empty chain.
     """
 
     place: int
@@ -149,8 +149,8 @@ class RunDifference:
 
     @property
     def first(self) -> int | None:
-        """The agent whose first difference is the earliest in mission time. If several are equal, it is the one with
-        the lowest ID. None without differences.
+        """The agent with the earliest first difference in mission time. Of several such agents, it is the one with the
+        lowest ID. None without differences.
         """
         at_s = {
             agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None
@@ -159,7 +159,9 @@ class RunDifference:
 
     @property
     def verdict(self) -> str:
-        """The verdict: `identical`, `same but for times`, or `differ`. Scenario keys do not affect it."""
+        """The verdict: `identical`, `same but for times`, or `differ`. Different scenario keys do not affect the
+        verdict.
+        """
         if any(difference.run or difference.chain for difference in self.agents.values()):
             return "differ"
         return "identical" if self.exact else "same but for times"
@@ -244,8 +246,8 @@ def _check_comparable(a: _ComparedRun, b: _ComparedRun) -> None:
 
 
 def _compare_traces(a: _ComparedRun, b: _ComparedRun, agent_id: int) -> tuple[int, bool, FirstDifference | None]:
-    """Return the number of equal handler runs, whether the traces are equal to the last byte, and the first
-    difference.
+    """Compare the traces of an agent. Return the number of equal handler runs, whether the traces are equal to the last
+    byte, and the first difference.
     """
     equal, exact = 0, True
     for line_a, line_b in zip_longest(a.archive.trace_lines(agent_id), b.archive.trace_lines(agent_id)):

@@ -1,7 +1,7 @@
 """Read all data of a run that can be exported: its files, its clock, and all recorded values.
 
-The run may have been interrupted, some files may be damaged, or `import` may have made it from field logs. The export
-contains everything that can be read. `problems` holds a sentence for each thing that cannot.
+The run may have been interrupted, some of its files may be damaged, or the command `import` may have created it from
+field logs. The export contains everything that is readable. `problems` contains a sentence for each file that is not.
 """
 
 from collections.abc import Iterable, Iterator
@@ -58,11 +58,11 @@ if TYPE_CHECKING:
 
 FAULTS, OPERATOR, VERDICTS = "faults", "operator", "verdicts"
 MAX_LINKED = 100
-"""Maximum number of vehicles whose links are exported one by one. 100 vehicles have 9900 links."""
+"""Maximum number of vehicles for which the loss of every link is exported. 100 vehicles have 9900 links."""
 
 
 class ExportedRun:
-    """A run to export. If no file contains positions, they are taken from logged events. `depot` decrypts the events.
+    """A run to export. If no file contains positions, the positions come from logged events, which `depot` decrypts.
 
     Raises RunDirectoryError if the directory holds no run, and ExportError if it holds nothing to export.
     """
@@ -94,11 +94,11 @@ class ExportedRun:
 
     @cached_property
     def block_names(self) -> dict[str, str]:
-        """The names of blocks by hash, such as "4.11"."""
+        """Block hash -> name of the block, such as "4.11"."""
         return name_blocks(self.archive.exports.by_agent)
 
     def block(self, block_hash: str) -> str:
-        """Return the name of a block. If no export contains the block, return the first 12 digits of its hash."""
+        """Return the name of a block. If no export contains the block, use the first 12 digits of its hash."""
         return self.block_names.get(block_hash, block_hash[:12])
 
     @cached_property
@@ -129,9 +129,7 @@ class ExportedRun:
 
     @property
     def problems(self) -> list[str]:
-        """A sentence for each damaged or missing file. The list is complete only after the last element of `samples`
-        was read.
-        """
+        """A sentence for each damaged or missing file. The list is complete only after all `samples` were read."""
         archive = self.archive
         sentences = [*archive.problems, *archive.gaps, *self.tracks.problems, *self.network.problems, *self._problems]
         return list(dict.fromkeys(map(archive.within, sentences)))
@@ -149,7 +147,9 @@ class ExportedRun:
         return list(log_files(self.directory))
 
     def samples(self) -> Iterator[Sample]:
-        """Yield all recorded values in order of time. Telemetry and log files are read while the caller iterates."""
+        """Yield all recorded values in order of time. The method reads telemetry and log files while the caller
+        iterates.
+        """
         streams: list[Iterable[Sample]] = [
             self.positions(),
             self._losses(),
@@ -167,7 +167,7 @@ class ExportedRun:
         return merge(*streams, key=attrgetter("at_ns"))
 
     def positions(self) -> Iterator[FieldPosition]:
-        """Yield the recorded positions of the vehicles. If there are none, yield the positions that agents logged as
+        """Yield the recorded positions of the vehicles. Without recorded positions, yield those that agents logged as
         events.
         """
         positions = self._by_tracks() if self.tracks.by_vehicle else self._by_events()
@@ -186,7 +186,7 @@ class ExportedRun:
                 yield FieldPosition(self.time.at(fix.at_s), vehicle, metres, place)
 
     def _by_events(self) -> Iterator[FieldPosition]:
-        """Yield the positions in logged events. The first position of all becomes the centre of the field."""
+        """Yield the positions in logged events. The first of all these positions is used as the centre of the field."""
         if not self.archive.exports.by_agent:
             return
         untimed, field = 0, None

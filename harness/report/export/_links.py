@@ -1,7 +1,7 @@
 """Draw lines for the radio links between moving vehicles.
 
-Lines are drawn again after vehicles have moved, at most once per mission second. The number of links grows with the
-square of the number of vehicles, so lines of large swarms are drawn less often.
+The lines are updated after vehicles have moved, at most once per mission second. The number of links grows with the
+square of the number of vehicles, so the lines of large swarms are updated less often.
 """
 
 from itertools import combinations
@@ -11,7 +11,7 @@ from harness.archive.connectivity import Link
 from harness.report.export._samples import FieldPosition, Metres
 
 FIELD = "field"
-"""The frame of the field: x is east, y north and z up, in metres from its centre."""
+"""Name of the coordinate frame of the field: x is east, y north and z up, in metres from the centre of the field."""
 PAIRS_A_SECOND = 100
 
 
@@ -21,7 +21,9 @@ def vehicle_frame(vehicle: int) -> str:
 
 
 class LinkLine(NamedTuple):
-    """The link between two vehicles. `loss` is the larger loss rate of the two directions, and is below 1."""
+    """A line for the link between two vehicles. `loss` is the larger loss rate of the two directions, and is below
+    1.
+    """
 
     low: Metres
     high: Metres
@@ -36,7 +38,7 @@ class LinkLine(NamedTuple):
 
 
 class CurrentLinks:
-    """The present positions of the vehicles, and the present loss rates of the links between them."""
+    """The current positions of the vehicles, and the current loss rates of the links between them."""
 
     def __init__(self) -> None:
         self.losses: dict[Link, float] = {}
@@ -45,10 +47,11 @@ class CurrentLinks:
         self._moved_ns = -1
 
     def move(self, position: FieldPosition) -> list[LinkLine] | None:
-        """Store a new position. If it is time for a new picture of the previous positions, return the lines of this
-        picture. Return None otherwise.
+        """Store a new position. If an update of the lines is due, return the lines for the previous positions. Return
+        None otherwise.
 
-        All movements of one instant belong together, so the lines are complete when the first later movement arrives.
+        Vehicles move at the same times. The lines for one time are therefore complete when the first later position
+        arrives.
         """
         at_ns = position.at_ns
         due = at_ns > self._moved_ns and self._are_due(at_ns)

@@ -1,8 +1,8 @@
-"""Read the log files of a run's programs. The time of each line is the time with which the line begins.
+"""Read the log files of a run's programs. Each line begins with its time.
 
-Agents may use any log format. A line without a time gets the time of the previous line, and a first line without a time
-gets the start of the mission. No log states its time zone. The reader assumes the zone in which the first line is
-nearest to the start of the mission.
+Agents may use any log format. A line without a time gets the time of the previous line. If the first line has no time,
+it gets the start of the mission. Log files do not name their time zone. The reader assumes the zone in which the first
+line is nearest to the start of the mission.
 """
 
 import math
@@ -26,8 +26,8 @@ _BAD = re.compile(r"\bwarn(ing)?\b", re.IGNORECASE)
 
 
 def log_files(directory: Path) -> Iterator[tuple[str, Path]]:
-    """Yield the name and path of each log file. The network, the rogue node, the agents and the vehicles write log
-    files.
+    """Yield the name and path of each log file of the run. Log files exist for the network, the rogue node, the agents
+    and the vehicles.
     """
     files = chain(directory.glob("*.log"), directory.glob("agents/**/*.log"), directory.glob("vehicles/*/output.log"))
     for path in sorted(islice(files, MAX_FILES)):
@@ -57,8 +57,8 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
 
 
 def _zone_s(ahead_s: float) -> float:
-    """Return the time zone of a log in seconds, from the difference between the first line of the log and the start of
-    the mission.
+    """Return the time zone of a log as an offset in seconds. It is computed from the difference between the first line
+    of the log and the start of the mission.
 
     Return infinity if no zone matches, as in virtual time.
     """
@@ -67,8 +67,8 @@ def _zone_s(ahead_s: float) -> float:
 
 
 def _seconds(timed: re.Match[str]) -> float | None:
-    """Return the time in seconds since the Unix epoch. The text is read as UTC, whatever its zone is. Return None if it
-    is not a valid time.
+    """Parse a time, and return seconds since the Unix epoch. The text is interpreted as UTC. Return None if it is not a
+    valid time.
     """
     try:
         whole = datetime.fromisoformat(timed[1]).replace(tzinfo=UTC).timestamp()

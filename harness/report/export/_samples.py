@@ -1,7 +1,7 @@
-"""Define the recorded values of a run. Each has a time in nanoseconds since the Unix epoch.
+"""Define the types of the recorded values of a run. Each value has a time in nanoseconds since the Unix epoch.
 
 Mission second 0 is the epoch that the agents received: wall time, or 0 in virtual time. With a speedup, mission time
-runs faster than the wall clock, like the timestamps of blocks.
+runs faster than wall time. The timestamps of blocks do the same.
 """
 
 from collections import Counter
@@ -21,7 +21,7 @@ Level = Literal["info", "warning", "error"]
 
 
 Metres = tuple[float, float, float]
-"""East, north and up."""
+"""A position in metres: east, north and up."""
 
 
 class EarthPosition(NamedTuple):
@@ -109,7 +109,7 @@ class ReconcileSample:
 
 @dataclass(frozen=True, slots=True)
 class ReplicationSample:
-    """The numbers of copies of blocks from one change to the next."""
+    """The numbers of copies of blocks during an interval in which they did not change."""
 
     at_ns: int
     replication: ReplicationFigures
@@ -126,9 +126,7 @@ class TelemetrySample:
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """A line of a log, a fault, a network change or a verdict. `source` is the name of the file or part that it comes
-    from.
-    """
+    """A line of a log file, a fault, a network change or a verdict. `source` names the file or the part of the run."""
 
     at_ns: int
     level: Level
@@ -152,7 +150,9 @@ Sample = (
 
 
 MAX_EPOCH_S = 2**31 - 1 - round(LATEST_S)
-"""Latest start of a mission. A later mission could exceed the last time of ROS, in 2038."""
+"""Latest start of a mission. The times of a later mission could exceed the last time that ROS can represent, in
+2038.
+"""
 MAX_SPEEDUP = 1000.0
 _NS = 1_000_000_000
 
@@ -161,7 +161,7 @@ _NS = 1_000_000_000
 class MissionTime:
     """The clock of the mission, which converts between mission seconds and time since the Unix epoch.
 
-    `epoch_ns` is mission second 0. `by_agent` holds the epochs of agents with other clocks.
+    `epoch_ns` is the time of mission second 0. `by_agent` holds this time for agents whose clocks differ.
     """
 
     epoch_ns: int
@@ -180,23 +180,25 @@ class MissionTime:
         return (at_ns - self.epoch_ns) / _NS
 
     def of_wall(self, wall_s: float) -> int | None:
-        """Convert a time of the wall clock (Unix seconds) to a time on this clock, which runs faster by `speedup`.
-        Return None if it is far outside the mission.
+        """Convert wall time (Unix seconds) to a time on this clock, which runs `speedup` times as fast. Return None if
+        it is far outside the mission.
         """
         mission_s = (wall_s - self.epoch_ns / _NS) * self.speedup
         return self.at(mission_s) if abs(mission_s) <= LATEST_S else None
 
     def of_timestamp(self, timestamp_us: int) -> int | None:
-        """Return the time of a timestamp in a block or an event. Return None if it is far outside the mission."""
+        """Convert the timestamp of a block or an event to a time on this clock. Return None if it is far outside the
+        mission.
+        """
         at_ns = timestamp_us * 1000
         return at_ns if abs(self.mission_s(at_ns)) <= LATEST_S else None
 
 
 def mission_time(headers: Mapping[int, TraceHeader], record: RunRecord, problems: list[str]) -> MissionTime:
-    """Return the clock of the mission. It comes from the headers of the traces, or from run.json if there are no
-    headers.
+    """Return the clock of the mission. It comes from the headers of the traces, or from run.json if no trace has a
+    header.
 
-    Add a sentence for each invalid clock.
+    Add a sentence to `problems` for each invalid clock.
     """
     epochs = {}
     for agent, header in headers.items():

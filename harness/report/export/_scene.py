@@ -1,6 +1,6 @@
 """Draw the swarm for Foxglove's 3D view: a shape for each vehicle, and a line for each link coloured by its loss rate.
 
-Each vehicle is drawn once, in its own moving frame. Links are drawn again after movements.
+Each vehicle is drawn once, in a coordinate frame that moves with it. Links are drawn again after movements.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,7 +22,7 @@ _TEXT = Color(r=1.0, g=1.0, b=1.0, a=1.0)
 
 
 def colours_of(vehicles: Iterable[int]) -> dict[int, Any]:
-    """Return the colour of each vehicle. Reports use the same colours."""
+    """Return the colour of each vehicle. They are the same as in reports."""
     return {vehicle: _colour(ink.fill) for vehicle, ink in inks(vehicles).items()}
 
 
@@ -32,7 +32,7 @@ def _colour(fill: str) -> Any:
 
 
 class FieldScene:
-    """The 3D view over time. `links` contains the current loss rates."""
+    """The 3D view, which changes over time. `links` contains the current loss rates."""
 
     def __init__(self, record: RunRecord, colours: Mapping[int, Any]) -> None:
         self.links = CurrentLinks()
@@ -40,7 +40,7 @@ class FieldScene:
         self._drawn: set[int] = set()
 
     def move(self, position: FieldPosition) -> Iterator[Any]:
-        """Yield the updates of the view (SceneUpdate messages) that a new position makes necessary."""
+        """Yield the updates of the 3D view (SceneUpdate messages) that follow from a new position."""
         if (lines := self.links.move(position)) is not None:
             yield _drawn_links(position.at_ns, lines)
         if position.vehicle not in self._drawn:

@@ -16,7 +16,7 @@ _LIFE = re.compile(r"([1-9]\d{0,4})(?:-([1-9]\d{0,3}))?")
 
 
 def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
-    """Return the vehicle and the path of each telemetry log. A restarted vehicle has several."""
+    """Return the vehicle and the path of each telemetry log. A restarted vehicle has several logs."""
     logs = []
     for path in islice((directory / "vehicles").glob(f"*/{NAME}"), MAX_FILES):
         if named := _LIFE.fullmatch(path.parent.name):

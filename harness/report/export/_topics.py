@@ -1,6 +1,7 @@
 """Convert recorded values to JSON objects for plots. Each kind of value has a topic with a JSON schema.
 
-An unknown value has no key, because plotting tools do not support null. Each object also contains the mission second.
+If a value is unknown, its key is omitted, because plotting tools do not support null. Each object also contains the
+mission second.
 """
 
 import math
@@ -30,7 +31,7 @@ Schema = dict[str, Any]
 _NUMBER, _WHOLE, _YES_OR_NO, _TEXT = ({"type": name} for name in ("number", "integer", "boolean", "string"))
 _AGENTS = {"type": "array", "items": _WHOLE}
 _LARGEST = 2**53
-"""Largest whole number that a float represents exactly. Some tools store all numbers as floats."""
+"""Largest integer up to which a float represents every integer exactly. Some tools store all numbers as floats."""
 
 
 def schema(**properties: Schema) -> Schema:
@@ -196,7 +197,7 @@ def _link(link: Link) -> str:
 
 
 def _whole(number: Any) -> int | None:
-    """Return the number if it is an integer that all tools can show. Return None otherwise."""
+    """Return the number if it is an integer that all tools can show. Return None for any other number."""
     return number if isinstance(number, int) and abs(number) <= _LARGEST else None
 
 

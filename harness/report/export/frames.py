@@ -1,7 +1,7 @@
 """Return tables of a run for notebooks: its handler runs and its blocks, as polars DataFrames.
 
-Each batch of records becomes columns before the next is read, so memory holds the finished columns and one batch.
-`DataFrame.write_parquet` keeps a large table in a file.
+Each batch of records is converted to columns before the next batch is read. Memory therefore holds only the finished
+columns and one batch. `DataFrame.write_parquet` keeps a large table in a file.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -13,14 +13,14 @@ from harness.present.polars import pl
 from ucp.trigger import MessageTrigger, Trigger
 
 BATCH = 20_000
-"""Maximum number of records in memory at the same time."""
+"""Maximum number of records that are in memory at the same time, before they are converted to columns."""
 
 Record = TypeVar("Record")
 Columns = Mapping[str, tuple[Any, Callable[[Record], Any]]]
-"""Name of a column -> its type, and a function that returns its value for a record."""
+"""Name of a column -> the type of the column, and a function that returns the value for a record."""
 
 _NAME = pl.Categorical
-"""Text with few distinct values."""
+"""Column type for text with few distinct values."""
 
 _HANDLER_RUN: Columns[RecordedRun] = {
     "agent": (pl.Int64, lambda each: each.agent_id),

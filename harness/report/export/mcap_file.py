@@ -1,8 +1,8 @@
 """Write a run as an MCAP file, which Foxglove, Lichtblick and PlotJuggler open without a plug-in.
 
-Where Foxglove has its own schema, the file uses it in protobuf: LocationFix (for maps) and FrameTransform (for the 3D
-view) for positions, SceneUpdate for links and vehicles, Log for lines of logs. Everything else becomes the JSON topics
-of `_topics`. run.json and the chain exports are attached unchanged.
+The file uses the protobuf schemas of Foxglove if one exists: LocationFix (for maps) and FrameTransform (for the 3D
+view) for positions, SceneUpdate for links and vehicles, and Log for lines of logs. All other values become the JSON
+topics of `_topics`. run.json and the chain exports are attached unchanged.
 """
 
 import contextlib
@@ -31,12 +31,12 @@ with extra("export", "writing MCAP"):
 
 _LEVELS = {"info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _SEVERITIES = (Log.FATAL, Log.FATAL, Log.FATAL, Log.ERROR, Log.WARNING, Log.INFO, Log.INFO, Log.DEBUG)
-"""Log levels of MAV_SEVERITY, from emergency to debug."""
+"""Log level of each MAV_SEVERITY, from emergency to debug."""
 
 
 def write_mcap(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    """Write a new MCAP file, and return the number of messages in it. `progress` is called from time to time with the
-    present mission second.
+    """Write a new MCAP file, and return the number of messages in it. `progress` is called repeatedly with the current
+    mission second.
 
     Raises OSError.
     """
@@ -74,7 +74,7 @@ def _write(recording: ExportedRun, writer: "_McapWriter", progress: Callable[[fl
 
 
 class _McapWriter:
-    """A writer of an MCAP file. It adds each channel to the file together with the channel's first message."""
+    """A writer of an MCAP file. It declares a channel in the file before the first message of the channel."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._writer = Writer(file)

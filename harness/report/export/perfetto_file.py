@@ -4,8 +4,8 @@ Each agent has a group of tracks: votes, reconciles with their phases, handler r
 arrow leads from the handler run that sent a message to each handler run that the message triggered. The swarm has
 counters of losses and chains, and a track of faults and log lines.
 
-The format is Perfetto's own protobuf. In Chrome's JSON format, arrows need slices with a duration, but a handler run is
-an instant.
+The format is Perfetto's own protobuf. Chrome's JSON format is not suitable. Its arrows need slices with a duration, but
+a handler run has no duration.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -41,18 +41,19 @@ with extra("export", "writing a Perfetto trace"):
 
 SWARM = "swarm"
 MAX_TEXT = 500
-"""Maximum length of the shown text of a log line, in characters."""
+"""Maximum number of characters of a log line that the trace shows."""
 _LARGEST = 2**63 - 1
 _SEQUENCE = 1
 
 Event = tuple[int, int, Any]
-"""Time, order at equal times, and packet. The order is 1 for effects of messages, so that sending precedes receiving.
+"""Time, order among packets of the same time, and packet. The order is 1 for effects of messages, so that sending
+precedes receiving.
 """
 
 
 def write_perfetto(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    """Write a new trace file, and return the number of events in it. `progress` is called from time to time with the
-    present mission second.
+    """Write a new trace file, and return the number of events in it. `progress` is called repeatedly with the current
+    mission second.
 
     Raises OSError.
     """
@@ -79,14 +80,16 @@ def _write(recording: ExportedRun, file: IO[bytes], progress: Callable[[float], 
 
 
 class _MessageArrows:
-    """The numbers of all arrows. Each message has one arrow for each of its receivers."""
+    """The numbers of the arrows. A message has one arrow for each of its receivers."""
 
     def __init__(self, messages: Iterable[BroadcastMessage]) -> None:
         numbers = count(1)
         self._from: dict[tuple[int, int, float], list[int]] = {}
         self._to: dict[tuple[int, int, int, float], int] = {}
         self.backwards = 0
-        """Number of receipts that precede their sending according to the agents' clocks. They have no arrow."""
+        """Number of receipts that come before their sending according to the clocks of the agents. They get no
+        arrow.
+        """
         for message in messages:
             for receiver, at_s in message.receipts:
                 if at_s < message.at_s:
@@ -127,14 +130,14 @@ class _PerfettoTrace:
             self._track(group, rank=rank)
 
     def clocks(self) -> Any:
-        """Return a packet that declares that all times are wall time."""
+        """Return the packet that declares the clock: all times are wall time."""
         packet = TracePacket(trusted_packet_sequence_id=_SEQUENCE)
         for clock in (BUILTIN_CLOCK_BOOTTIME, BUILTIN_CLOCK_REALTIME):
             packet.clock_snapshot.clocks.add(clock_id=clock, timestamp=self._recording.time.epoch_ns)
         return packet
 
     def new_tracks(self) -> Iterator[Any]:
-        """Yield descriptions of the tracks that are used for the first time."""
+        """Yield descriptions of tracks that are used for the first time."""
         new, self._new = self._new, []
         yield from new
 
@@ -213,7 +216,7 @@ class _PerfettoTrace:
         return at_ns, 0, self._packet(at_ns, _agent(agent), track, TrackEvent.TYPE_SLICE_END)
 
     def _count(self, at_ns: int, group: str, name: str, value: float) -> Iterator[Event]:
-        """Yield a counter event if the value of the counter differs from the value in the last event of the counter."""
+        """Yield a counter event if the value of the counter has changed since its last event."""
         if self._counters.get((group, name)) != value and abs(value) <= _LARGEST:
             self._counters[group, name] = value
             packet = self._packet(at_ns, group, name, TrackEvent.TYPE_COUNTER)

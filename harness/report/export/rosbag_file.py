@@ -34,20 +34,20 @@ with extra("export", "writing a ROS bag"):
     from rosbags.typesys import Stores, get_typestore
 
 Timed = tuple[int, str, Any]
-"""Time, topic and message."""
+"""The time, topic and content of a message."""
 
 METADATA_VERSION: Literal[8] = 8
 """Version of the bag format. ROS 2 Humble and later versions read it."""
 LEVELS = {"info": 20, "warning": 30, "error": 40}
-"""Levels of rcl_interfaces/Log: INFO, WARN, ERROR."""
+"""Levels of rcl_interfaces/Log by name: INFO, WARN and ERROR."""
 _LARGEST = 2**32 - 1
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _NS = 1_000_000_000
 
 
 def write_rosbag(recording: ExportedRun, path: Path, progress: Callable[[float], None]) -> int:
-    """Write a new ROS 2 bag, and return the number of messages in it. `progress` is called from time to time with the
-    present mission second.
+    """Write a new ROS 2 bag, and return the number of messages in it. `progress` is called repeatedly with the current
+    mission second.
 
     Raises OSError, and MachineError if the database cannot be written.
     """
@@ -74,7 +74,7 @@ def _write(recording: ExportedRun, path: Path, progress: Callable[[float], None]
 
 
 class _RosMessages:
-    """The recorded values of a run as ROS messages."""
+    """A converter from the recorded values of a run to ROS messages."""
 
     def __init__(self, recording: ExportedRun) -> None:
         self._recording = recording
@@ -82,7 +82,7 @@ class _RosMessages:
         self._counts: dict[str, float] = {}
 
     def all(self) -> Iterator[Timed]:
-        """Yield all messages in time order."""
+        """Yield all messages in order of time."""
         traces = [self._trace(agent) for agent in self._recording.archive.traces]
         yield from merge(self._of_samples(), *traces, key=itemgetter(0))
         end_ns = self._recording.time.at(self._recording.end_s)
@@ -134,7 +134,7 @@ class _RosMessages:
                 yield f"/vehicle_{vehicle}/mavlink", _bytes(bytes(message.get_msgbuf()))
 
     def _count(self, topic: str, kind: str, value: float) -> Iterator[tuple[str, Any]]:
-        """Yield a message with the value if the value differs from the last one on this topic."""
+        """Yield a message with the value if it differs from the last value on this topic."""
         if self._counts.get(topic) != value:
             self._counts[topic] = value
             yield topic, _message(f"std_msgs/msg/{kind}", data=value)

@@ -1,8 +1,8 @@
 """Serve the live page of a run in a separate process: `python -m harness.report.live DIRECTORY PORT`.
 
-A separate process takes no time from the run and cannot break it. `harness.report.live.server_process` describes the
-messages between the two processes. After the run the server stays while a page is open. It ends at once if the process
-of the run ends.
+A separate process does not delay the run, and a failure of it does not affect the run.
+`harness.report.live.server_process` describes the messages between the two processes. After the run the server
+continues while a page is open. It ends at once if the process of the run ends.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ from harness.report.live.feed_to_log import copy_live_run
 from harness.report.live.server import UPDATE_S, LivePageServer
 
 MAX_UNWATCHED_S = 3.0
-"""Seconds without a page after which the server ends. A page that is reloaded reconnects within this time."""
+"""Seconds after which the server ends if no page is open. A page that is reloaded reconnects within this time."""
 
 
 async def main(directory: Path, port: int) -> None:
@@ -48,13 +48,15 @@ def _print(line: str) -> None:
 
 
 def _send_request(page: int, request: Any) -> None:
-    """Send the request of a browser page to the process of the run."""
+    """Send the request of a browser page to the process that plays the run."""
     if isinstance(request, dict):
         _print(json.dumps([page, request.get("number"), request]))
 
 
 async def _read_until_over(reader: asyncio.StreamReader, server: LivePageServer, log: ChangeLog) -> bool:
-    """Read messages from the process of the run until the run is over. Return false if that process ended early."""
+    """Read messages from the process that plays the run, until the run is over. Return false if the process ended
+    early.
+    """
     while line := await reader.readline():
         kind, *rest = json.loads(line)
         if kind == "over":

@@ -1,8 +1,8 @@
 """Follow the trace of one agent line by line, and convert it to changes for the live page.
 
 A change is a list that becomes a line of JSON: its kind, its mission second, and further values.
-`harness.report.live.feed` lists all kinds. Most lines of a trace only receive a message. A regular expression
-recognizes these lines, so that they need no JSON parser.
+`harness.report.live.feed` lists all kinds. Most lines of a trace only record that a message was received. A regular
+expression recognizes these lines, so the JSON parser is not needed for them.
 """
 
 import re
@@ -26,7 +26,7 @@ from ucp.trigger import MessageTrigger
 Change = list[Any]
 
 KEY_LENGTH = 16
-"""Number of digits of a block hash that identify the block on the page."""
+"""Number of hexadecimal digits of a block hash that identify a block on the page."""
 
 _RECEIPT_LINE = re.compile(
     rb'\{"t":([\d.]+),"handler":"receive_\w+","algorithm":\d+,'
@@ -37,7 +37,7 @@ _NO_CHANGES = b'"changes":[],"sent":[]'
 
 
 class MessageReceipt(NamedTuple):
-    """The reception of the message with the sequence number `seq` of the agent `sender`."""
+    """A change: the message with sequence number `seq` of the agent `sender` was received."""
 
     t: float
     sender: int
@@ -45,7 +45,7 @@ class MessageReceipt(NamedTuple):
 
 
 class SentMessage(NamedTuple):
-    """The broadcast of the message with the sequence number `seq`. `block` identifies the block that the message
+    """A change: the message with sequence number `seq` was broadcast. `block` identifies the block that the message
     concerns, if any.
     """
 
@@ -68,12 +68,14 @@ class AgentActions:
         self.at_s = 0.0
         """Mission second of the last entry that was read."""
         self.problem: str | None = None
-        """The reason why the rest of the trace cannot be read, or None."""
+        """The reason why the rest of the trace cannot be read. None without a problem."""
         self.has_messages_without_effect = False
-        """True if the trace contains a message without effect. Traces of virtual time omit these by default."""
+        """True if the trace records a message without effect. By default, traces of virtual time omit these
+        messages.
+        """
         self._trace = AgentTrace(agents, agent_id)
         self._ahead: MessageReceipt | HandlerRun | DroppedDatagram | None = None
-        """An entry that was read, but is later than the requested mission second."""
+        """An entry that was read but lies after the requested mission second."""
         self._has_started = False
         self._held = HeldBlocks()
         self._completed: dict[str, int] = {}
@@ -82,8 +84,8 @@ class AgentActions:
         self._incarnation = HistoryReader(agent_id)
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Read the trace up to mission second `until_s`, but at most `at_most` lines. Return true if entries up to
-        `until_s` remain unread.
+        """Read the trace up to mission second `until_s`, but at most `at_most` lines. Return true if there are further
+        entries up to `until_s`.
         """
         for _ in range(at_most):
             entry = self._ahead or self._next()
@@ -104,14 +106,16 @@ class AgentActions:
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the entry that was read in advance. None if there is no such entry."""
+        """The mission second of the next entry, which was already read but not processed. None without such an
+        entry.
+        """
         return None if self._ahead is None else self._ahead.t
 
     def close(self) -> None:
         self._trace.close()
 
     def _next(self) -> MessageReceipt | HandlerRun | DroppedDatagram | None:
-        """Return the next entry that has a valid time. Return None if there is no further entry yet."""
+        """Return the next entry that has a valid time. Return None if the trace has no further entry yet."""
         while self.problem is None:
             line = self._trace.next()
             if line is None:
@@ -137,7 +141,7 @@ class AgentActions:
         return bool(self._held.not_in_chain) and b'"idle":true' in line
 
     def _begin(self) -> None:
-        """Reset the state that was computed from the trace, because the agent was restarted."""
+        """Forget the state that was computed from the trace, because the agent was restarted."""
         if self._has_started:
             self.changes.append(["z", self.at_s, self.agent_id])
         self._has_started, self._held, self._idle_too_early = True, HeldBlocks(), False
@@ -190,7 +194,7 @@ class AgentActions:
         self.changes.append(["s", t, self.agent_id, activity, detail])
 
     def _report_violations(self, run: HandlerRun) -> None:
-        """Report a violation of characteristic 2 or 3 when it is first found."""
+        """Report a violation of characteristic 2 or 3 when it first occurs."""
         for operation, block in run.changes:
             if operation.endswith("+") and self._held.copies[block] > 1 and block not in self._duplicates:
                 self._duplicates.add(block)

@@ -1,8 +1,8 @@
 """Follow a growing trace file line by line, including all restarts of its agent.
 
 An agent that is a process writes the trace of each incarnation into its own directory (`7.trace.jsonl`, then
-`7-2/7.trace.jsonl`). At the end of the run, all incarnations are joined in the first file. In virtual time, one file
-holds all incarnations.
+`7-2/7.trace.jsonl`). At the end of the run, the first file gets the traces of all incarnations. In virtual time, a
+single file contains all incarnations.
 """
 
 from collections import deque
@@ -20,7 +20,7 @@ _CHUNK_BYTES = 256 * 1024
 class GrowingFile:
     """The complete lines of a file that still grows. The file may be created after this object.
 
-    `trouble` is the reason why no more lines can be read, or None.
+    `trouble` is the reason why no further lines can be read, or None.
     """
 
     def __init__(self, path: Path) -> None:

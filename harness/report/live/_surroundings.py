@@ -22,7 +22,7 @@ MAX_DETAIL = 300
 
 class _TimedNetworkLine(NetworkLine):
     detail: Any = ""
-    """A description for people."""
+    """A description of the change for human readers."""
     by_hand: bool = False
 
 
@@ -32,7 +32,7 @@ TimedLine = TypeVar("TimedLine", _TimedNetworkLine, TrackLine)
 class _TimedFile(Generic[TimedLine]):
     """A growing file in which each entry has a time.
 
-    `model` validates each line, and `play` processes it at its mission second.
+    `model` validates each line. `play` processes the line when the caller reads up to its mission second.
     """
 
     def __init__(self, path: Path, model: type[TimedLine], play: Callable[[TimedLine], None]) -> None:
@@ -40,14 +40,14 @@ class _TimedFile(Generic[TimedLine]):
         self._model: type[TimedLine] = model
         self._play: Callable[[TimedLine], None] = play
         self.ahead: TimedLine | None = None
-        """An entry that was read, but is later than the requested mission second."""
+        """An entry that was read but lies after the requested mission second."""
         self.at_s = 0.0
-        """Mission second of the last entry that was played."""
+        """Mission second of the last entry that was processed."""
         self.problems: dict[str, None] = {}
 
     def read(self, until_s: float, at_most: int) -> bool:
-        """Read the file up to mission second `until_s`, but at most `at_most` lines. Return true if entries up to
-        `until_s` remain unread.
+        """Read the file up to mission second `until_s`, but at most `at_most` lines. Return true if there are further
+        entries up to `until_s`.
         """
         name = self._file.path.name
         for _ in range(at_most):
@@ -77,8 +77,8 @@ class _TimedFile(Generic[TimedLine]):
 
 
 class NetworkAndVehicles:
-    """The network and the vehicles of a run, as far as their files were read. Callers read the list `changes` and empty
-    it.
+    """The network and the vehicles of a run, according to the parts of the files read so far. Callers read the list
+    `changes` and empty it.
     """
 
     def __init__(self, directory: Path, vehicles: Collection[int]) -> None:
@@ -93,7 +93,7 @@ class NetworkAndVehicles:
     def read(self, until_s: float, at_most: int) -> bool:
         """Read the growing files up to mission second `until_s`, but at most `at_most` lines of each file.
 
-        Return true if entries up to `until_s` remain.
+        Return true if there are further entries up to `until_s`.
         """
         more = self._conditions.read(until_s, at_most)
         return self._tracks.read(until_s, at_most) or more
@@ -105,7 +105,9 @@ class NetworkAndVehicles:
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the earliest entry that was read in advance. None if there is no such entry."""
+        """The mission second of the next entry, which was already read but not processed. None without such an
+        entry.
+        """
         ahead = (self._conditions.ahead, self._tracks.ahead)
         return min((line.at_s for line in ahead if line is not None), default=None)
 
@@ -149,7 +151,9 @@ class NetworkAndVehicles:
 
 
 def _state_after(fault: type[Fault]) -> str:
-    """Return the state of an agent after a fault in one word. Return "" if the fault does not change the state."""
+    """Return the state of an agent after a fault in one word. Return an empty text if the fault does not change the
+    state.
+    """
     states = {
         "gone": fault.removes_vehicle,
         "down": fault.ends_incarnation,

@@ -14,7 +14,7 @@ from harness.report.live._agent_course import Change
 MAX_BYTES = 512 * 1024 * 1024
 CHUNK_BYTES = 256 * 1024
 FAR_BEHIND_BYTES = 4 * 1024 * 1024
-"""A live reader that is further behind skips messages and positions to catch up."""
+"""Number of bytes. A live reader that is further behind skips messages and positions to catch up."""
 _LEFT_OUT = (b'["m"', b'["p"', b'["t"', b'["d"')
 
 _encode = partial(json.dumps, separators=(",", ":"), check_circular=False)
@@ -42,10 +42,9 @@ class ChangeLog:
         self.size += len(lines)
 
     def read(self, start: int, *, may_skip: bool = False) -> tuple[int, str]:
-        """Return the complete lines that follow the position `start`, and the position after these lines. The position
-        is the first value.
+        """Return (position after the lines, lines): the complete lines that follow the position `start`.
 
-        With `may_skip`, a reader that is far behind gets no messages and positions.
+        If `may_skip` is true and the reader is far behind, messages and positions are omitted.
         """
         skips = may_skip and self.size - start > FAR_BEHIND_BYTES
         data = self._pread(start, FAR_BEHIND_BYTES if skips else CHUNK_BYTES)

@@ -47,17 +47,20 @@ from harness.scenario.verdict_names import kind_of
 MAX_VEHICLES = 200
 """Maximum number of vehicles whose links the page can draw."""
 LINES_AT_ONCE = 500
-"""Maximum number of lines that are read from one file before the next file."""
+"""Maximum number of lines that are read from one file before the reader continues with the next file."""
 POLLS_UNTIL_REPORTED = 2
-"""Number of polls between the first sight of a message and its change. By then most receivers have recorded it. A
-receiver on a busy machine records it later, which gives a change `h`."""
+"""Number of polls between the first sight of a message and its change on the page. By then most receivers have recorded
+the message. If a receiver on a busy machine records it later, this causes a change `h`.
+"""
 MAX_KEPT = 100_000
-"""Maximum number of reported messages that can still get a change `h`, and of messages that only receivers recorded."""
+"""Maximum number of reported messages that can still get a change `h`. The same limit applies to messages that only
+receivers have recorded.
+"""
 
 
 @dataclass
 class _Broadcast:
-    """A broadcast message. `message` is None as long as only receivers, and not yet the sender, have recorded it."""
+    """A broadcast message. `message` is None until the sender's record of it was read."""
 
     mask: int
     polls: int
@@ -66,7 +69,7 @@ class _Broadcast:
     block: str | None = None
 
     def add_receiver(self, bit: int) -> bool:
-        """Add the receiver with this bit. Return true if the receiver was not yet known."""
+        """Add the receiver with this bit. Return true if it is a new receiver."""
         before = self.mask
         self.mask |= bit
         return self.mask != before
@@ -75,7 +78,8 @@ class _Broadcast:
 class ChangeFeed:
     """The stream of changes in a run directory.
 
-    Raises RunDirectoryError if the directory is no run, has nothing to show, or has more than `MAX_VEHICLES` vehicles.
+    Raises RunDirectoryError if the directory contains no run, if the run has nothing to show, or if it has more than
+    `MAX_VEHICLES` vehicles.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -95,7 +99,7 @@ class ChangeFeed:
         self._surroundings = NetworkAndVehicles(directory, self._roster)
         self._broadcasts: dict[tuple[int, int], _Broadcast] = {}
         self._reported: dict[tuple[int, int], _Broadcast] = {}
-        """The last reported messages: sender and sequence number -> message."""
+        """(sender, sequence number) -> the message, for the last reported messages."""
         self._polls = 0
         self._reported_s = 0.0
         self._reported_problems: set[str] = set()
@@ -136,8 +140,8 @@ class ChangeFeed:
         return has_vehicles and record.backend is not None and not in_virtual_time(record.backend)
 
     def poll(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
-        """Return the new changes up to a mission second, and whether more changes up to this mission second remain
-        unread.
+        """Return the new changes up to mission second `until_s`, and whether there are further changes up to this
+        second.
         """
         more = self._surroundings.read(until_s, LINES_AT_ONCE)
         for course in self._courses:
@@ -162,7 +166,9 @@ class ChangeFeed:
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the earliest entry that was read in advance. None if there is no such entry."""
+        """The mission second of the next entry, which was already read but not processed. None without such an
+        entry.
+        """
         ahead = (self._surroundings.next_s, *(course.next_s for course in self._courses))
         return min((at_s for at_s in ahead if at_s is not None), default=None)
 

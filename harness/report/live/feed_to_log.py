@@ -7,7 +7,7 @@ from harness.report.live.feed import ChangeFeed
 from harness.report.live.server import UPDATE_S
 
 STRIDE_S = 20.0
-"""Mission seconds that are read from all files in one step of a finished run."""
+"""Number of mission seconds of a finished run that are read from all files in one step."""
 
 
 async def copy_finished_run(feed: ChangeFeed, log: ChangeLog) -> None:
@@ -28,7 +28,7 @@ async def copy_finished_run(feed: ChangeFeed, log: ChangeLog) -> None:
 
 async def copy_live_run(feed: ChangeFeed, log: ChangeLog, ended: asyncio.Event) -> None:
     """Write the changes of an active run to a log until the run has a result. Also stop when `ended` is set, because
-    the process of the run has ended.
+    the process that plays the run has ended.
     """
     log.append([feed.run_change(live=True)])
     while True:

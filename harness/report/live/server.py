@@ -1,8 +1,9 @@
 """The web server of the live page. It listens on 127.0.0.1 only, and requires the secret token in the page's address.
 
-The table of served files is made at the start, so no address can reach another file. The Content-Security-Policy lets
-browsers load from this server only. Three checks keep out other pages in the same browser: they do not know the token,
-their origin is visible (Origin), and a host name of theirs that resolves to 127.0.0.1 is rejected (Host).
+The server lists the files that it serves at its start, so no address can reach another file. The
+Content-Security-Policy lets browsers load from this server only. Three checks reject other pages in the same browser.
+They do not know the token. The header Origin reveals their origin. And the header Host reveals a foreign host name that
+resolves to 127.0.0.1.
 """
 
 import asyncio
@@ -30,16 +31,16 @@ _PAGE = Path(__file__).parent / "page"
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 MAX_READERS = 16
 MAX_MESSAGE_BYTES = 4096
-"""Maximum size of a message from a page."""
+"""Maximum size in bytes of a message from a page."""
 UPDATE_S = 0.1
 GONE_S = 20.0
-"""A browser that does not answer for this time counts as gone."""
+"""Seconds after which a browser that does not answer counts as disconnected."""
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 RequestHandler = Callable[[int, Any], None]
-"""Receives the number of a page and its request. `LivePageServer.answer` sends the answer."""
+"""A function that receives the number of a page and its request. `LivePageServer.answer` sends the answer."""
 MOST_ANSWERS = 32
-"""Maximum number of waiting answers of one page. Further answers replace the oldest."""
+"""Maximum number of answers that wait for one page. Further answers replace the oldest."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class LivePageServer:
 
     @contextlib.asynccontextmanager
     async def open(self, port: int) -> AsyncIterator[str]:
-        """Run the server as long as the context is open, and yield the address of the page.
+        """Run the server inside the context, and yield the address of the page.
 
         Port 0 means any free port. Raises MachineError if the port is not available.
         """
@@ -144,9 +145,7 @@ class LivePageServer:
         )
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
-        """Return the report of the run. Send it as a page without rights in the browser, because the author of the
-        report is unknown.
-        """
+        """Return the report of the run. The browser gets it as a page without rights, because its author is unknown."""
         path = self._directory / "report.html"
         if not path.is_file():
             raise web.HTTPNotFound
@@ -177,7 +176,7 @@ class LivePageServer:
         return len(self._pages)
 
     def answer(self, page: int, answer: Change) -> None:
-        """Send the answer to a request to the page that made the request, if this page is still open."""
+        """Send the answer to the page that made the request, if this page is still open."""
         if page in self._pages:
             self._pages[page].answers.append(json.dumps(answer) + "\n")
 
@@ -204,8 +203,8 @@ class LivePageServer:
 
 
 def _log() -> logging.Logger:
-    """Return a log for errors of the server. It leaves out malformed requests, because any program of this machine can
-    send them.
+    """Return a log for errors of the server. It omits malformed requests, because any program on this machine can send
+    them.
     """
     log = logging.getLogger(__name__)
     log.addFilter(_is_own_error)

@@ -1,7 +1,7 @@
 """Manage the live page of an active run. The web server of the page is a separate process.
 
-The two processes exchange lines of JSON. The run sends `["t", mission second]`, `["hand", state]` and answers to
-requests. The server first sends the page's address, and then `[page, number, request]` for each request.
+The two processes exchange lines of JSON. The process of the run sends `["t", mission second]`, `["hand", state]` and
+answers to requests. The server first sends the page's address, and then `[page, number, request]` for each request.
 """
 
 import json
@@ -23,10 +23,12 @@ from harness.play.progress import ProgressDisplay, SwarmSnapshot
 
 STATE_EVERY_S = 0.1
 LAST_LOOK_S = 60.0
-"""Maximum wall time in which the server reads the rest of a run, and reports the number of open pages."""
+"""Maximum wall time after the run, in seconds, in which the server reads the rest of the run and reports the number of
+open pages.
+"""
 ENDING_S = 5.0
 MAX_OUTGOING = 10_000
-"""Maximum number of unsent lines. Further lines are lost, because the server hangs."""
+"""Maximum number of unsent lines. If the server hangs, further lines are lost."""
 _LAST_LINES = 20
 _NO_REASON = "it does not say why"
 
@@ -64,10 +66,10 @@ class LivePage:
         self._writer, self._reader = _thread(self._write_lines), _thread(self._read_requests)
         self._state_sender = _thread(self._send_state)
         self.problem: str | None = None
-        """After the run: a sentence about an early end of the server, or None."""
+        """A sentence about an early end of the server, after the run. None without a problem."""
 
     def tee(self, progress: ProgressDisplay) -> ProgressDisplay:
-        """Return a progress display that passes all progress on to `progress` and also updates the page."""
+        """Return a progress display that forwards all progress to `progress` and also updates the page."""
         return _ProgressTee(progress, self)
 
     def set_snapshot(self, snapshot: SwarmSnapshot) -> None:
@@ -117,13 +119,13 @@ class LivePage:
         return self._last_lines[-1] if self._last_lines else _NO_REASON
 
     def _read_errors(self) -> None:
-        """Read the error output of the web server. Without a reader, a full pipe would block it."""
+        """Read the error output of the web server. If no thread read it, a full pipe would block the server."""
         for line in _required(self._process.stderr):
             if line.strip():
                 self._last_lines.append(line.strip())
 
     def _send(self, what: list[Any]) -> None:
-        """Send a line to the web server without waiting. A failed or hung server must not affect the run."""
+        """Queue a line for the web server, and return at once. A failed or hung server must not affect the run."""
         with suppress(queue.Full):
             self._outgoing.put_nowait(what)
 
@@ -206,7 +208,7 @@ def _required(stream: IO[str] | None) -> IO[str]:
 
 
 def _perform(interventions: Interventions, request: dict[str, Any]) -> Future[float]:
-    """Execute the request of a page. Raises ValueError, TypeError, KeyError or AttributeError if the request is
+    """Execute a request that a page sent. Raises ValueError, TypeError, KeyError or AttributeError if the request is
     invalid.
     """
     match request["do"]:

@@ -1,6 +1,6 @@
 """Print the logbook of a swarm: all events in its chains, as text, JSON, GeoJSON and KML.
 
-`book` gathers the exports, `logbook_text` prints chain by chain, and `positions` and `map_files` make tracks for maps.
+`book` reads the exports, `logbook_text` prints chain by chain, and `positions` and `map_files` make tracks for maps.
 The checker judges whether the chains are correct.
 """
 

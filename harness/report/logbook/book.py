@@ -59,7 +59,7 @@ class Logbook:
 def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
     """Return the logbook of an archive. `depot` decrypts encrypted events.
 
-    Raises RunDirectoryError if there are no exports, and ExportError if nothing is sealed to this depot.
+    Raises RunDirectoryError if the archive has no exports, and ExportError if no events are encrypted for this depot.
     """
     exports = archive.exports
     if not exports.by_agent and not exports.errors:
@@ -81,7 +81,7 @@ def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
 def logged_telemetry(record: RunRecord) -> bool:
     """Return true if the events are telemetry of vehicles.
 
-    Without vehicles they are random; without a run record they are telemetry.
+    In a run without vehicles, events are random. Without run.json, they are assumed to be telemetry.
     """
     scenario = record.scenario
     if scenario is None:

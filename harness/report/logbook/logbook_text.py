@@ -16,8 +16,8 @@ _BYTES_SHOWN = 8
 
 
 def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
-    """Yield the lines of each agent's chain. The oldest block is first. If `decode` is true, each event has a
-    description.
+    """Yield the lines of each agent's chain. The oldest block is first. If `decode` is true, events are described in
+    words.
     """
     vehicle_types = _vehicle_types(logbook) if decode else {}
     for agent_id, export in logbook.exports.items():
@@ -35,7 +35,7 @@ def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
 def document(logbook: Logbook, decode: bool) -> dict[str, Any]:
     """Return the logbook as a JSON object. Data and hashes are hexadecimal, and times are in microseconds.
 
-    `events` is null for a block whose events are unreadable or sealed.
+    `events` is null for a block whose events are unreadable or encrypted.
     """
     vehicle_types = _vehicle_types(logbook) if decode else {}
     return {
@@ -62,8 +62,8 @@ def words(event: LoggableEvent, telemetry: bool, of_type: int | None = None) -> 
 
 
 def _vehicle_types(logbook: Logbook) -> dict[int, int]:
-    """Return the type (MAV_TYPE) of each agent's vehicle. It is known from the first change of flight mode that the
-    agent logged.
+    """Return the type (MAV_TYPE) of each agent's vehicle. The first change of the flight mode that an agent logged
+    contains it.
     """
     types: dict[int, int] = {}
     if not logbook.telemetry:
@@ -78,7 +78,7 @@ def _vehicle_types(logbook: Logbook) -> dict[int, int]:
 
 
 def _time(timestamp_us: int, logbook: Logbook) -> str:
-    """Return a timestamp as text. If the mission second is a different number, it stands in front."""
+    """Format a timestamp as text. The mission second precedes it, unless both are the same number."""
     mission_s = logbook.mission_s(timestamp_us) if logbook.epoch_us else None
     return moment(timestamp_us) if mission_s is None else f"{mission_s:8.1f} s  {moment(timestamp_us)}"
 

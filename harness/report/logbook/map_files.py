@@ -12,8 +12,8 @@ def geojson(tracks: Iterable[EventTrack]) -> dict[str, Any]:
     """Return a GeoJSON FeatureCollection. Altitudes are metres above mean sea level.
 
     The property `times` of a LineString holds the time of each position. A vehicle with a single position has no
-    LineString. Other events are at the last position of the vehicle, which is `position_age_s` seconds older. An event
-    before the first position has the geometry null.
+    LineString. Other events get the last known position of the vehicle, which is `position_age_s` seconds older than
+    the event. Events before the first position have the geometry null.
     """
     return {"type": "FeatureCollection", "features": [feature for track in tracks for feature in _features(track)]}
 
@@ -51,8 +51,8 @@ ElementTree.register_namespace("gx", _GX)
 def kml(tracks: Iterable[EventTrack]) -> str:
     """Return a KML document. The folder of each vehicle contains its flight path and its other events with their times.
 
-    Altitudes are above mean sea level. An event is at the last position of the vehicle. Events before the first
-    position are left out.
+    Altitudes are in metres above mean sea level. An event gets the last known position of the vehicle. Events before
+    the first position are omitted.
     """
     root = ElementTree.Element(f"{{{_KML}}}kml")
     document = _add(root, "Document")

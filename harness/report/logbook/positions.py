@@ -1,7 +1,7 @@
 """Find the positions of vehicles over time, in logged events or in the flight paths that the run recorded.
 
-A vehicle's events are taken from every surviving copy of its blocks: from each chain, deque and reconcile stack of the
-logbook. The track of a lost vehicle therefore reaches as far as other agents hold its blocks.
+The events of a vehicle come from all surviving copies of its blocks, in all chains, deques and reconcile stacks. The
+track of a lost vehicle therefore ends with the last of its blocks that another agent holds.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,7 +18,7 @@ from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.telemetry import position_of
 
 LAST_TIMESTAMP_US = 253_402_300_799_999_999
-"""The end of the year 9999. Map programs cannot show later times."""
+"""The last microsecond of the year 9999. Map programs cannot show later times."""
 
 
 class GlobalPosition(Protocol):
@@ -34,8 +34,8 @@ class GlobalPosition(Protocol):
 
 @dataclass(frozen=True)
 class LogEntry:
-    """One event in the block `block`. If the event has no position, `position` is the previous position of the vehicle.
-    It is None if there is none.
+    """One event in the block `block`. If the event has no position, `position` is the previous position of the vehicle,
+    or None without one.
 
     `position_age_s` is the age of the position at the time of the event, in seconds.
     """
@@ -49,7 +49,7 @@ class LogEntry:
 
 @dataclass(frozen=True)
 class EventTrack:
-    """All events of one agent. The oldest is first. `fixes` contains the positions of the agent, with timestamps in
+    """All events of one agent, with the oldest first. `fixes` contains the positions of the agent, with timestamps in
     microseconds.
     """
 
@@ -84,7 +84,7 @@ def utc(timestamp_us: int) -> str:
 
 
 def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[LoggableEvent, str]]:
-    """Return the events with the names of their blocks. Unreadable blocks are left out."""
+    """Return the events in these blocks, with the names of the blocks. Unreadable blocks are skipped."""
     logged = []
     for block in blocks:
         try:
@@ -97,7 +97,7 @@ def _events(logbook: Logbook, blocks: Iterable[ExportedBlock]) -> list[tuple[Log
 
 
 def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> EventTrack:
-    """Return a track that contains these events in order of time. Events with an impossible time are left out."""
+    """Return a track that contains these events in order of time. Events with an impossible time are omitted."""
     track = EventTrack(agent_id, [], [])
     possible = [pair for pair in logged if pair[0].timestamp_us <= LAST_TIMESTAMP_US]
     for event, block in sorted(possible, key=lambda pair: pair[0].timestamp_us):

@@ -1,9 +1,10 @@
 """Describe the actions of agents as text, in order of time. Actions of the same moment are ordered from causes to
 effects.
 
-In a real network, the order of receivers of one message is random. The text therefore does not depend on it. Within an
-instant, actions are ordered by their distance from the first cause, and then by agent ID: a timer ends and an agent
-asks, all receivers answer, the answers are counted. Agents with equal actions for equal reasons share one line.
+In a real network, the receivers of a message handle it in random order. The text must not depend on this order. Within
+an instant, actions are therefore ordered by their distance from the first cause, and then by agent ID. For example, a
+timer expires and an agent sends a query, then all receivers answer, then the agent counts the answers. Agents with
+equal actions for equal reasons share one line.
 """
 
 from collections import defaultdict
@@ -21,26 +22,28 @@ from ucp.trace import HandlerRun, SentMessage
 from ucp.trigger import LocalTrigger, MessageTrigger, TimerTrigger
 
 INSTANT_S = 1.5
-"""Maximum delay in mission seconds between a cause and its effect in the same instant. A timer within this delay counts
-as punctual. A slow machine is late more often the faster it plays a mission."""
+"""Maximum number of mission seconds between a cause and an effect that belong to the same instant. A timer with this
+lateness still counts as punctual. On a slow machine, timers are later in mission seconds the faster the mission is
+played.
+"""
 
 
 @dataclass
 class AgentReaction:
-    """An action of an agent: a handler run that an input triggered, with all handler runs that followed from it."""
+    """An action of an agent: the handler run for an input, and all handler runs that followed from it."""
 
     agent_id: int
     position: int
-    """Index in the agent's trace."""
+    """Index of the first handler run in the agent's trace."""
     runs: list[HandlerRun]
     cause: "AgentReaction | None" = None
-    """The action that sent the triggering message, if there was one."""
+    """The action that sent the message that triggered this one. None if no message triggered it."""
     receivers: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
-    """Receivers of each sent message, by sequence number."""
+    """Sequence number of a sent message -> the receivers of the message."""
     at_s: float = 0.0
-    """Mission second at which the first cause would have begun without any lateness."""
+    """Mission second at which the first cause would have happened if no timer had been late."""
     distance: int = 0
-    """Number of messages between the first action of the instant and this one."""
+    """Number of messages between the first cause of the instant and this action."""
 
     @property
     def instant(self) -> int:
@@ -53,9 +56,7 @@ class AgentReaction:
 
     @property
     def answer(self) -> MessageTrigger | None:
-        """The trigger of the action, if the action received the answer to a query or request. None for any other
-        action.
-        """
+        """The trigger of the action, if it is an answer to a query or request. None otherwise."""
         trigger = self.runs[0].trigger
         return trigger if isinstance(trigger, MessageTrigger) and trigger.message in ANSWERS else None
 
@@ -92,7 +93,7 @@ class StoryWriter:
         )
 
     def answer(self, section: StorySection, *, first: bool = False) -> list[str]:
-        """Return the lines for one section. The first section also includes earlier actions."""
+        """Return the lines for one section. If `first` is true, the lines also include earlier actions."""
         from_s = 0 if first else section.from_s
         actions = [
             action for action in self._actions if from_s <= action.instant and _before(action.instant, section.until_s)
@@ -103,7 +104,7 @@ class StoryWriter:
         return [*lines, *(self._chains(section.until_s) if section.shows_chains else [])]
 
     def _instant(self, actions: Sequence[AgentReaction]) -> Iterator[str]:
-        """Yield the lines for one moment. Agents with equal actions are listed in the same lines."""
+        """Yield the lines for one instant. Agents with equal actions share their lines."""
         equal: dict[tuple[int, int, object], list[AgentReaction]] = {}
         for action in actions:
             key = action.distance, action.agent_id, self._kind(action)
@@ -117,9 +118,9 @@ class StoryWriter:
             yield from (f"  {_listed(agents):<10}{line}" for line in lines)
 
     def _kind(self, action: AgentReaction) -> object:
-        """Return a key for an action. Actions of one agent with equal keys concern the same answer, and are merged.
+        """Return a key for an action. Actions of one agent with equal keys handle equal answers, and are merged.
 
-        Which of several equal answers arrives first, and therefore counts, is random.
+        The reason is that the order of equal answers is random, and only the first one counts.
         """
         run = action.runs[0]
         if action.cause is None or action.answer is None:
@@ -154,16 +155,16 @@ class StoryWriter:
         return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
 
     def _missing_receivers(self, action: AgentReaction, sent: SentMessage) -> str:
-        """Return a note about the agents that should have received the message and did not.
+        """Return a note about the agents that should have received the message but did not.
 
-        An answer only matters to the agent that asked.
+        An answer only concerns the agent that sent the query.
         """
         meant = {action.sender} if sent.message in ANSWERS else {*self._roster} - {action.agent_id}
         missed = sorted(agent for agent in meant - action.receivers[sent.seq] if agent is not None)
         return f", not to {_listed(missed)}" if missed else ""
 
     def _chains(self, until_s: int | None) -> list[str]:
-        """Return the chains of all agents as a tree of blocks, with the agents at the ends."""
+        """Return the chains of all agents as a tree of blocks. The agents are listed at the ends of their chains."""
         chains: dict[int, list[str]] = {}
         for agent_id, trace in self._traces.items():
             positions = {action.position: action.instant for action in self._actions if action.agent_id == agent_id}
@@ -190,7 +191,7 @@ def _actions_with_causes(traces: Mapping[int, Trace]) -> list[AgentReaction]:
             for message in run.sent:
                 sent[action.agent_id, message.seq].append(action)
     due: dict[tuple[int, object], float] = {}
-    """(agent ID, timer) -> the mission second at which the timer should end."""
+    """(Agent ID, timer) -> the mission second at which the timer should expire."""
     for action in sorted(actions, key=lambda action: (action.runs[0].t, action.agent_id, action.position)):
         run = action.runs[0]
         timer = run.trigger.timer if isinstance(run.trigger, TimerTrigger) else None
@@ -222,9 +223,7 @@ def _set_cause(action: AgentReaction, sent: Mapping[tuple[int, int], Sequence[Ag
 
 
 def _actions(agent_id: int, trace: Trace) -> Iterator[AgentReaction]:
-    """Yield the actions in a trace. A handler run that another handler triggered belongs to the action of
-    that handler.
-    """
+    """Yield the actions in a trace. If a handler triggered another handler, both runs belong to the same action."""
     action: AgentReaction | None = None
     for position, run in enumerate(trace.runs):
         if not has_possible_time(run):
@@ -240,8 +239,8 @@ def _actions(agent_id: int, trace: Trace) -> Iterator[AgentReaction]:
 
 
 def _tree(chains: Mapping[int, Sequence[str]], indent: str) -> Iterator[str]:
-    """Yield a line for the common beginning of the chains. Below it, yield an indented tree for each way in which
-    chains continue.
+    """Yield a line for the common beginning of the chains. Below it, yield an indented tree for each different
+    continuation.
     """
     common = 0
     while all(len(chain) > common for chain in chains.values()) and (

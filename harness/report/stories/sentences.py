@@ -36,8 +36,8 @@ class StoryEntries:
         self.ends_at_s: int | None = None
 
     def add(self, at_s: int, sentence: str) -> None:
-        """Add the scenario entries for one sentence of the story. Raises ScenarioError if no form of sentence
-        matches.
+        """Add the scenario entries for one sentence of the story. Raises ScenarioError if the sentence has no known
+        form.
         """
         if sentence == "end":
             self.ends_at_s = at_s

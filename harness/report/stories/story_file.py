@@ -10,8 +10,8 @@ The reactions of the agents are below each sentence.
     ...
     30 s: end
 
-The indented text is called the answer. It covers the time up to the next later sentence. A test compares it, and can
-write it anew.
+The indented text is called the answer. It covers the time until the next later sentence. A test compares the answer
+with the run, and can rewrite it.
 """
 
 import re
@@ -33,12 +33,14 @@ _ENTRY = re.compile(r"(`?)(timeline|events\.script)\.(\d+)(?:\.|: )")
 INDENT = "    "
 DELAY_S = 0.02
 SPEEDUP = 10.0
-"""Speedup of processes. Sentences may be one second apart, and changing a network takes some milliseconds."""
+"""Speedup of stories that are played as processes. It is limited, because sentences may be one second apart, and a
+change of the network takes some milliseconds.
+"""
 
 
 @dataclass(frozen=True)
 class StorySection:
-    """A place in the story file, after line `line` (from 0). It is for the reactions from mission second `from_s` to
+    """A place in the story file after line `line` (counted from 0), for the reactions from mission second `from_s` to
     `until_s`.
     """
 
@@ -50,7 +52,7 @@ class StorySection:
 
 @dataclass(frozen=True)
 class Story:
-    """The content of a story file, which describes a mission in sentences. `lines` contains its lines except the
+    """The content of a story file, which describes a mission in sentences. `lines` contains its lines without the
     reactions of the agents.
     """
 
@@ -92,7 +94,7 @@ def is_story(path: Path) -> bool:
 
 
 def read_story(path: Path) -> Story:
-    """Read a story file. Raises ScenarioError with the names of the file and the line."""
+    """Read a story file. Raises ScenarioError, which names the file and the line."""
     try:
         text = read_text(path, MAX_BYTES)
     except (OSError, UnicodeDecodeError) as error:
@@ -151,19 +153,21 @@ def _parsed(path: Path, text: str) -> Story:
 
 
 def _in_its_line(problem: str, entry_lines: Mapping[str, Sequence[int]]) -> str:
-    """Return an error message that names the line of the sentence in place of the scenario entry."""
+    """Return an error message that names the line of the sentence instead of the scenario entry."""
     entry = _ENTRY.match(problem)
     return f"line {entry_lines[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
 
 
 def _gap(lines: Sequence[str]) -> list[str]:
-    """Return an empty line if the last line is a sentence. The empty line separates the sentence from a comment."""
+    """Return an empty line if the last line is a sentence. The empty line separates the sentence from the following
+    comment.
+    """
     return [""] if _SENTENCE.fullmatch(lines[-1]) else []
 
 
 def _sections(sentences: Sequence[tuple[int, int, bool]]) -> list[StorySection]:
-    """Return one section for each mission second in the story. It is placed after the last sentence of that mission
-    second.
+    """Return one section for each mission second in the story. The section is placed after the last sentence of this
+    mission second.
     """
     last = {
         at_s: (line, any(chains for _, other_s, chains in sentences if other_s == at_s)) for line, at_s, _ in sentences

@@ -25,11 +25,13 @@ from ucp.trace import HandlerRun, SentMessage
 
 INCEPTION = "inception"
 MAX_FULL_CHAIN = 4
-"""Maximum length of a chain that is written in full. Longer chains are named by their first and last blocks."""
+"""Maximum length of a chain whose name lists all blocks. The name of a longer chain has only its first and last
+blocks.
+"""
 
 
 class LocalChain:
-    """The chain of an agent according to its trace, as block hashes and chain hashes. The oldest is first."""
+    """The chain of an agent according to its trace: block hashes and chain hashes, oldest first."""
 
     def __init__(self, trace: Trace) -> None:
         try:
@@ -51,7 +53,7 @@ class LocalChain:
 
 
 def _digest(block_hash: str) -> bytes:
-    """Return the hash as bytes. Return no bytes if the text is not a hash."""
+    """Return the hash as bytes. Return empty bytes if the text is not a hash."""
     try:
         return bytes.fromhex(block_hash)
     except ValueError:
@@ -59,7 +61,9 @@ def _digest(block_hash: str) -> bytes:
 
 
 class StoryNames:
-    """Names of blocks as in the figures of the thesis, such as "1.1". The name of a chain is the list of its blocks."""
+    """Names of blocks as in the figures of the thesis, such as "1.1". The name of a chain lists the names of its
+    blocks.
+    """
 
     def __init__(self, traces: Mapping[int, Trace]) -> None:
         self._blocks = {
@@ -89,7 +93,7 @@ class StoryNames:
         return "an unknown chain" if blocks is None else _chain_text(blocks)
 
     def chain_below(self, chain_hash: bytes) -> str:
-        """Return the name of the chain that is left without the top block."""
+        """Return the name of the chain without its top block."""
         blocks = self._chains.get(chain_hash)
         return "an unknown chain" if not blocks else _chain_text(blocks[:-1])
 
@@ -113,7 +117,7 @@ class NameSource(Protocol):
 ANSWERS = frozenset(
     message.NAME for message in (BlockAddResponse, ChainContainResponse, NextInSequenceResponse, BlockResponse)
 )
-"""Names of messages that answer one agent."""
+"""Names of the messages that answer a single agent."""
 
 _FORMATS: dict[type[Message], Callable[[Any, NameSource], str]] = {
     BlockAddRequest: lambda message, names: (
