@@ -1,12 +1,13 @@
-"""Compare the speed of simulated runs with that of another revision: `python -m benchmarks.against HEAD~20 [--rounds
-15]`.
+"""Compare the speed with that of another revision and of a bare model: `python -m benchmarks.against HEAD~20`.
 
-The other revision is checked out in a temporary directory. Both revisions play the same seeds alternately, each in a
-process of its own. The ratio is the processor time of this revision divided by that of the other one, in the same
-round. A ratio below 1 means that this revision is faster. `--large` also plays 50 agents, and the thesis's matrix with
-200 seeds on one core, which takes minutes.
+The argument is a revision, which is checked out in a temporary directory, or the directory of another clone. Each side
+plays in a process of its own. In each round, the two sides and the bare model (`benchmarks.bare_model`) play the same
+seed alternately. A ratio below 1 means that this revision needs less processor time than the other one or the model.
+A clone with compiled modules uses them, and a revision that is checked out does not have any. Thus `HEAD` measures the
+effect of the compilation.
 
-The scenario has 20 minutes at 15 % loss with a final reconcile. Each revision judges its own runs.
+The scenario has 20 minutes at 15 % loss with a final reconcile. Each revision judges its own runs. `--large` also plays
+50 agents, and a larger proof, which takes minutes.
 """
 
 from __future__ import annotations
@@ -27,17 +28,21 @@ ROOT = Path(__file__).resolve().parent.parent
 PLAYER = Path(__file__).with_name("played_by.py")
 
 SMALL = {
-    "5 agents, untraced": ("untraced 5", "untraced 5"),
-    "5 agents, traced": ("traced 5", "traced 5"),
-    "5 agents, traced beside untraced": ("untraced 5", "traced 5"),
-    "a seed of explore": ("explore", "explore"),
+    "5 agents, untraced": ("untraced 5", "bare 5"),
+    "5 agents, traced and judged": ("traced 5", "bare 5"),
+    "20 agents, untraced": ("untraced 20", "bare 20"),
+    "20 agents, traced and judged": ("traced 20", "bare 20"),
+    "a seed of explore": ("explore", "bare 5"),
+    "a run of the matrix, judged": ("matrix", None),
+    "a state of prove, 4/2 lossy": ("prove 4/2", None),
+    "run --backend sim, from the shell": ("shell", "bare 5"),
 }
 LARGE = {
-    "50 agents, untraced": ("untraced 50", "untraced 50"),
-    "50 agents, traced": ("traced 50", "traced 50"),
-    "a run of the matrix": ("matrix", "matrix"),
+    "50 agents, untraced": ("untraced 50", "bare 50"),
+    "50 agents, traced and judged": ("traced 50", "bare 50"),
+    "a state of prove, 3/3 lossy": ("prove 3/3", None),
 }
-"""Row -> the runs of the other revision, and the runs of this one."""
+"""Row -> the runs of both revisions, and the runs of the bare model."""
 
 
 class Player:
@@ -68,7 +73,12 @@ class Player:
 
 @contextmanager
 def checked_out(revision: str) -> Iterator[Path]:
-    """Check out this revision into a temporary directory, which exists until the block ends."""
+    """Check out this revision into a temporary directory, which exists until the block ends. The directory of another
+    clone stays as it is.
+    """
+    if (Path(revision) / "harness").is_dir():
+        yield Path(revision).resolve()
+        return
     with tempfile.TemporaryDirectory() as directory:
         tree = Path(directory) / "tree"
         git = ("git", "-C", str(ROOT), "worktree")
@@ -80,26 +90,29 @@ def checked_out(revision: str) -> Iterator[Path]:
             subprocess.run([*git, "remove", "--force", tree], check=True)
 
 
-def row(name: str, plays: tuple[str, str], other: Player, this: Player, rounds: int) -> dict[str, Any]:
-    played_before, played_now = plays
-    before, now = [], []
+def row(name: str, plays: tuple[str, str | None], other: Player, this: Player, rounds: int) -> dict[str, Any]:
+    play, bare_play = plays
+    before, now, bare = [], [], []
     for seed in range(1, rounds + 1):
-        before.append(other.seconds(played_before, seed))
-        now.append(this.seconds(played_now, seed))
+        before.append(other.seconds(play, seed))
+        now.append(this.seconds(play, seed))
+        if bare_play is not None:
+            bare.append(other.seconds(bare_play, seed))
     return {
         "what": name,
         "then, ms": Spread.of(1000 * seconds for seconds in before),
         "now, ms": Spread.of(1000 * seconds for seconds in now),
         "now, per second": f"{1 / Spread.of(now).median:.1f}",
         "ratio": Spread.of_ratios(now, before),
+        "beside the bare model": f"{sum(now) / sum(bare):.2f}" if bare else "",
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("revision", help="other revision, as git names it")
+    parser.add_argument("revision", help="other revision, as git names it, or the directory of another clone")
     parser.add_argument("--rounds", type=int, default=15, help="number of rounds")
-    parser.add_argument("--large", action="store_true", help="also 50 agents and the matrix, one round each")
+    parser.add_argument("--large", action="store_true", help="also 50 agents and a larger proof, one round each")
     parser.add_argument("--json", action="store_true", help="print JSON")
     arguments = parser.parse_args()
     with checked_out(arguments.revision) as tree, ExitStack() as players:
@@ -111,7 +124,7 @@ def main() -> None:
         rows = [row(name, plays, other, this, arguments.rounds) for name, plays in SMALL.items()]
         if arguments.large:
             rows += [row(name, plays, other, this, 1) for name, plays in LARGE.items()]
-    show(rows, {"then, ms": ".1f", "now, ms": ".1f", "ratio": ".2f"}, arguments.json)
+    show(rows, {"then, ms": ".3g", "now, ms": ".3g", "ratio": ".2f"}, arguments.json)
 
 
 if __name__ == "__main__":

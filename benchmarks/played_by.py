@@ -1,15 +1,23 @@
 """Play runs for `benchmarks.against`, with the revision of the project that is first on PYTHONPATH.
 
 A line on standard input names the kind of run and a seed, such as "explore/3". The answer is the processor time of each
-run, in seconds. The program uses only functions that all revisions have.
+run, in seconds. The program uses only functions that all revisions have. `bare_model` lies beside it, so that all
+revisions play the same model.
 """
 
 import gc
+import os
+import subprocess
 import sys
-import time
 from collections.abc import Callable
+from functools import partial
 from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import bare_model
+
+from harness.proof import Bounds, prove
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from harness.sweep.explore._exploring import simulated as explored
@@ -17,7 +25,7 @@ from harness.sweep.matrix._cell_play import simulated as cell
 
 LOSS = (0.0, 0.10, 0.15, 0.25, 0.30, 0.50, 0.75, 1.00)
 """The loss rates of scenarios/thesis_matrix.yaml."""
-SEEDS_OF_MATRIX = 200
+SEEDS_OF_MATRIX = 10
 SEEDS_OF_EXPLORE = 10
 
 
@@ -34,7 +42,7 @@ def scenario(agents: int, loss: float = 0.15, *, final_reconcile: bool = True, s
     )
 
 
-FIVE, FIFTY = scenario(5), scenario(50)
+FIVE, TWENTY, FIFTY = scenario(5), scenario(20), scenario(50)
 
 
 def explore(seed: int) -> int:
@@ -44,13 +52,27 @@ def explore(seed: int) -> int:
     return SEEDS_OF_EXPLORE
 
 
-def matrix(_: int) -> int:
-    """Play all cells like `ucp-harness matrix` on one core; return the number of runs."""
+def matrix(seed: int) -> int:
+    """Play some seeds of all cells like `ucp-harness matrix` on one core; return the number of runs."""
     cells = [scenario(5, loss, final_reconcile=False, settle_s=7200.0) for loss in LOSS]
     runs = list(product(cells, range(SEEDS_OF_MATRIX)))
     for of_loss, number in runs:
-        cell(of_loss, number)
+        cell(of_loss, seed * SEEDS_OF_MATRIX + number)
     return len(runs)
+
+
+def proof(bounds: Bounds) -> int:
+    """Prove within these bounds on one core; return the number of states."""
+    with TemporaryDirectory() as directory:
+        return prove(bounds, out=Path(directory) / "example.yaml").figures.states
+
+
+def shell(seed: int) -> int:
+    """Play a mission and write its run directory and report with the command in a new process."""
+    with TemporaryDirectory() as directory:
+        command = [sys.executable, "-m", "harness.cli", "run", "loss_15", "--backend", "sim", "--seed", str(seed)]
+        subprocess.run([*command, "--out", f"{directory}/run"], stdout=subprocess.DEVNULL, check=True)
+    return 1
 
 
 def once(play: Callable[[int], object]) -> Callable[[int], int]:
@@ -62,22 +84,32 @@ def once(play: Callable[[int], object]) -> Callable[[int], int]:
 
 
 PLAYS = {
-    "untraced 5": once(lambda seed: simulate(FIVE, seed)),
-    "traced 5": once(lambda seed: simulate(FIVE, seed, tracing=True)),
-    "untraced 50": once(lambda seed: simulate(FIFTY, seed)),
-    "traced 50": once(lambda seed: simulate(FIFTY, seed, tracing=True)),
     "explore": explore,
     "matrix": matrix,
+    "prove 4/2": lambda _: proof(Bounds(4, 2, "lossy")),
+    "prove 3/3": lambda _: proof(Bounds(3, 3, "lossy")),
+    "shell": shell,
 }
+for swarm in (FIVE, TWENTY, FIFTY):
+    agents = swarm.agents
+    PLAYS[f"bare {agents}"] = once(partial(bare_model.play, agents, 0.15))
+    PLAYS[f"untraced {agents}"] = once(partial(simulate, swarm))
+    PLAYS[f"traced {agents}"] = once(partial(simulate, swarm, tracing=True))
+
+
+def processor_s() -> float:
+    """Return the processor time of this process and of the processes that it has started and that have ended."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
 
 
 def main() -> None:
     for line in sys.stdin:
-        what, seed = line.split("/")
+        what, _, seed = line.rpartition("/")
         gc.collect()  # what earlier runs left is not this one's
-        began = time.process_time()
+        began = processor_s()
         runs = PLAYS[what](int(seed))
-        sys.stdout.write(f"{(time.process_time() - began) / runs}\n")
+        sys.stdout.write(f"{(processor_s() - began) / runs}\n")
         sys.stdout.flush()
 
 

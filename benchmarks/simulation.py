@@ -1,18 +1,15 @@
-"""Compare the speed of the simulation with that of a trivial model: `python -m benchmarks.simulation [--rounds 5]`.
+"""Compare the speed of the simulation with that of a bare model: `python -m benchmarks.simulation [--rounds 5]`.
 
 `--agents 200 --loss 0.15 --settle 1200 --rounds 1` is the largest swarm. `--matrix` also measures 8 x 200 runs of five
 agents.
 
-The null model delivers as many broadcasts to as many agents as the simulated mission, and does nothing with them. Each
-delivery is a heap operation, a random number for loss and one for latency, a set insert and a dictionary look-up.
-Rounds alternate between the two, so that a slow phase of the machine affects both. Times are processor times. The
-checker judges each simulation without traces, as in a matrix. Runs with `--traced` have traces and all checks.
+`benchmarks.bare_model` is the protocol alone, in one file. Rounds alternate between the two, so that a slow phase of
+the machine affects both. Times are processor times. The checker judges each simulation at its end. Runs with `--traced`
+have traces and all checks.
 """
 
 import argparse
 import gc
-import heapq
-import random
 import resource
 import statistics
 import sys
@@ -20,10 +17,10 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+from benchmarks.bare_model import play
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 
-MISSION_S = 1200.0
 MATRIX_LOSS = [0.0, 0.05, 0.10, 0.15, 0.20, 0.25, 0.30, 0.35]
 MATRIX_SEEDS = 200
 
@@ -32,26 +29,6 @@ def scenario(agents: int, loss: float, settle_s: float) -> Scenario:
     return Scenario.model_validate(
         {"name": "benchmark", "agents": agents, "network": {"loss": loss}, "settle": {"limit_s": settle_s}}
     )
-
-
-def null_model(agents: int, loss: float, broadcasts: int) -> int:
-    """Deliver this number of broadcasts over a mission without agents. Return the number of deliveries."""
-    coming: list[tuple[float, int, int]] = []
-    seen: set[tuple[int, int]] = set()
-    held = dict.fromkeys(range(agents), 0)
-    deliveries = 0
-    for number in range(broadcasts):
-        now = MISSION_S * number / broadcasts
-        while coming and coming[0][0] <= now:
-            _, message, receiver = heapq.heappop(coming)
-            seen.add((message, receiver))
-            held[receiver] += 1
-            deliveries += 1
-        sender = number % agents
-        for receiver in range(agents):
-            if receiver != sender and random.random() >= loss:
-                heapq.heappush(coming, (now + 0.002 + 0.048 * random.random(), number, receiver))
-    return deliveries + len(coming)
 
 
 def seconds(what: Callable[[], object]) -> float:
@@ -70,7 +47,7 @@ def main() -> None:
     parser.add_argument("--traced", action="store_true", help="also with traces")
     parser.add_argument("--matrix", action="store_true", help=f"also {len(MATRIX_LOSS)} x {MATRIX_SEEDS} runs of 5")
     arguments = parser.parse_args()
-    print_row("agents", "loss", "broadcasts", "null model", "simulation", "ratio", "peak so far", "traced", "ratio")
+    print_row("agents", "loss", "broadcasts", "bare model", "simulation", "ratio", "peak so far", "traced", "ratio")
     for agents in arguments.agents:
         for loss in arguments.loss:
             row(scenario(agents, loss, arguments.settle), agents, loss, arguments.rounds, arguments.traced)
@@ -88,23 +65,23 @@ def matrix() -> None:
 
 def row(what: Scenario, agents: int, loss: float, rounds: int, traced: bool) -> None:
     broadcasts = []
-    times: dict[str, list[float]] = {"null": [], "plain": [], "traced": []}
+    times: dict[str, list[float]] = {"bare": [], "plain": [], "traced": []}
     for seed in range(rounds):
         messages = simulate(what, seed).result.figures["messages"]
         assert isinstance(messages, int)
         broadcasts.append(messages)
         times["plain"].append(seconds(partial(simulate, what, seed)))
-        times["null"].append(seconds(partial(null_model, agents, loss, messages)))
+        times["bare"].append(seconds(partial(play, agents, loss, seed, what.settle.limit_s, final_reconcile=False)))
         if traced:
             times["traced"].append(seconds(partial(simulate, what, seed, tracing=True)))
-    null, plain = statistics.median(times["null"]), statistics.median(times["plain"])
+    bare, plain = statistics.median(times["bare"]), statistics.median(times["plain"])
     cells = [
         str(agents),
         f"{loss:.2f}",
         str(round(statistics.median(broadcasts))),
-        ms(null),
+        ms(bare),
         ms(plain),
-        f"{plain / null:.2f}",
+        f"{plain / bare:.2f}",
         f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB",
     ]
     if traced:
