@@ -1,5 +1,5 @@
-"""Read the packet capture of one vehicle from the field. It contains the datagrams that the agent of the vehicle sent,
-and those that reached it.
+"""Read the packet capture of one vehicle from the field. The capture contains the datagrams that the agent of the
+vehicle sent, and those that reached the vehicle.
 """
 
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class AgentCapture:
     speedup: float
     sightings: list[CapturedDatagram] = field(default_factory=list)
     unreadable: int = 0
-    """Number of sealed datagrams that no given key decrypts."""
+    """Number of encrypted datagrams that no given key decrypts."""
 
 
 def read_capture(
@@ -77,5 +77,5 @@ def read_capture(
 
 
 def seconds_of(event: LoggableEvent, capture: AgentCapture) -> float:
-    """Return the mission second at which an event was logged, on the clock of the captured vehicle."""
+    """Return the mission second at which an event was logged, on the clock of the vehicle with the capture."""
     return (event.timestamp_us - capture.epoch_us) / MICROSECONDS

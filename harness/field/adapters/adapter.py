@@ -1,8 +1,8 @@
 """Define an adapter, which reads another file format, and load adapters that users write.
 
 An adapter reads the records of another implementation, or of a separate recorder, and yields their contents one
-observation after another. It invents nothing. For example, an agent that did not record its handler runs gets no trace,
-but the datagrams that a recorder received from it still make a capture.
+observation after another. It yields only recorded data. For example, an agent that did not record its handler runs gets
+no trace. If a separate recorder received the agent's datagrams, the agent still gets a capture.
 """
 
 import importlib
@@ -26,7 +26,7 @@ class TraceLine:
     agent_id: int
     text: str | bytes
     where: int | None = None
-    """Number of the line, row or message in the source, from 1. The classes below have the same field."""
+    """Number of the line, row or message in the source, counted from 1. The following classes have the same field."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,9 @@ class Datagram:
 
 @dataclass(frozen=True, slots=True)
 class LoggedEvent:
-    """An event that the agent received at `time_ns` to log it, in nanoseconds since the Unix epoch (Section 3.1)."""
+    """An event that the agent had to log. `time_ns` is the time of the event in nanoseconds since the Unix epoch
+    (Section 3.1).
+    """
 
     agent_id: int
     time_ns: int
@@ -63,8 +65,8 @@ class ChainExport:
 class Unusable:
     """A part of the source file that cannot be used. `why` completes a sentence, as in "it has no time".
 
-    With `of_a_trace`, the part may have been a line of a trace. The trace of `agent_id` then has a gap here. If
-    `agent_id` is None, all traces have a gap.
+    If `of_a_trace` is true, the part may have been a line of a trace. The trace of `agent_id` then has a gap at this
+    place. If `agent_id` is None, all traces have a gap.
     """
 
     why: str
@@ -87,7 +89,7 @@ class Adapter:
     counts: ClassVar[str] = "line"
 
     def recognises(self, source: Path, beginning: bytes) -> bool:
-        """Return true if a file has this format, judged by its name or its first bytes.
+        """Return true if a file has this format. The adapter decides this by the file's name or first bytes.
 
         The default accepts every file.
         """
@@ -97,15 +99,15 @@ class Adapter:
         """Return the path of the recording to which a file belongs. Several files, for example all files of a
         directory, may belong to one recording.
 
-        By default, each file is a recording of its own.
+        By default, each file is a separate recording.
         """
         return source
 
     def observations(self, source: Path) -> Iterator[Observation]:
         """Yield the messages, events and trace lines in a file, in their order.
 
-        An exception ends the reading of this file. It is reported with the name of the file, and the earlier
-        observations are used.
+        If the method raises an exception, the rest of the file is not read. The import reports the exception with the
+        name of the file, and uses the earlier observations.
         """
         raise NotImplementedError
 

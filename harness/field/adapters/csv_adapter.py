@@ -9,7 +9,7 @@ event    the event's ID, for `event` only
 data     for `trace` a line of the agent's trace, and for `export` its chain export, both as JSON;
          for `sent` and `received` the datagram, and for `event` the event's data, in base64
 
-The separator is a comma, a semicolon or a tab. A damaged row is left out, and does not affect other rows, even if a
+The separator is a comma, a semicolon or a tab. A damaged row is omitted, and does not affect other rows, even if a
 quote in it is never closed.
 """
 
@@ -31,7 +31,7 @@ COLUMNS = ("time_s", "agent", "kind", "event", "data")
 KINDS = ("trace", "sent", "received", "event", "export")
 MAX_BYTES = 1024 * 1024 * 1024
 MAX_LINES_OF_A_ROW = 20_000
-"""Maximum number of lines in a row. A spreadsheet or a person may format an export over many lines."""
+"""Maximum number of lines that a row may take. A spreadsheet or a person may format an export over many lines."""
 MAX_ROW_BYTES = 4 * MAX_LINE_BYTES
 LAST_NS = 2**63 - 1
 MAX_EVENT_ID = 254
@@ -98,7 +98,7 @@ def _layout(row: str) -> _ColumnLayout | None:
 def _rows(file: BoundedFile) -> Iterator[tuple[int, str]]:
     """Yield each row together with the number of its first line.
 
-    A row may extend over several lines if a quote is open and closes.
+    A row may extend over several lines inside a quoted cell.
     """
     read_ahead: deque[str] = deque()  # lines after a quote that did not close
     number = 0

@@ -1,8 +1,8 @@
 """Import records of any format. Adapters read the records, and this module writes them into one directory as files of
 the harness.
 
-The import never invents records. An agent with recorded handler runs gets a trace. An agent of which only datagrams
-were recorded gets a capture.
+The import uses only recorded data. An agent with recorded handler runs gets a trace. If only the datagrams of an agent
+were recorded, it gets a capture.
 """
 
 import json
@@ -58,8 +58,8 @@ FILE = "import.json"
 class ImportedAgent(BaseModel):
     """The imported files of one agent. Their names are relative to the directory of the flight.
 
-    `trace_from` has the sources of the trace. `handler_runs`, `lives`, `gaps` and `clock_jumps` are counts in the
-    trace.
+    `trace_from` lists the sources of the trace. `handler_runs`, `lives` (incarnations), `gaps` and `clock_jumps` are
+    numbers of these items in the trace.
     """
 
     trace: str | None = None
@@ -101,8 +101,8 @@ class ImportRemark(BaseModel):
 
 
 class ImportRecord(BaseModel):
-    """The result of an import: the flights (the largest is first), the files that were left out, and remarks on the
-    imported files.
+    """The result of an import: the flights (the largest is first), the omitted files, and remarks on the imported
+    files.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -120,7 +120,7 @@ class ImportRecord(BaseModel):
 AGENTS = "agents"
 FLIGHT_LOGS = "flight-logs"
 INCOMPLETE_LINE = '{"lost_lines":'
-"""The beginning of a line. A truncated trace ends with it."""
+"""The beginning of a line about lost lines. A truncated trace ends with it."""
 _COPY_BYTES = 1024 * 1024
 
 
@@ -202,7 +202,7 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
 
 
 def _survived_trace(trace: Trace, export: Export | None) -> bool:
-    """Return true if the agent still ran after the end of its trace, because its export has a later time."""
+    """Return true if the agent was still running after the end of its trace. A later time in its export shows this."""
     if export is None:
         return False
     at_s = mission_s(export.exported_at_us, trace.header)
@@ -210,10 +210,10 @@ def _survived_trace(trace: Trace, export: Export | None) -> bool:
 
 
 def _trace_lines(trace: Trace, *, survived_trace: bool) -> Iterator[str]:
-    """Yield the lines of a trace. Each gap gives one line that replaces the lost lines.
+    """Yield the lines of a trace. One line about each gap replaces the lost lines.
 
-    A trace that ends within a line gets an incomplete last line, because the agent may have been killed there. If it
-    survived, a gap is written instead.
+    If a trace ends within a line, its last line stays incomplete, because the agent may have been killed there. If the
+    agent was still running, a line about a gap is written instead.
     """
     for entry in trace.entries():
         yield gap_line(entry) if isinstance(entry, TraceGap) else entry.to_line()
@@ -242,7 +242,7 @@ def _copy_flight_log(log: Path, directory: Path, number: int) -> str:
 MAX_AGENTS = 1000
 LAST_NS = 2**63 - 1
 MAX_REJECTED = 200_000
-"""Maximum number of unusable parts of a source. A source with more is probably no record at all."""
+"""Maximum number of unusable parts of a source. A source with more of them probably contains no records."""
 _MAX_LISTED = 10
 
 
@@ -257,9 +257,9 @@ def import_records(
 ) -> ImportRecord:
     """Read `sources` with `adapters`, and write all flights in them to `out`, which is an empty or new directory.
 
-    A file that no adapter recognises is read as a file of the harness. With `by_content=False` the first adapter reads
-    all files. `report_progress` receives a text at each step. Raises FieldError if a source does not exist or nothing
-    is usable, and RunDirectoryError if `out` cannot be written.
+    A file that no adapter recognises is read as a file of the harness. If `by_content` is false, the first adapter
+    reads all files. `report_progress` receives a text at each step. Raises FieldError if a source does not exist or
+    nothing is usable, and RunDirectoryError if `out` cannot be written.
     """
     left_out: list[UnusedPart] = []
     adapters = [*adapters]

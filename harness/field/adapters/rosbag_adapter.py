@@ -1,6 +1,6 @@
 """Read ROS bags of versions 1 and 2 without an installation of ROS. The package `rosbags` decodes the messages.
 
-The agents of the thesis were ROS nodes. By convention agent 7 has these topics, and any of them may be missing:
+The agents of the thesis were ROS nodes. By convention agent 7 has the following topics, some of which may be missing:
 
 /ucp/7/trace     std_msgs/String           lines of its trace, the header first
 /ucp/7/sent      std_msgs/UInt8MultiArray  each datagram that it broadcast
@@ -94,7 +94,7 @@ class RosBag(Adapter):
         return content if isinstance(content, str) else bytes(content)
 
     def decoded(self, message: BagMessage) -> Any:
-        """Return the message as an object whose attributes are the fields of its ROS type."""
+        """Decode a message. The attributes of the returned object are the fields of its ROS type."""
         data = message_data(message.data)
         if "/msg/" in message.type_name:
             return self._version_2.deserialize_cdr(data, message.type_name)

@@ -15,9 +15,9 @@ from harness.run.code_state import GitBisection, GitCommit, RepositoryError, Sus
 
 @dataclass(frozen=True)
 class CommitTrial:
-    """The result of testing one commit: `good` (unchanged result), `bad` (changed result), or `skip` (not testable).
+    """The result of testing one commit: `good` (unchanged outcome), `bad` (changed outcome), or `skip` (not testable).
 
-    `why` gives the reason.
+    `why` is the reason.
     """
 
     commit: str
@@ -27,11 +27,10 @@ class CommitTrial:
 
 @dataclass
 class BisectionResult:
-    """The result of a search for a commit. `first` is the first commit that changes the result of a scenario or a
-    record.
+    """The result of a bisection. `first` is the first commit that changes the outcome of a scenario or a record.
 
-    `first` has several commits if some of them cannot be played. It is empty if the outcomes of the good and the bad
-    commit are equal.
+    If some commits cannot be tested, `first` contains several candidates. It is empty if the good and the bad commit
+    have the same outcome.
     """
 
     good: Outcome
@@ -39,9 +38,9 @@ class BisectionResult:
     first: list[GitCommit] = field(default_factory=list)
     tried: list[CommitTrial] = field(default_factory=list)
     changes: list[str] = field(default_factory=list)
-    """Differences between the outcome after the change and that of the good commit."""
+    """Differences between the outcome of the good commit and the outcome after the change."""
     first_difference: RunDifference | None = None
-    """The first difference between the two runs, for a scenario in virtual time."""
+    """The first difference between the runs before and after the change. Only for a scenario in virtual time."""
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -62,8 +61,8 @@ def bisect(
     directory: Path,
     report_progress: Callable[[str], None],
 ) -> BisectionResult:
-    """Test commits between `good` and `bad`. The repository is cloned into `directory`. The caller must remove
-    `directory`.
+    """Search for the first commit with a changed outcome between `good` and `bad`. The repository is cloned into
+    `directory`, which the caller must remove.
 
     `report_progress` receives a line for each commit. Raises HarnessError.
     """

@@ -1,13 +1,13 @@
 """Send the recorded inputs of one agent to a different agent program over UDP, and compare its messages with the
 recorded ones.
 
-The agent runs in a lab with only one other node, which plays all peers. This node sends the datagrams that the peers
+The agent runs in a lab with one other node, which plays all its peers. This node sends the datagrams that the peers
 sent according to the record, at the same times.
 
-Events of the record cannot be logged by another agent, because the agent contract has no command for that. Therefore a
-peer commits the agent's own blocks at the times at which the agent committed them in the record. A reconcile that
-followed one of its own votes is started by command. The agent does everything else by itself, and its messages are
-compared with those in the record.
+The agent contract has no command to log an event, so the agent program cannot log the recorded events. Instead, a peer
+commits the agent's own blocks at the times at which the recorded agent committed them. If a vote of the recorded agent
+led to a reconcile, a command starts this reconcile. The agent program does everything else by itself, and its messages
+are compared with the record.
 """
 
 import asyncio
@@ -54,9 +54,11 @@ from ucp.trace import DroppedDatagram, HandlerRun, RecordedBytes, in_base64
 from ucp.trigger import LocalTrigger, MessageTrigger, OperatorTrigger
 
 START_DELAY_S = 2.0
-"""Time until mission second 0. The node of the peers has started by then."""
+"""Seconds until mission second 0. By then, the node of the peers has started."""
 SLACK_S, SLACK_WALL_S = 1.0, 0.15
-"""Tolerated time difference between a message and the record, in mission seconds, plus wall seconds."""
+"""Tolerated difference between the time of a message and its recorded time: mission seconds, plus seconds of wall
+time.
+"""
 HASH_DIGITS = 12
 
 
@@ -82,7 +84,7 @@ class ExpectedMessage:
 class ScriptedDatagram:
     """A datagram to send to the agent program.
 
-    `after` is the agent's query that it answers, if any, and `asked_s` the time of the query.
+    If the datagram is an answer, `after` is the agent's query, and `asked_s` is the time of the query.
     """
 
     t: float
@@ -97,19 +99,19 @@ class ScriptedDatagram:
 
 @dataclass(frozen=True)
 class PeerScript:
-    """The datagrams and commands to send to the agent program at each mission second, and the messages expected from
-    it.
+    """A script for the peers: the datagrams and commands to send to the agent program at each mission second, and the
+    messages expected from it.
     """
 
     datagrams: list[ScriptedDatagram]
     questions: list[tuple[float, str]]
-    """Mission second and datagram (base64) of each query of the agent."""
+    """Mission second and datagram (in base64) of each query that the recorded agent sent."""
     reconciles: list[float]
     expected: list[ExpectedMessage]
     finished: list[float]
-    """Mission seconds at which a reconcile ended."""
+    """Mission seconds at which a reconcile of the recorded agent ended."""
     lines: list[tuple[float, int]]
-    """Mission second and line number of each line of the record."""
+    """Mission second and line number of each handler run in the record."""
     ends_s: float
 
     def line_at(self, at_s: float) -> int:
@@ -117,17 +119,17 @@ class PeerScript:
         return self.lines[max(0, bisect_right(self.lines, at_s, key=itemgetter(0)) - 1)][1] if self.lines else 0
 
     def is_near_reconcile_end(self, at_s: float, slack_s: float) -> bool:
-        """Return true if a reconcile ended at about that time.
+        """Return true if a reconcile of the recorded agent ended at about that time.
 
-        A process may then answer queries a little earlier or later.
+        Around this time, a process may begin to answer queries slightly earlier or later.
         """
         index = bisect_left(self.finished, at_s - slack_s)
         return index < len(self.finished) and self.finished[index] <= at_s + slack_s
 
 
 def script_of(record: RecordedTrace) -> PeerScript:
-    """Return the inputs before the first restart of the agent. Inputs after a restart would depend on the content of
-    its disk.
+    """Return the script for the inputs before the first restart of the recorded agent. Inputs after a restart would
+    depend on the content of its disk.
     """
     datagrams: list[ScriptedDatagram] = []
     reconciles: list[float] = []
@@ -170,8 +172,8 @@ def script_of(record: RecordedTrace) -> PeerScript:
 
 
 def _question_key(message: Message) -> tuple[type, bytes] | None:
-    """Return the type of the answer to a query, together with the chain or block that is queried. Return None if the
-    message is not a query.
+    """Return the type of the answer to a query, together with the chain or block that the query concerns. Return None
+    if the message is not a query.
     """
     match message:
         case ChainContainQuery():
@@ -319,7 +321,7 @@ class _AgentProgramReplay:
             await _ask(agent, "reconcile")
 
     def _wall_s(self, epoch_us: int, mission_s: float) -> float:
-        """Return the number of seconds of wall time from now until a mission second."""
+        """Return the seconds of wall time from now until a mission second."""
         return max(0.0, epoch_us / MICROSECONDS + mission_s / self._speedup - time.time())
 
 

@@ -24,11 +24,11 @@ from harness.run.code_state import ROOT, ProcessResult, run_python
 from harness.scenario import Scenario
 
 SPEEDUP = 20.0
-"""Mission seconds per second, when an agent process replays a record."""
+"""Mission seconds per second of wall time when an agent program replays a record."""
 RECORD_CORE = "harness.field.bisection._record_core"
-"""The module that plays records with the core under test. It runs as a process."""
+"""The module that plays records with the tested core. The harness starts it as a process."""
 CODE = "{code}"
-"""A placeholder in an agent command for the directory of the code."""
+"""A placeholder in an agent command. It stands for the directory of the code."""
 
 
 class UntestableError(HarnessError):
@@ -36,8 +36,8 @@ class UntestableError(HarnessError):
 
 
 class SubjectPlayer:
-    """A player that can play one scenario or record many times. Each time has its own directory in `directory`, and a
-    limit of `limit_s` seconds.
+    """A player that plays one scenario or record once for each commit. Each play has its own directory in `directory`,
+    and may take `limit_s` seconds.
 
     Without `command`, the code under test plays a scenario in virtual time, and its core plays records. With `command`,
     the installed harness plays a scenario with agent processes, and an agent process replays the record of one agent.
@@ -61,8 +61,8 @@ class SubjectPlayer:
 
     @property
     def is_deterministic(self) -> bool:
-        """True if the same code always gives the same run. Only then is the first difference between two runs
-        meaningful.
+        """True if the same code always gives the same run. If it is false, the first difference between two runs is
+        meaningless.
         """
         return self.subject.scenario is not None and self._command is None
 
@@ -122,8 +122,7 @@ class SubjectPlayer:
         return self._judge(played, run_dir, exact=False), run_dir
 
     def _judge(self, played: ProcessResult, run_dir: Path, *, exact: bool) -> Outcome:
-        """Return the result of a run. The installed checker judges the run, and the checker of the tested commit is not
-        used.
+        """Return the result of a run. The installed checker judges the run, not the checker of the tested commit.
 
         Raises UntestableError.
         """
@@ -192,7 +191,7 @@ class SubjectPlayer:
 
 
 class MachineCannotError(HarnessError):
-    """An error: this machine cannot play the scenario or record with any commit."""
+    """An error: this machine cannot play the scenario or record, regardless of the commit."""
 
     exit_status = CANNOT_HERE
 

@@ -49,7 +49,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _agents(path: Path) -> list[int]:
-    """Return the IDs of the agents that have a trace in the largest flight."""
+    """Return the IDs of all agents that have a trace in the largest flight at this path."""
     return sorted(ingest_files([path]).largest().traces)
 
 

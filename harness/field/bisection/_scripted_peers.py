@@ -1,13 +1,15 @@
 """Play the peers of one agent: `python -m harness.field.bisection._scripted_peers SCRIPT HEARD EPOCH_US SPEEDUP`.
 
-Each line of SCRIPT is a datagram to send, `{"t": mission seconds, "datagram": base64}`, in order of time. A process is
-some milliseconds later than the record, and during a reconcile the delay grows. Fixed sending times would therefore
-change which datagrams reach the agent before a timer expires. So the sending times follow the agent:
+Each line of SCRIPT is a datagram to send, `{"t": mission seconds, "datagram": base64}`, in order of time. An agent
+process is some milliseconds later than in the record, and during a reconcile this delay grows. With fixed sending
+times, datagrams would reach the agent before other timer expiries than in the record. The sending times therefore adapt
+to the agent:
 
-- A response to a query also has the query (`"after"`, the datagram in base64) and its recorded time (`"asked_s"`). It
-  waits until the agent sends that query, with any sequence number.
-- During a reconcile, all other datagrams are delayed as much as the agent's last query was. Lines with `"question"` in
-  place of `"datagram"` have the recorded times of the queries.
+- The line of a response also contains the query (`"after"`, the datagram in base64) and its recorded time
+  (`"asked_s"`). The response waits until the agent sends this query, with any sequence number.
+
+- During a reconcile, all other datagrams are delayed by the delay of the agent's last query. Lines with `"question"`
+  instead of `"datagram"` contain the recorded times of the queries.
 
 HEARD gets a line for each datagram that the agent sends. SIGTERM ends the process.
 """
@@ -33,19 +35,19 @@ DATAGRAMS_PER_TURN = 64
 
 
 MAX_EARLY_S = 2.0
-"""Maximum time, in mission seconds, by which a query may be earlier than in the record."""
+"""Maximum number of mission seconds by which a query may come earlier than in the record."""
 
 
 MARGIN_WALL_S = 0.006
-"""Typical delay of a timer in a process, in wall seconds."""
+"""Typical delay of a timer in an agent process, in seconds of wall time."""
 MAX_QUESTION_GAP_S = 6.0
-"""Mission seconds without a query after which the agent is no longer in a reconcile."""
+"""Mission seconds without a query after which the agent counts as no longer in a reconcile."""
 
 
 class AgentLateness:
-    """The lateness of the agent during a reconcile, compared with the record, in mission seconds.
+    """The delay of the agent during a reconcile, compared with the record, in mission seconds.
 
-    `margin_s` is the additional delay of its next timer.
+    `margin_s` is the additional delay that its next timer is expected to have.
     """
 
     def __init__(self, margin_s: float) -> None:
@@ -54,15 +56,15 @@ class AgentLateness:
         self._asked_s = -math.inf
 
     def note_question(self, now: float, in_record: Iterable[float]) -> None:
-        """Process a query that the agent sent. `in_record` contains the times at which the record has the
-        same query.
+        """Update the delay with a query that the agent sent. `in_record` contains the times of this query in the
+        record.
         """
         nearest = min(in_record, key=lambda at_s: abs(now - at_s), default=None)
         if nearest is not None and abs(now - nearest) < MAX_QUESTION_GAP_S:
             self._late_s, self._asked_s = max(0.0, now - nearest), nearest
 
     def at(self, mission_s: float) -> float:
-        """Return the delay for a datagram that the record has at this mission second."""
+        """Return the delay for a datagram that was sent at this mission second in the record."""
         return self._late_s + self._margin_s if mission_s - self._asked_s < MAX_QUESTION_GAP_S else 0.0
 
 

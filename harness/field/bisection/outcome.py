@@ -20,7 +20,7 @@ from ucp.plain_file import read_json, read_plain_file
 
 MAX_OUTCOME_BYTES = 64 * 1024 * 1024
 TIMING_DEPENDENT = ("2", "5", "6", "liveness")
-"""Keys of judgements that depend on the progress of the agent processes at the end of the run."""
+"""Keys of judgements that depend on how far the agent processes have come at the end of the run."""
 
 
 class _OutcomeModel(BaseModel):
@@ -28,7 +28,7 @@ class _OutcomeModel(BaseModel):
 
 
 class RecordDifference(_OutcomeModel):
-    """A difference between an agent core and a record."""
+    """A difference between the behaviour of an agent core and a record."""
 
     line: int
     handler: str | None
@@ -38,8 +38,9 @@ class RecordDifference(_OutcomeModel):
 class AgentResult(_OutcomeModel):
     """The result of one agent. A field that is None is not compared.
 
-    `chain` has the names of its blocks, oldest first, and `top` its top chain hash. `deviates` is the handler of its
-    first deviation, "" if that is no handler of the protocol. `differences` are those from its record.
+    `chain` contains the names of the agent's blocks, oldest first, and `top` is its top chain hash. `deviates` is the
+    handler of its first deviation, or "" if that is no handler of the protocol. `differences` contains the differences
+    from its record.
     """
 
     chain: list[str] | None = None
@@ -49,9 +50,8 @@ class AgentResult(_OutcomeModel):
 
 
 class Outcome(_OutcomeModel):
-    """The result of playing a scenario or record once.
-
-    `crashed` is the place of the exception in the code under test that ended it.
+    """The outcome of playing a scenario or record once. If an exception in the tested code ended it, `crashed` is the
+    place of this exception.
     """
 
     schema_: Literal["ucp-outcome/1"] = "ucp-outcome/1"
@@ -61,13 +61,13 @@ class Outcome(_OutcomeModel):
     crashed: str | None = None
 
     def as_recorded(self) -> "Outcome":
-        """Return the result that an agent core has if it does not differ from the records."""
+        """Return the outcome that an agent core has if it does not differ from the records."""
         agents = {agent: AgentResult(differences=[]) for agent in self.agents}
         return self.model_copy(update={"agents": agents, "crashed": None})
 
     @property
     def sentence(self) -> str:
-        """The result of one play, described in one line."""
+        """The outcome in one line of text."""
         if self.crashed:
             return f"it crashes: {self.crashed}"
         bad = [key for key, verdict in self.verdicts.items() if kind_of(verdict) == "bad"]
@@ -94,10 +94,10 @@ def _first(result: AgentResult) -> str:
 
 
 def outcome_of_run(subject: str, result: Result, exports: dict[int, Export], *, exact: bool) -> Outcome:
-    """Return the result of a run that the checker has judged.
+    """Return the outcome of a run that the checker has judged.
 
-    If the run is not `exact`, because its processes depend on timing, chains and timing-dependent judgements are left
-    out.
+    If the run is not `exact`, because its processes depend on timing, the outcome omits chains and timing-dependent
+    judgements.
     """
     names = name_blocks(exports)
     first: dict[int, str] = {}
@@ -166,7 +166,7 @@ def _at(chain: list[str], place: int) -> str:
 
 
 def read(path: Path) -> Outcome:
-    """Read a result from a file. Raises RunDirectoryError."""
+    """Read an outcome from a file. Raises RunDirectoryError."""
     try:
         return Outcome.model_validate(read_json(path, MAX_OUTCOME_BYTES))
     except OSError as error:
@@ -180,8 +180,8 @@ YAML = (".yaml", ".yml")
 
 @dataclass(frozen=True)
 class BisectionSubject:
-    """The scenario or the records to play. If `scenario` is None, the records in `path` are played. `agent` selects the
-    records of one agent.
+    """The scenario or the records to play. If `scenario` is None, the subject is the records in `path`. `agent` selects
+    the records of one agent.
     """
 
     path: Path
@@ -201,8 +201,8 @@ class BisectionSubject:
 def subject_of(path: Path, seed: int | None, agent: int | None) -> BisectionSubject:
     """Return the scenario or records at `path`, which the bisection plays.
 
-    A YAML file, a library name, or a run directory of virtual time is a scenario. Every other path is a record. Raises
-    HarnessError.
+    A YAML file, the name of an included scenario, and a run directory of virtual time are scenarios. Every other path
+    contains records. Raises HarnessError.
     """
     path = load.find_file(path)
     if path.suffix in YAML or (path.is_file() and _is_scenario(path)):
@@ -228,7 +228,7 @@ def _is_scenario(path: Path) -> bool:
 
 
 def _played(path: Path) -> tuple[Scenario, int] | None:
-    """Return the scenario and the seed of a run if playing them gives the same run again. Return None otherwise."""
+    """Return the scenario and the seed of a run if playing them again gives the same run. Return None otherwise."""
     record = RunArchive(path).record
     if record.backend != "sim" or record.scenario is None or record.seed is None:
         return None

@@ -1,5 +1,5 @@
 """Calibrate the radio model of a scenario with the records and flight logs of a real flight.
 
-`_delivery_model.py` has the model and its fit. `_attempts.py` and `_positions.py` read the records. `calibration.py`
-validates the fit and makes the scenario.
+`_delivery_model.py` defines the model and fits it. `_attempts.py` and `_positions.py` read the records.
+`calibration.py` validates the fit and writes the scenario.
 """

@@ -1,9 +1,9 @@
 """Find out which messages reached which vehicles, and the distance between sender and receiver at that time.
 
 A capture shows each frame of its vehicle, so captures are preferred. A trace shows the messages that its agent handled.
-An agent in virtual time is not given messages without effect, so only some types count there, and only while the agent
-does not reconcile. Messages are matched by sender, type and sequence number, not by time. The clock of the sender
-determines the time of an attempt.
+In virtual time, an agent does not receive messages without effect. Only some message types count there, and only while
+the agent does not reconcile. Messages are matched by sender, type and sequence number, not by time. The time of a
+transmission is the sending time on the sender's clock.
 """
 
 from bisect import bisect_left, bisect_right
@@ -25,13 +25,13 @@ from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 from ucp.trigger import MessageTrigger
 
 ON_AIR_S = 0.005
-"""Two messages whose sending differs by at most this time count as on the air at the same time."""
+"""Maximum number of seconds between the sending times of two messages that count as on the air at the same time."""
 _NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitBlock, ChainContainQuery))
 
 
 class _SentMessage(NamedTuple):
-    """A message, with the vehicles that received it (`reached`) and those that did not (`lost`), as far as the records
-    show.
+    """A message with the vehicles that received it (`reached`) and the vehicles that did not (`lost`), as far as the
+    records show.
     """
 
     at_s: float
@@ -42,8 +42,8 @@ class _SentMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class ObservedTransmissions:
-    """All transmissions of messages to receivers, the source of these data, and a sentence for each part of the records
-    that cannot be used.
+    """All transmissions of messages to receivers, the source of these data, and a sentence for each unusable part of
+    the records.
     """
 
     attempts: list[TransmissionAttempt]
@@ -151,8 +151,8 @@ class _ReceivingAgent:
         return message in _NEVER_WITHHELD and not any(around)
 
     def takes(self, key: tuple[int, str, int]) -> bool:
-        """Return true if the agent handled the message. If the agent handled a message once, only the first call for it
-        returns true.
+        """Return true if the agent handled the message. A message that was handled once gives true only for the first
+        call.
         """
         self._handled[key] -= 1
         return self._handled[key] >= 0

@@ -7,22 +7,25 @@ A receiver at d metres gets a message with probability
 
 - `range_m` is the distance at which path loss and shadowing lose half of the messages.
 - `spread` is the standard deviation of the shadowing, in units of ln(distance).
-- `floor` is the loss that no distance explains.
-- `load` is the loss per message of another vehicle on the air at about the same time, `others` their number.
+- `floor` is the loss rate that does not depend on the distance.
 
-The last factor is the model `log_distance` of a scenario. Delivery alone does not identify its parameters. Transmit
-power, sensitivity and the loss of the first metre only shift the same margin, so `range_m` stands for all of them.
-Twice the exponent and twice the shadowing in dB give the same delivery, so `spread` stands for both: the shadowing is
-`10 / ln(10) * exponent * spread` dB. The caller must know the exponent, for example from signal strengths.
+- `load` determines the loss by the messages of other vehicles on the air at about the same time. `others` is the number
+  of these messages.
 
-Messages over one link are correlated, because a building or a wing shadows many of them. Intervals from independent
-draws would be too short. So the attempts are divided into clusters, and each interval comes from the jackknife over
-clusters: the fit without each cluster, in one step of Newton's method (Cameron and Miller, Journal of Human Resources
-50(2), 2015, section VI.B). The clusters are links in blocks of time, and whole links; the wider interval counts. A
-bootstrap over clusters costs hundreds of fits and covers less with few clusters.
+The last factor is the model `log_distance` of a scenario. The deliveries do not determine all its parameters. Transmit
+power, sensitivity and the loss of the first metre have the same effect, so `range_m` stands for all of them. If the
+exponent and the shadowing in dB are both doubled, the delivery does not change, so `spread` stands for both: the
+shadowing is `10 / ln(10) * exponent * spread` dB. The caller must know the exponent, for example from signal strengths.
 
-The intervals of `floor` and `load` must work at zero. They are profile likelihood intervals. Their threshold is scaled
-by the ratio of the jackknife variance to that of independent draws.
+Messages over one link are correlated, because a building or a wing shadows many of them. Intervals that assume
+independent messages would be too short. The transmissions are therefore divided into clusters, and each interval comes
+from the jackknife over clusters: the model is fitted without each cluster in turn, in one step of Newton's method
+(Cameron and Miller, Journal of Human Resources 50(2), 2015, section VI.B). This is done with two kinds of clusters:
+links in blocks of time, and whole links. The wider interval counts. A bootstrap over clusters would need hundreds of
+fits, and would be less accurate with few clusters.
+
+`floor` and `load` can be zero, so their intervals are profile likelihood intervals. The threshold of these intervals is
+scaled by the ratio of the jackknife variance to the variance of independent messages.
 """
 
 import math
@@ -34,13 +37,13 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 BLOCK_S = 120.0
-"""Length in seconds of the time blocks of a link."""
+"""Length in seconds of the blocks of time into which the messages of a link are divided."""
 MIN_DISTANCE_M = 1.0
 LEVEL = 0.95
 PARAMETERS = ("range_m", "spread", "floor", "load")
 
 _STEPS_PER_FOLD = 50
-"""Steps of distance per factor e, in which attempts are counted together."""
+"""Number of steps per factor e of distance. Transmissions in the same step are counted together."""
 _MOST_ITERATIONS = 60
 _LEAST = 1e-9
 _LOWEST = (math.log(1.0), math.log(0.02), 0.0, 0.0)
@@ -59,7 +62,7 @@ class TransmissionAttempt(NamedTuple):
     distance_m: float
     delivered: bool
     others: int = 0
-    """Number of messages of other vehicles on the air at about the same time."""
+    """Number of messages from other vehicles on the air at about the same time."""
 
     @property
     def link(self) -> frozenset[int]:
@@ -68,7 +71,7 @@ class TransmissionAttempt(NamedTuple):
 
 @dataclass(frozen=True)
 class DeliveryModel:
-    """The parameters of the model of delivery. The docstring of the module explains them."""
+    """The parameters of the delivery model. The docstring of this module explains them."""
 
     range_m: float
     spread: float
@@ -84,8 +87,8 @@ class DeliveryModel:
 
     @property
     def wide(self) -> float:
-        """Return the distance at which 10 % of the messages arrive divided by the distance at which 90 % arrive.
-        `floor` counts as 0.
+        """Return the ratio of two distances: at the first one 10 % of the messages arrive, and at the second one 90 %.
+        `floor` is treated as 0.
         """
         return math.exp(2 * _NORMAL.inv_cdf(0.9) * self.spread)
 
@@ -110,7 +113,7 @@ class FittedModel:
     clusters: int
     log_likelihood: float
     constant_log_likelihood: float
-    """Log likelihood of the model with one loss for all messages."""
+    """Log likelihood of a model with the same loss rate for all messages."""
 
 
 class _TransmissionCluster(NamedTuple):
@@ -125,9 +128,9 @@ class _TransmissionCluster(NamedTuple):
 
 
 def fit(attempts: Sequence[TransmissionAttempt], *, with_load: bool = True) -> FittedModel | None:
-    """Fit the model to transmissions. Return None if the transmissions do not determine a range and a spread.
+    """Fit the model to transmissions. Return None if the transmissions do not determine the range and the spread.
 
-    That is the case if all or no messages arrived, or if the distances hardly differ.
+    This is the case if all or no messages arrived, or if the distances hardly differ.
     """
     rows = _rows(attempts)
     cells = _cells(rows)
@@ -161,8 +164,8 @@ def _rows(attempts: Iterable[TransmissionAttempt]) -> list[_TransmissionCluster]
 
 
 def _cells(rows: Iterable[_TransmissionCluster]) -> list[_TransmissionCluster]:
-    """Combine transmissions of different clusters. The likelihood of the combined transmissions is the same and faster
-    to compute.
+    """Combine transmissions with similar distances across clusters. The likelihood stays the same and is faster to
+    compute.
     """
     counts: dict[tuple[float, int], list[int]] = defaultdict(lambda: [0, 0])
     for row in rows:
@@ -340,7 +343,7 @@ def _intervals(
 def _profile(
     rows: Sequence[_TransmissionCluster], values: Vector, least: float, free: Sequence[int], parameter: int
 ) -> tuple[float, float]:
-    """Return the values of a parameter at which its profile likelihood falls to the value `least`."""
+    """Return the values of a parameter at which its profile likelihood falls to `least`."""
     others = [each for each in free if each != parameter]
 
     def inside(value: float) -> bool:
@@ -364,7 +367,7 @@ def _profile(
 def student(freedom: float) -> float:
     """Return the quantile of Student's t for a two-sided interval at `LEVEL` (Abramowitz and Stegun, 26.7.5).
 
-    The series is exact to 0.1 % from 3 degrees of freedom on. Fewer count as 3.
+    The series is exact to 0.1 % from 3 degrees of freedom on. Fewer degrees of freedom count as 3.
     """
     nu, z = max(freedom, 3.0), _NORMAL.inv_cdf(0.5 + LEVEL / 2)
     return (
@@ -377,8 +380,8 @@ def student(freedom: float) -> float:
 
 
 def wilson(delivered: float, attempts: float) -> ConfidenceInterval:
-    """Return the confidence interval of a share of independent draws (Wilson, JASA 22, 1927). Without draws, it is 0 to
-    1.
+    """Return Wilson's confidence interval of a probability from independent draws (Wilson, JASA 22, 1927). Without
+    draws, it is 0 to 1.
     """
     if not attempts:
         return ConfidenceInterval(0.0, 1.0)

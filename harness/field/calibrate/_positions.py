@@ -1,8 +1,9 @@
 """Find the positions of the vehicles over time in `tracks.jsonl` of a run, in flight logs, or in logged events.
 
-For each vehicle, the first of these sources counts. A flight log belongs to the agent with the vehicle's MAVLink system
-ID. Only records with GPS time are used, because the clocks of the autopilot and of the computer have no relation to
-mission time. Between two positions a vehicle flies straight. A longer gap than MAX_GAP_S has no positions.
+For each vehicle, the first of these sources that exists is used. A flight log belongs to the agent with the vehicle's
+MAVLink system ID. Only records with GPS time are used, because the clocks of the autopilot and of the computer have no
+relation to mission time. Between two known positions, a straight path is assumed. In gaps longer than MAX_GAP_S, the
+position is unknown.
 """
 
 import math
@@ -26,7 +27,7 @@ _FARTHEST_M = 200_000.0
 _BEGINNING_BYTES = 4096
 
 Place = tuple[float, float, float, float]
-"""Mission seconds, degrees north, degrees east, metres above mean sea level."""
+"""A known position: mission second, degrees north, degrees east, metres above mean sea level."""
 
 
 @dataclass

@@ -1,8 +1,9 @@
 """Estimate the path loss exponent from the signal strengths that telemetry radios reported (RADIO_STATUS).
 
-The ground station is taken to be where the vehicle took off. The strength falls by 10 * exponent dB per factor of ten
-in distance. The unit of SiK radios is 1.9 counts per dB (SiK, Firmware/radio/radio.c). The interval is from the
-jackknife over minutes, because neighbouring samples share their shadowing.
+The module assumes that the ground station is at the place where the vehicle took off. The signal strength falls by 10 *
+exponent dB when the distance grows by a factor of ten. The unit of SiK radios is 1.9 counts per dB (SiK,
+Firmware/radio/radio.c). The interval comes from the jackknife over minutes, because neighbouring samples have the same
+shadowing.
 """
 
 import math
@@ -19,7 +20,7 @@ _PLAUSIBLE = (1.0, 6.0)
 _METRES_PER_DEGREE = 111_195.0
 
 Sample = tuple[float, float, int]
-"""ln(distance), strength in dB, number of the minute."""
+"""A sample: ln(distance), signal strength in dB, number of the minute."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,8 @@ class SignalFit:
 
 
 def fit_signal(positions: Positions) -> SignalFit | None:
-    """Estimate the path loss exponent from the signal strengths in all logs. Return None if they do not
-    determine it.
+    """Estimate the path loss exponent from the signal strengths in all logs. Return None if the logs do not determine
+    it.
     """
     samples = [sample for number, log in enumerate(positions.logs) for sample in _samples(positions, number)]
     minutes = sorted({minute for _, _, minute in samples})

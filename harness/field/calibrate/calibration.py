@@ -28,7 +28,9 @@ from netem.channel import PRESETS
 from netem.radio import LogDistance
 
 TRAINING_SHARE = 2 / 3
-"""Part of the flight time that the validation fits. The rest is predicted."""
+"""The beginning of the flight, as a share of its time, to which the validation fits the model. The model then predicts
+the rest.
+"""
 BLOCK_S = 120.0
 _BINS = 10
 _MAX_LOSS = 0.9999
@@ -36,11 +38,11 @@ _MAX_LOSS = 0.9999
 
 @dataclass(frozen=True)
 class ModelValidation:
-    """The test of a model that was fitted to the beginning of the flight. The model predicts the end, and is compared
-    with a constant loss rate.
+    """The test of a model that was fitted to the beginning of the flight. The model predicts the rest of the flight,
+    and is compared with a constant loss rate.
 
-    A lower score is better. `bins` has, for each tenth of the predicted probability: number of messages, mean
-    prediction and delivered share.
+    A lower score is better. `bins` has an entry for each tenth of the predicted probability: the number of messages,
+    the mean prediction, and the share that arrived.
     """
 
     attempts: int
@@ -62,7 +64,7 @@ class ModelValidation:
 
 @dataclass(frozen=True)
 class DeliveryShare:
-    """The share of some messages that arrived. Its confidence interval assumes independent messages."""
+    """The share of messages that arrived. Its confidence interval assumes independent messages."""
 
     attempts: int
     delivered: int
@@ -76,7 +78,7 @@ class DeliveryShare:
 
 @dataclass(frozen=True)
 class LinkDelivery:
-    """The share of messages that arrived over one link: in total, and in each block of time."""
+    """The share of messages that arrived over one link: for the whole flight, and for each block of time."""
 
     one: int
     other: int
@@ -139,7 +141,7 @@ class CalibrationResult:
     def network(self, preset: str | None = None) -> dict[str, Any]:
         """Return the section `network` of a scenario. It contains a radio, or the shared channel of a preset.
 
-        A channel computes the losses by other messages itself, so its constant loss is only the floor.
+        A shared channel simulates the losses caused by other messages, so only `floor` remains as its constant loss.
         """
         if self.fit is None:
             delivered = sum(attempt.delivered for attempt in self.attempts)
@@ -272,7 +274,7 @@ def calibrate(paths: Sequence[Path]) -> CalibrationResult:
 
 def validate(attempts: Sequence[TransmissionAttempt]) -> ModelValidation | None:
     """Fit the model to the beginning of the flight, and test how well it predicts the end. Return None if the beginning
-    does not determine the model.
+    is not sufficient for a fit.
     """
     first_s, last_s = min(each.at_s for each in attempts), max(each.at_s for each in attempts)
     until_s = first_s + TRAINING_SHARE * (last_s - first_s)
@@ -306,8 +308,8 @@ def _brier(predicted: Sequence[float], outcomes: Sequence[bool]) -> float:
 
 
 def _log_score(predicted: Sequence[float], outcomes: Sequence[bool]) -> float:
-    """Return the mean of -ln(predicted probability of the outcome) over all transmissions. Probabilities are limited to
-    0.001 to 0.999.
+    """Return the mean of -ln(p) over all transmissions, where p is the predicted probability of the observed outcome.
+    Probabilities are limited to 0.001 to 0.999.
     """
     bounded = [min(max(p, 0.001), 0.999) for p in predicted]
     return -sum(math.log(p if d else 1 - p) for p, d in zip(bounded, outcomes, strict=True)) / len(outcomes)
@@ -336,6 +338,6 @@ def share_of(attempts: Sequence[TransmissionAttempt]) -> DeliveryShare:
 
 
 def model_of(radio: LogDistance, loss: float = 0.0) -> DeliveryModel:
-    """Return a model with the same probability of arrival as this radio with an additional loss rate."""
+    """Return a delivery model with the same probabilities as this radio with an additional loss rate."""
     range_m = 10 ** (radio.margin_db(1.0) / (10 * radio.exponent))
     return DeliveryModel(range_m, radio.shadowing_db * math.log(10) / (10 * radio.exponent), loss)

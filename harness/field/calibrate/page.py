@@ -94,8 +94,8 @@ def _delivery(calibration: CalibrationResult) -> Markup:
 
 
 def _residuals(calibration: CalibrationResult) -> Markup:
-    """Draw the residuals: the share of messages that arrived minus the share that the model predicts. Without a model,
-    the predicted share is constant.
+    """Draw the residuals: the share of messages that arrived minus the share that the model predicts. If no model was
+    fitted, the predicted share is constant.
     """
     area = _areas(2)[1]
     across, up = _distance_axis(calibration, area), svg.linear_axis(-0.5, 0.5, area.up)

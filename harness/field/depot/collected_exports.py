@@ -1,8 +1,8 @@
 """Read the chain exports of a mission. If an export is damaged, use all of its undamaged parts.
 
-A truncated export is read up to its end, and an edited or damaged one without its damaged parts. The hash of a block is
-computed from its content (eq. 3.1). If the file has another hash, the difference is reported. Vehicles that hold the
-same block share one object for it.
+A truncated export is used up to its end. An edited or damaged export is used without its damaged parts. The hash of a
+block is computed from its content (eq. 3.1). A different hash in the file is reported. If several vehicles hold the
+same block, memory contains one object for it.
 """
 
 import base64
@@ -57,9 +57,10 @@ EXPORT_AGAIN = "export it again if you can"
 
 @dataclass(frozen=True)
 class ReadExport:
-    """A chain export that was read, and its file. The hashes in `export` are correct.
+    """A chain export and its file. The hashes in `export` are the computed ones.
 
-    `problems` has a sentence for each error. `claims` maps the true hash of each wrong block to the hash in the file.
+    `problems` has a sentence for each error. If a block has a wrong hash in the file, `claims` maps its computed hash
+    to the wrong one.
     """
 
     path: Path
@@ -76,7 +77,7 @@ class ReadExport:
 class CollectedExports:
     """The exports of one mission: the latest export of each agent, and the exports that the same agents made earlier.
 
-    `left_out` has a sentence for each unused file, and `remarks` has further facts about the used ones.
+    `left_out` has a sentence for each unused file, and `remarks` has further facts about the used files.
     """
 
     latest: dict[int, ReadExport]
@@ -84,16 +85,18 @@ class CollectedExports:
     left_out: list[str]
     remarks: list[str]
     roster: set[int] = field(default_factory=set)
-    """Agents that other files name: mission files, traces, a manifest, or the record of the run."""
+    """The agents that other files of the mission name: mission files, traces, a manifest, or the record of the run."""
     traced: dict[int, list[str]] = field(default_factory=dict)
-    """Hashes of the blocks that agents without an export completed, according to their traces."""
+    """Agent without an export -> hashes of the blocks that the agent completed, according to its trace."""
     flight_logs: list[FlightLog] = field(default_factory=list)
     telemetry: bool = True
-    """True if events come from vehicles, unless a file contradicts that."""
+    """False if a file shows that the events are not telemetry of vehicles. True otherwise."""
     wrong_signatures: list[str] = field(default_factory=list)
-    """A sentence on each wrong signature, in a secured mission."""
+    """A sentence about each wrong signature in a secured mission."""
     unproven: str | None = None
-    """The reason why valid signatures prove nothing. None if they do, or if the mission was not secured."""
+    """The reason why valid signatures do not prove that the exports are genuine. None if they do, or if the mission was
+    not secured.
+    """
 
     @property
     def read_exports(self) -> list[ReadExport]:
@@ -115,10 +118,9 @@ class CollectedExports:
 
     @property
     def claims(self) -> dict[str, str]:
-        """The blocks that have a wrong hash in a file. The keys are the correct hashes, and the values are the wrong
-        ones.
+        """The blocks that have a wrong hash in a file: computed hash -> wrong hash.
 
-        A block is not wrong if another export has it under its true hash, or if its agent completed it.
+        A block is not included if another export contains it with the computed hash, or if its agent completed it.
         """
         claims = {true: claimed for read_export in self.read_exports for true, claimed in read_export.claims.items()}
         for read_export in self.read_exports if claims else ():
@@ -129,7 +131,7 @@ class CollectedExports:
 
 @gc_paused()
 def collect_exports(paths: Iterable[Path], keys: "PublicKeys | None" = None) -> CollectedExports:
-    """Return the exports in these files and directories that belong to the mission with the most agents.
+    """Read the exports in these files and directories. Return those of the mission with the most agents.
 
     `keys` are public keys that the user trusts. Without them, signatures are verified with the keys in the directories.
     Raises FieldError if a path does not exist, and ExportError if no export is usable.
@@ -220,8 +222,8 @@ class NotAnExportError(ExportError):
 
 
 def _largest_mission(read_exports: Iterable[ReadExport]) -> str:
-    """Return the hash of the inception block of the mission with the most agents. If several have equally many, return
-    the one with the most blocks.
+    """Return the hash of the inception block of the mission with the most agents. Of several such missions, return the
+    one with the most blocks.
     """
     agents: dict[str, set[int]] = {}
     blocks: Counter[str] = Counter()
@@ -248,7 +250,7 @@ def _other_missions(read_exports: Iterable[ReadExport], mission: str) -> Iterato
 
 
 def _by_agent(read_exports: Iterable[ReadExport], left_out: list[str]) -> CollectedExports:
-    """Group the exports by agent. The latest export of an agent has its current state. Earlier exports may contain
+    """Group the exports by agent. The latest export of an agent contains its current state. Earlier exports may contain
     blocks that the latest one lacks.
     """
     collected = CollectedExports({}, [], left_out, [])
@@ -277,7 +279,7 @@ def _by_agent(read_exports: Iterable[ReadExport], left_out: list[str]) -> Collec
 
 
 class _PartialExport(Export):
-    """An export in which every key has a default value."""
+    """An export with a default value for every missing key."""
 
     agent_id: AgentId | None = None  # type: ignore[assignment]
     exported_at_us: Annotated[int, Field(ge=0, strict=True)] = 0
@@ -385,7 +387,9 @@ def _edited(path: Path, which: str, claimed: str) -> str:
 
 
 def _content(path: Path, named_by_user: bool) -> bytes:
-    """Return the content of a file if the user named the file, or if it looks like an export."""
+    """Return the content of a file. Return None if the user did not name the file and it does not look like an
+    export.
+    """
     try:
         with BoundedFile(path, MAX_EXPORT_BYTES) as file:
             if not named_by_user and path.suffix != ".json" and _FORMAT not in file.peek(BEGINNING_BYTES):
@@ -399,7 +403,7 @@ def _content(path: Path, named_by_user: bool) -> bytes:
 
 
 def _recover(path: Path, data: bytes, problems: list[str]) -> Export:
-    """Return the undamaged parts of an export. For each error, a sentence is added to `problems`."""
+    """Return the undamaged parts of an export. Add a sentence to `problems` for each error."""
     if _FORMAT not in data:
         raise NotAnExportError(f"{path}: not a chain export")
     text = data.decode("utf-8", errors="replace")
@@ -438,12 +442,14 @@ def _recover(path: Path, data: bytes, problems: list[str]) -> Export:
 
 
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.|\\\Z)*(?:"|\Z)|[\[\]{},]', re.DOTALL)
-"""A JSON string or bracket. A truncated string extends to the end of the text, even if it contains brackets."""
+"""A pattern for a JSON string or bracket. A truncated string extends to the end of the text, even if it contains
+brackets.
+"""
 _FLAT_OBJECT = re.compile(r"\{[^{}]*\}")
 
 
 def _parse_prefix(text: str) -> Any:
-    """Return the complete parts of a truncated JSON value. Return None if no part is complete."""
+    """Return the undamaged beginning of a truncated JSON value. Return None if no part of it is complete."""
     closing: list[str] = []
     complete_end, after = 0, ""
     for token in _TOKEN.finditer(text):
@@ -462,7 +468,7 @@ def _parse_prefix(text: str) -> Any:
 
 
 def _intact_blocks(text: str) -> Iterator[Any]:
-    """Yield each block in a text whose hash is correct. The text around a block may have any content."""
+    """Yield each block in a text whose hash is correct. The text between the blocks may be anything."""
     for candidate in _FLAT_OBJECT.finditer(text):
         try:
             block = ExportedBlock.model_validate_json(candidate[0])

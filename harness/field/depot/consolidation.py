@@ -1,9 +1,10 @@
-"""Merge the exports of a mission into one ordered record. It lists each block once with its holders, and the missing
-blocks.
+"""Merge the exports of a mission into one ordered record. The record lists each block once with its holders, and the
+missing blocks.
 
-Blocks are in the order of `harness.field.depot.record_lines`. The current block of an agent at its export comes after
-them, unless a completed block begins with the same events. In that case both are the same block at different times.
-Therefore each event of each chain, deque, reconcile stack or current block occurs exactly once.
+Blocks have the order that `harness.field.depot.record_lines` defines. They are followed by the unfinished blocks that
+agents had when they exported their chains. If a completed block begins with the events of an unfinished block, both are
+the same block at different times, and only the completed one is listed. Therefore each event of each chain, deque,
+reconcile stack or current block occurs exactly once.
 """
 
 import base64
@@ -41,7 +42,7 @@ _HEADER = struct_of(EVENT_FIELDS)
 
 @dataclass(frozen=True)
 class RecordedBlock:
-    """A block of the merged record. The events of the block are decoded when they are needed."""
+    """A block of the merged record. Its events are decoded only when they are needed."""
 
     line: Block
     event_data: bytes
@@ -76,7 +77,7 @@ class MergedRecord:
 
     @property
     def unfinished(self) -> list[RecordedBlock]:
-        """The blocks that their agents had not completed when they exported their chains."""
+        """The unfinished blocks: their agents had not completed them when they exported their chains."""
         return [block for block in self.blocks if block.line.block_hash is None]
 
 
@@ -164,12 +165,12 @@ def _header(
 
 
 def _without_surrogates(text: str) -> str:
-    """Return the text of a file name. Bytes that are not valid text are replaced by question marks."""
+    """Return a file name as valid text. Bytes that are not valid text become question marks."""
     return text.encode(errors="replace").decode()
 
 
 def _event_data(block: ExportedBlock, event_data: EventData) -> tuple[bytes, bool]:
-    """Return the event data of a block, and whether the data are still encrypted."""
+    """Return the event data of a block, decrypted if possible, and whether they are still encrypted."""
     try:
         return event_data.of_block(block), False
     except SealedError:
@@ -177,8 +178,8 @@ def _event_data(block: ExportedBlock, event_data: EventData) -> tuple[bytes, boo
 
 
 def events_in(event_data: bytes) -> list[tuple[int, int, int, int]]:
-    """Return the events at the beginning of the data, up to the first unreadable one: timestamp, event ID, and the
-    start and end of the event's own data.
+    """Return the events up to the first unreadable one. Each event has its timestamp, its ID, and the start and end
+    positions of its data.
     """
     events, offset = [], 0
     last_header = len(event_data) - EVENT_HEADER_BYTES
@@ -197,8 +198,8 @@ def _unreadable(event_data: bytes, events: Sequence[tuple[int, int, int, int]]) 
 
 
 def _names(collected: CollectedExports) -> dict[str, str]:
-    """Return the names of the blocks by hash. A block that was modified in a file has the name of the original block,
-    followed by "(edited)".
+    """Return block hash -> name of the block. If a file contains a modified block, its name is that of the original
+    block, followed by "(edited)".
     """
     claims = collected.claims
     exports: dict[int, Export] = {}
@@ -224,7 +225,7 @@ def _names(collected: CollectedExports) -> dict[str, str]:
 
 
 def _holdings(collected: CollectedExports) -> dict[str, list[Holding]]:
-    """Return, for each block hash, the agents that hold the block."""
+    """Return block hash -> the agents that hold the block, with the places."""
     where: dict[str, dict[tuple[Place, int | None, str | None], list[int]]] = defaultdict(lambda: defaultdict(list))
     for agent_id, export in collected.exports.items():
         for position, block in enumerate(export.chain, 1):
@@ -248,8 +249,8 @@ def _holdings(collected: CollectedExports) -> dict[str, list[Holding]]:
 
 
 def _add_unfinished(recorded_blocks: list[RecordedBlock], collected: CollectedExports) -> None:
-    """Add the unfinished block of each export. If a recorded block begins with the same events, the unfinished block
-    becomes a part of that block.
+    """Add the unfinished block of each export. If a recorded block begins with the same events, both are the same
+    block, and only its holders are added.
     """
     building = [
         (base64.b64decode(export.current_block.event_data), export)
@@ -321,7 +322,7 @@ def _lost_blocks(
     names: Mapping[str, str],
     without_export: Sequence[int],
 ) -> list[MissingItem]:
-    """Return the blocks that their agents completed, but that no export contains."""
+    """Return the completed blocks that are lost: no export contains them."""
     lost: dict[str, MissingItem] = {}
     edited = {*collected.claims.values()}
     for read_export in collected.read_exports:

@@ -1,10 +1,10 @@
 """Reconcile the exports of a mission by running the protocol without vehicles (Section 5.1).
 
-Each export is put into an agent, as after a brown-out (`Agent.boot`). The agents run in virtual time on a network
-without loss. One agent after another reconciles, until a round changes no chain, as at the end of a run. Then each
-agent receives the blocks in its deque and proposes them. Edited blocks are left out. Blocks that only an earlier export
-of an agent contains are put on its reconcile stack, and so return to the top of its chain. Current blocks stay as they
-are, because no further events occur.
+An agent starts with the content of each export, as after a power failure (`Agent.boot`). The agents run in virtual time
+on a network without loss. The agents reconcile one after another, until no chain changes in a round, as in a final
+reconcile. Then each agent receives the blocks in its deque and proposes them. Edited blocks are omitted. Blocks that
+only an earlier export of an agent contains are put on its reconcile stack. The agent then commits them on top of its
+chain. Unfinished blocks do not change, because no further events occur.
 """
 
 import base64
@@ -31,7 +31,7 @@ from ucp.clock import MICROSECONDS
 from ucp.store import StoredState
 
 LIMIT_S = 1e7
-"""Time limit for the agents to become idle, in virtual seconds. A block that is popped takes five seconds."""
+"""Maximum time for the agents to become idle, in virtual seconds. Popping a block takes five seconds."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,9 @@ class ReconciledExports:
 
 
 def reconcile(record: MergedRecord, report_progress: Callable[[str], None] = lambda words: None) -> ReconciledExports:
-    """Reconcile the exports of a record with each other. `report_progress` is called with texts about the progress."""
+    """Reconcile the exports of a merged record with each other. `report_progress` is called with texts about the
+    progress.
+    """
     collected = record.collected
     stored = _stored(collected)
 
@@ -91,7 +93,7 @@ async def _reconcile(swarm: RestoredSwarm) -> int:
 
 
 def write(reconciliation: ReconciledExports, directory: Path) -> None:
-    """Write the exports after the reconcile. Raises MachineError if that fails."""
+    """Write the exports after the reconcile to a directory. Raises MachineError if that fails."""
     try:
         for agent_id, export in reconciliation.exports.items():
             write_json_atomically(directory / f"{agent_id}{SUFFIX}", export.model_dump(mode="json", by_alias=True))
@@ -122,7 +124,9 @@ def _signatures(collected: CollectedExports) -> dict[bytes, bytes]:
 
 
 def _stored(collected: CollectedExports) -> dict[int, StoredState]:
-    """Return the initial state of each agent, from its export. Repeated blocks and modified blocks are left out."""
+    """Return the initial state of each agent, which comes from its export. Repeated blocks and modified blocks are
+    omitted.
+    """
     claims, shared_blocks = collected.claims, dict[str, Block]()
     stored = {}
     held_anywhere = {block.block_hash for export in collected.exports.values() for block in export.blocks()}

@@ -1,8 +1,9 @@
 """Compare the files of all vehicles key by key, to find out whether they belong to the same mission.
 
-Mission files must agree in all values that a swarm shares, and must differ in the values that are unique per vehicle. A
-manifest has the expected values. Without one, the most frequent values are expected. Chain exports and traces in the
-same directory must have the same inception block and roster. An unreadable file counts as a difference.
+Mission files must be equal in all values that a swarm shares, and must differ in the values that are unique for each
+vehicle. If a manifest exists, it contains the expected values. Without a manifest, the most frequent values are
+expected. Chain exports and traces in the same directory must have the same inception block and roster. An unreadable
+file counts as a difference.
 """
 
 import base64
@@ -45,7 +46,7 @@ class UnreadableFileError(HarnessError):
 
 @dataclass(frozen=True)
 class SharedValue:
-    """A value that must be the same in all files. `key` is its key in this file."""
+    """A value that must be the same in all files. `key` is the name of its key in this file."""
 
     key: str
     value: Hashable
@@ -79,7 +80,7 @@ class MissionDifference:
 
 @dataclass
 class MissionComparison:
-    """The compared files of a mission, and the differences between these files."""
+    """The files of a mission that were compared, and their differences."""
 
     files: list[ComparedFile]
     differences: list[MissionDifference]
@@ -286,8 +287,8 @@ def _shown(value: Any) -> str:
 
 
 def _deviating_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
-    """Yield a difference for each value that differs from the value in the manifest. Without a manifest, compare with
-    the most frequent value.
+    """Yield a difference for each value that differs from the expected value. The expected value is in the manifest.
+    Without a manifest, it is the most frequent value.
     """
     names = dict.fromkeys(name for file in files for name in file.shared)
     for name in names:
@@ -315,8 +316,8 @@ def _deviating_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifferen
 
 
 def _has_settings_to_compare(file: ComparedFile, others: Sequence[ComparedFile]) -> bool:
-    """Return true if single settings can be compared. Their differences then replace a sentence about the hash of the
-    settings.
+    """Return true if single settings can be compared. The comparison then names the differing settings instead of
+    reporting a different hash of all settings.
     """
     return file.mission is not None and any(other.mission is not None for other in others)
 
@@ -340,8 +341,8 @@ def _duplicate_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifferen
 
 
 def _roster_differences(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
-    """Yield a difference for each agent on the roster without a mission file, and for each file of an agent that is not
-    on the roster.
+    """Yield a difference for each agent on the roster that has no mission file, and for each file of an agent that is
+    not on the roster.
     """
     rosters = [file for file in files if ROSTER in file.shared and file.kind in ("manifest", "mission file")]
     if not rosters:
@@ -373,7 +374,7 @@ def _roster_differences(files: Sequence[ComparedFile]) -> Iterator[MissionDiffer
 
 
 def _files(paths: Iterable[Path]) -> list[tuple[Path, bool]]:
-    """Return each file once, as (file, true if the user named the file and not its directory)."""
+    """Return each file once, with true if the user named the file itself, and false if the user named its directory."""
     files: dict[Path, tuple[Path, bool]] = {}
     for path in paths:
         if path.is_dir():
@@ -390,8 +391,8 @@ def _files(paths: Iterable[Path]) -> list[tuple[Path, bool]]:
 
 
 def _in_directory(directory: Path) -> list[Path]:
-    """Return the JSON files in a directory. If there are none, return the JSON files in its subdirectories, one of
-    which belongs to each vehicle.
+    """Return the JSON files in a directory. If it has none, return the JSON files in its subdirectories, because each
+    vehicle may have its own subdirectory.
     """
     agents_folder = agents_directory(directory)
     for pattern in ("*.json*", "*/*.json*"):

@@ -1,9 +1,9 @@
 """Write the mission files of all agents, and a manifest that describes them (`ucp-mission-manifest/1`).
 
-They equal the files that a run gives to its agents (`harness.play.process.agent_mission`), with some differences for
-real flights. Time has no speedup, and there are no quirks. Each vehicle has an address of the user's network. Each
-agent keeps a store, so that a brown-out loses no data. Each file is parsed by the agent's own parser before it is
-written.
+The mission files are like those that a run gives to its agents (`harness.play.process.agent_mission`), with some
+differences for real flights. They have no speedup and no quirks. Each vehicle has an address in the user's network.
+Each agent keeps a store, so that a power failure loses no data. Each file is parsed by the agent's own parser before it
+is written.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ from ucp.settings import Settings
 
 FILE = "manifest.json"
 EXACT = 2**53
-"""Integers up to this number are exact as floats."""
+"""Largest integer up to which every integer is exact as a float."""
 
 
 class ManifestInception(BaseModel):
@@ -88,9 +88,9 @@ class MissionFileError(HarnessError):
 class MissionPlan:
     """The plan of a mission before it is written. `settings` and `events` override values of the scenario.
 
-    The address of a vehicle is given in `addresses`, or is the address in `subnet` with its ID as the number. Without a
-    subnet, the address is that of a run (`netem.addresses`). The broadcast address follows from the subnet unless it is
-    given. If `secured`, each vehicle has a bundle of keys in the directory of its mission file.
+    The address of a vehicle is in `addresses`, or is computed from `subnet` and the ID of the vehicle. Without a
+    subnet, it is the same as in a run (`netem.addresses`). The broadcast address follows from the subnet if it is not
+    given. If `secured` is true, the key bundle of each vehicle is in the directory of its mission file.
     """
 
     scenario: Scenario
@@ -164,10 +164,10 @@ class MissionPlan:
 
 
 def write(plan: MissionPlan, directory: Path, *, overwrite: bool = False) -> list[Path]:
-    """Write the mission files and the manifest. Return their paths. The manifest is last.
+    """Write the mission files and the manifest. Return their paths, with the manifest as the last one.
 
     Raises MissionFileError, or MachineError on a disk error. Raises RunDirectoryError if a file exists and `overwrite`
-    is false, or if the directory has other mission files.
+    is false, or if the directory contains further mission files.
     """
     documents = {f"{agent_id}{SUFFIX}": document for agent_id, document in plan.documents().items()}
     missions = {name: parse_mission(document) for name, document in documents.items()}

@@ -10,10 +10,10 @@
 Data is in base64, hashes are in lower-case hex, and times are in microseconds, as in blocks. The data of a block, and
 so its hash, can be computed again from its events and its unreadable part.
 
-The mutual chain comes first, in the order that all agents share. Each other block comes after its predecessors in all
-chains, as long as the chains do not contradict each other. Of several possible next blocks, the one with the earliest
-timestamp comes first, then the one with the lowest agent ID. If chains contradict each other about the order of some
-blocks, these blocks stand together in order of time. Therefore equal exports give an equal order.
+The mutual chain comes first, in the order that all agents share. Each other block comes after the blocks that precede
+it in any chain, unless the chains contradict each other. If several blocks could be next, the one with the earliest
+timestamp is next, and of these the one with the lowest agent ID. If chains have some blocks in different orders, these
+blocks are listed together in order of time. The same exports therefore always give the same order.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -39,7 +39,7 @@ class RecordLine(BaseModel):
 
 
 class ExportUsed(RecordLine):
-    """An export that was used, with the numbers of blocks in it. `latest` is true for the most recent export of an
+    """A chain export that was used, and the numbers of blocks in it. `latest` is true for the most recent export of an
     agent.
     """
 
@@ -57,7 +57,8 @@ class ExportUsed(RecordLine):
 
 
 class Header(RecordLine):
-    """The first line: the mission, its exports, and totals. `roster` has the IDs of all agents known to have flown.
+    """The first line of the record: the mission, its exports, and totals. `roster` contains the IDs of all agents that
+    are known to have flown.
 
     `problems` has a sentence for each error in an export, `left_out` for each unused file, and `remarks` for other
     facts.
@@ -102,11 +103,11 @@ class Fork(RecordLine):
 
 
 class Holding(RecordLine):
-    """A place at which agents hold a block, and these agents. `position` counts from 1: in a chain from the inception
-    block, in a deque from the front, in a stack from the bottom.
+    """A place at which some agents hold a block, and the IDs of these agents. `position` counts from 1: in a chain from
+    the inception block, in a deque from the front, in a stack from the bottom.
 
-    Blocks with the same `chain_hash` have the same predecessors. `current block` means that the agent had the first
-    events of the block. `earlier export` means that only an older export of the agent has the block.
+    Blocks with the same `chain_hash` have the same predecessors. The place `current block` means that the agent had not
+    completed the block yet. `earlier export` means that only an older export of the agent contains the block.
     """
 
     place: Place
@@ -116,11 +117,12 @@ class Holding(RecordLine):
 
 
 class Block(RecordLine):
-    """A block. `number` counts the blocks of the record from 1. `block_hash` is null for an incomplete block.
+    """The line of a block. The blocks of the record are numbered from 1 in `number`. `block_hash` is null for an
+    incomplete block.
 
     `mutual` is true if all chains share the block. `claimed_hash` is the wrong hash in a file that was edited or
-    damaged. `unreadable` is the data after the last readable event. `sealed` is true if the data is encrypted. It is
-    then all `unreadable`.
+    damaged. `unreadable` is the data after the last readable event. `sealed` is true if the data is encrypted. All its
+    data are then in `unreadable`.
     """
 
     line: Literal["block"] = "block"
@@ -143,7 +145,9 @@ class Block(RecordLine):
 
 
 class Event(RecordLine):
-    """One event. `block` is the number of its block, and `index` is its position in the block, from 0."""
+    """The line of an event. `block` is the number of its block, and `index` is its position in the block, counted from
+    0.
+    """
 
     line: Literal["event"] = "event"
     block: Number
@@ -155,8 +159,8 @@ class Event(RecordLine):
 
 
 class MissingItem(RecordLine):
-    """A missing block of the agent `agent_id`. If `block` is null, the vehicle itself is missing. `agents` are the
-    missing vehicles that may have the block, or only `agent_id`.
+    """The line of a missing block of agent `agent_id`. If `block` is null, the vehicle itself is missing. `agents`
+    lists the missing vehicles that may have the block, or only `agent_id`.
     """
 
     line: Literal["lost"] = "lost"
@@ -180,7 +184,7 @@ class ReconcileResult(RecordLine):
     """The last line of the record: the result of a final reconcile of the exports. `chain` contains the hashes of the
     uniform chain, oldest first. It is empty if the chains are not uniform.
 
-    `left_out` has the blocks in no chain, each with the reason.
+    `left_out` lists the blocks that are in no chain, with the reasons.
     """
 
     line: Literal["reconciled"] = "reconciled"
@@ -211,7 +215,7 @@ def mutual_chain(chains: Iterable[Sequence[str]]) -> Sequence[str]:
 def ordered(blocks: Mapping[str, ExportedBlock], chains: Sequence[Sequence[str]]) -> list[str]:
     """Return the hashes of `blocks` in the order of the merged record.
 
-    `blocks` includes all blocks of the chains. There is at least one chain.
+    `blocks` includes all blocks of the chains. `chains` has at least one chain.
     """
     mutual = mutual_chain(chains)
     first = set(mutual)

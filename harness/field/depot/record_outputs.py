@@ -83,7 +83,7 @@ def table(record: MergedRecord) -> str:
 
 
 def flight_logs(record: MergedRecord) -> list[MatchedLog]:
-    """Return the flight logs, each with the agent that flew on its vehicle."""
+    """Return the flight logs, each with the agent of its vehicle."""
     if not record.collected.flight_logs:
         return []  # the events of all blocks need not be decoded
     logged = {track.agent_id: track.fixes for track in tracks(record)}
@@ -91,8 +91,8 @@ def flight_logs(record: MergedRecord) -> list[MatchedLog]:
 
 
 def flown_tracks(matches: Iterable[MatchedLog]) -> list[EventTrack]:
-    """Return the path in each flight log that belongs to an agent. Times are UTC if the log has GPS time, otherwise
-    times on the log's clock.
+    """Return the flight path from each flight log that belongs to an agent. Times are UTC if the log has GPS time.
+    Otherwise they are times on the log's clock.
     """
     return [
         EventTrack(match.agent_id, [], [_fix(position) for position in match.vehicle.positions])
@@ -124,7 +124,8 @@ MAX_NAMES = 8
 
 
 def in_words(record: MergedRecord, reconciled: ReconcileResult | None = None, *, opened: bool = False) -> Iterator[str]:
-    """Yield sentences about the exports, diverged chains, blocks on one vehicle only, lost blocks, and the reconcile.
+    """Yield sentences about the exports, diverged chains, blocks that only one vehicle holds, lost blocks, and the
+    reconcile.
 
     `opened` is true if the depot's key was given.
     """
@@ -208,7 +209,9 @@ def agents(ids: Sequence[int]) -> str:
 
 
 def _single_copies(record: MergedRecord) -> Iterator[str]:
-    """Yield a sentence for each vehicle that is the only holder of some blocks. Its loss would have destroyed them."""
+    """Yield a sentence for each vehicle that is the only holder of some blocks. The loss of this vehicle would have
+    destroyed these blocks.
+    """
     if len(record.collected.latest) < 2:
         return
     single_copies: dict[int, list[str]] = {}

@@ -1,8 +1,8 @@
 """Collect the records in a flight log, detect jumps of its clock, and convert its times to UTC.
 
-A clock segment is the part of a log between two jumps of its clock. In each segment, a time is converted by straight
-lines through the medians of GPS time in each ten seconds. Medians ignore single late or damaged records. The lines
-follow the drift of the clock, and the rate of a simulated vehicle that flies faster than real time.
+A clock segment is the part of a log between two jumps of its clock. In each segment, times are converted by straight
+lines through points. Each point is the median of GPS time in ten seconds. The median ignores single late or damaged
+records. The lines account for the drift of the clock, and for a simulated vehicle that flies faster than real time.
 """
 
 from bisect import bisect_left
@@ -13,12 +13,14 @@ from typing import Any, TypeVar
 from harness.field.flight_logs._records import ClockJump, FlightRecord, GpsTime
 
 MAX_RECORDS = 500_000
-"""Maximum number of records in a file. A copter logs about 60,000 per hour."""
+"""Maximum number of records that are stored from a file. A copter logs about 60,000 per hour."""
 MAX_TIME_US = 2**53
 _BACK_US, _AHEAD_US = 1_000_000, 60_000_000
 _BIN_US = 10_000_000
 _MAX_DRIFT = 0.01
-"""Difference in rate from which a clock counts as that of a simulated vehicle. Real clocks differ by 0.0001 or less."""
+"""Difference in rate above which a clock counts as the clock of a simulated vehicle. The rates of real clocks differ by
+0.0001 or less.
+"""
 _SECOND_US = 1_000_000
 _UNKNOWN = object()
 
@@ -26,8 +28,8 @@ Kind = TypeVar("Kind", bound=FlightRecord)
 
 
 class LogClock:
-    """The clock of a flight log. It drops a single record with a wrong time. Several new times that agree with each
-    other count as a jump of the clock.
+    """The clock of a flight log. It rejects a single record with a wrong time. Several records with consistent new
+    times count as a jump of the clock.
     """
 
     def __init__(self) -> None:
@@ -60,7 +62,7 @@ def _consistent(before_us: int, after_us: int) -> bool:
 
 
 class RecordBudget:
-    """The number of records that may still be stored from a file."""
+    """The number of further records that may be stored from a file."""
 
     def __init__(self) -> None:
         self.left = MAX_RECORDS
@@ -82,8 +84,8 @@ class RecordCollector:
         self._last_state: dict[type[Any], Hashable] = {}
 
     def add(self, record: FlightRecord) -> bool:
-        """Store a record. Its time is converted to UTC at the end of the segment. Return false if the limit of records
-        is reached.
+        """Store a record. Its time is converted to UTC at the end of the segment. Return false if the limit of the
+        number of records is reached.
         """
         kept = self._budget.take()
         if kept:
@@ -124,7 +126,7 @@ class RecordCollector:
         return True
 
     def end_segment(self) -> None:
-        """Convert the times of all records to UTC that were stored since the previous call."""
+        """Return the records of one type, in the order of the file."""
         to_utc = (
             _PiecewiseLinearClock(
                 [
@@ -150,8 +152,8 @@ class RecordCollector:
 
 
 class _PiecewiseLinearClock:
-    """A conversion to UTC by straight lines through points (time on the log's clock, UTC). The first and the last line
-    continue beyond their points.
+    """A conversion of times to UTC by straight lines through points (time on the log's clock, UTC). The first and the
+    last line are extended beyond the points.
     """
 
     def __init__(self, points: list[tuple[int, int]]) -> None:

@@ -1,8 +1,8 @@
 """Read DataFlash, the binary log that ArduPilot writes on the vehicle.
 
 Each message begins with A3 95 and the number of its type. Messages of type FMT define the other types: name, length,
-types and names of the columns. A message has no checksum. So a message counts only if another one, or the end of the
-file, follows it directly. The numbers in a message are checked for plausible ranges.
+types and names of the columns. Messages have no checksum. A message is therefore used only if another message or the
+end of the file follows it directly. The values in a message must have plausible ranges.
 
 Only the messages in `_HANDLERS` are decoded. The others are skipped by their length.
 """
@@ -29,7 +29,7 @@ from harness.field.flight_logs._records import (
 MAGIC = b"\xa3\x95"
 FMT = 128
 MAX_MESSAGES = 30_000_000
-"""Maximum number of messages in a file, about seven hours of flight."""
+"""Maximum number of messages that are read from a file. They correspond to about seven hours of flight."""
 _FMT_BYTES = 89
 _MAX_DEFINITIONS = 4096
 _CHUNK_BYTES = 1024 * 1024
@@ -40,7 +40,7 @@ _COLUMN_TYPES: dict[str, tuple[str, float | None]] = {
     **{"a": ("64s", None), "g": ("e", None), "n": ("4s", None), "N": ("16s", None), "Z": ("64s", None)},
     **{"c": ("h", 100), "C": ("H", 100), "e": ("i", 100), "E": ("I", 100), "L": ("i", 1e7), "M": ("b", None)},
 }
-"""Code of a column in FMT -> its code in `struct`, and the divisor of its values."""
+"""Code of a column type in an FMT message -> its code in Python's `struct`, and the divisor of its values."""
 _VEHICLE_PARAMETERS = ("MAV_SYSID", "SYSID_THISMAV")
 _EVENT_ARMED, _EVENT_DISARMED = 10, 11
 _FAILSAFES = {
@@ -52,9 +52,9 @@ _FAILSAFES = {
     11: "terrain failsafe",
     19: "crash failsafe",
 }
-"""ModeReason of ArduPilot -> words. Other reasons are no failsafe."""
+"""Number of ArduPilot's ModeReason -> description of the failsafe. Other reasons are no failsafes."""
 _FIRMWARE = {"ArduPlane": 1, "ArduCopter": 2, "ArduRover": 10, "Rover": 10}
-"""First word of the firmware's text -> MAV_TYPE."""
+"""First word of the firmware's text -> type of the vehicle (MAV_TYPE)."""
 
 Values = dict[str, Any]
 
@@ -74,14 +74,14 @@ class _MessageDefinition(NamedTuple):
 
 
 class DataFlashReader:
-    """A reader of one DataFlash file. The method `read` stores the records in collectors."""
+    """A reader for one DataFlash file. The method `read` stores the records in collectors."""
 
     def __init__(self) -> None:
         budget = RecordBudget()
         self.budget = budget
         self.vehicle = RecordCollector(budget)
         self.gps_positions = RecordCollector(budget)
-        """Positions of the GPS receiver, for logs without estimated positions."""
+        """Positions of the GPS receiver. They are used for logs without estimated positions."""
         self.clock = LogClock()
         self.damage = DamagedBytes()
         self.vehicle_id: int | None = None
@@ -112,7 +112,7 @@ class DataFlashReader:
         self.gps_positions.end_segment()
 
     def _messages(self, stream: BinaryIO) -> Iterator[tuple[_MessageDefinition, bytes, int]]:
-        """Yield the messages to decode, each as its definition, the buffer, and the position of its first column."""
+        """Yield the messages to decode. Each has its definition, the buffer, and the position of its first column."""
         lengths = [0] * 256
         lengths[FMT] = _FMT_BYTES
         definitions: dict[int, _MessageDefinition] = {}

@@ -3,12 +3,16 @@
 from harness.field.flight_logs._records import GpsTime
 
 _EPOCH_S = 315_964_800
-"""1980-01-06, the beginning of GPS time, in seconds since the Unix epoch."""
+"""The beginning of GPS time, 1980-01-06, in seconds since the Unix epoch."""
 _WEEK_MS = 7 * 86_400_000
 _LEAPS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (1_230_768_000, 15), (1_136_073_600, 14))
-"""(seconds since the Unix epoch, GPS time minus UTC from then on), newest first (IERS Bulletin C)."""
+"""Leap seconds as (seconds since the Unix epoch, GPS time minus UTC from then on). The newest entry is first (IERS
+Bulletin C).
+"""
 _OLDEST_S, _NEWEST_S = 1_136_073_600, 4_102_444_800
-"""2006 and 2100. Another time comes from damage, or from a receiver without a fix."""
+"""The years 2006 and 2100, as limits of a plausible time. Times outside come from damage, or from a receiver without a
+fix.
+"""
 
 
 def from_week(at_us: int, week: int, week_ms: int) -> GpsTime | None:

@@ -4,20 +4,22 @@ import math
 from dataclasses import dataclass
 
 MAX_SEARCHES = 500_000
-"""Maximum number of searches for the next message in a file."""
+"""Maximum number of times that the reader searches for the next message in a file."""
 _NO_PLACE_DEG = 0.01
 _ALTITUDES_M = (-1000.0, 100_000.0)
 
 
 @dataclass
 class DamagedBytes:
-    """The bytes of a flight log that do not belong to a message."""
+    """A counter of the bytes in a flight log that belong to no message."""
 
     searches: int = 0
     skipped_bytes: int = 0
     first_at: int | None = None
     ends_at: int | None = None
-    """Byte from which the file is not read, because it has too much damage. None if it is read to its end."""
+    """Position of the byte at which reading stopped because of too much damage. None if the file was read to its
+    end.
+    """
     unusable: int = 0
     """Number of messages with an unknown layout or impossible values."""
 
@@ -28,7 +30,7 @@ class DamagedBytes:
             self.first_at = at
 
     def ends_reading(self, at: int) -> bool:
-        """Return true if the file has too much damage before the byte `at` to continue reading."""
+        """Return true if the file has so much damage before the byte `at` that reading must stop."""
         if self.searches <= MAX_SEARCHES:
             return False
         self.ends_at = at
@@ -52,7 +54,7 @@ class DamagedBytes:
 def is_place(lat_deg: float, lon_deg: float, alt_m: float) -> bool:
     """Return true if these values are a position on Earth.
 
-    A vehicle that does not know its position yet reports a place near 0° N, 0° E.
+    A place near 0° N, 0° E does not count, because vehicles report it while they do not know their position.
     """
     return (
         -90 <= lat_deg <= 90

@@ -1,13 +1,13 @@
 """Find out which agent flew on the vehicle of each flight log, by comparing times and positions.
 
 An agent logs positions of its vehicle as events, and the flight log has the same positions more densely. Both come from
-the same messages of the autopilot. So a moving vehicle passes each place at a known time on the clock of the agent, and
-at a known time of the log. The difference of these times is the same for all places if the log belongs to the agent.
-It is also the error of the agent's clock if the log has GPS time. The vote of all places for a difference needs no
-clock to be right, and ignores places at which a vehicle stays.
+the same messages of the autopilot. A moving vehicle therefore passes each place at a known time on the agent's clock,
+and at a known time on the clock of the log. If the log belongs to the agent, the difference of these times is the same
+for all places. If the log has GPS time, the difference is the error of the agent's clock. Each place votes for a
+difference. This method needs no correct clock, and ignores places at which a vehicle stays.
 
-The system ID of a vehicle decides only if the positions of the agent do not: without positions, for a vehicle that did
-not move, and never for a log of another place or day.
+The system ID of a vehicle decides only if positions cannot decide: if the agent logged none, or if the vehicle did not
+move. It never assigns a log of another place or day.
 """
 
 import math
@@ -21,25 +21,30 @@ from typing import Protocol
 from harness.field.flight_logs._records import FlightLog, Position, VehicleLog
 
 MAX_PLACES = 500
-"""Maximum number of positions of an agent that vote."""
+"""Maximum number of an agent's positions that vote for a time difference."""
 MAX_ASIDE_M = 3.0
-"""Maximum distance of a logged position from the track in the flight log. Vehicles may fly side by side."""
+"""Maximum distance in metres of a logged position from the track in the flight log. It is small because vehicles may
+fly side by side.
+"""
 _CELL_DEG = 1e-4
 """Size of a cell in degrees of latitude, about eleven metres."""
 _PAUSE_US = 5_000_000
-"""Time between two positions near a place from which they belong to two visits."""
+"""Microseconds between two positions near a place. After a longer time, they belong to two different visits."""
 _MAX_VISIT_US = 20_000_000
-"""A vehicle that is near a place for a longer time stays there. The visit then does not vote."""
+"""Maximum duration of a visit in microseconds. A vehicle that is near a place for longer stays there, and the visit
+does not vote.
+"""
 _BIN_US = 1_000_000
 _MIN_VOTES = 3
 _MIN_SHARE = 0.5
-"""Share of the moving positions that must agree."""
+"""Minimum share of the positions of a moving vehicle that must agree on a time difference."""
 _SAME_FLIGHT_S = 60.0
 _NEAR_M = 1_000.0
 _DAY_US = 86_400_000_000
 _FIRST_UTC_US = 1_000_000_000_000_000
-"""An earlier timestamp comes from a clock that was never set. From here on, a clock is at most a day off. Otherwise the
-flight of another day along the same path would match."""
+"""Earliest timestamp of a clock that was set. Earlier timestamps come from clocks that were never set. A set clock is
+assumed to be wrong by at most a day. Otherwise the flight of another day along the same path would match.
+"""
 _METRES_PER_DEGREE = 111_195.0
 
 
@@ -53,15 +58,15 @@ class LoggedPosition(Protocol):
 
 
 Fixes = Sequence[tuple[int, LoggedPosition]]
-"""The positions of an agent with their timestamps in microseconds."""
+"""An agent's positions with their timestamps in microseconds."""
 
 
 @dataclass(frozen=True)
 class MatchedLog:
     """A vehicle in a flight log, and its agent. `agent_id` is None if none of the known agents flew on the vehicle.
 
-    `evidence` completes "is of agent 10 by ...", or "matches no agent: ...". `clock_ahead_s` is the time on the agent's
-    clock minus GPS time, None if unknown.
+    `evidence` completes a sentence such as "is of agent 10 by ..." or "matches no agent: ...". `clock_ahead_s` is the
+    time on the agent's clock minus GPS time. It is None if unknown.
     """
 
     log: FlightLog
@@ -74,7 +79,7 @@ class MatchedLog:
 def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[MatchedLog]:
     """Find the agent of each vehicle in the flight logs. `agents` contains the logged positions of each agent.
 
-    Of several flights along the same path, an agent keeps the one whose time is nearest to its own clock.
+    If an agent matches several flights along the same path, it gets the one that is nearest in time by its own clock.
     """
     matches = [_match(log, vehicle, agents) for log in logs for vehicle in log.vehicles]
     nearest: dict[int, float] = {}
@@ -169,8 +174,8 @@ def _vote(positions: Sequence[Position], fixes: Fixes) -> _ClockDifference | Non
 
 
 def _visits(near: list[tuple[int, Position]], fix: LoggedPosition) -> Iterator[int]:
-    """Yield the time of each short visit of the vehicle at a place. On a visit, the vehicle comes within MAX_ASIDE_M of
-    the place.
+    """Yield the time of each short visit of the vehicle at a place. During a visit, the vehicle is within MAX_ASIDE_M
+    of the place.
     """
     near.sort(key=lambda timed: timed[0])
     visit: list[tuple[int, Position]] = []
@@ -197,7 +202,9 @@ def _passage(before: tuple[int, Position], after: tuple[int, Position], fix: Log
 
 
 def _metres(position: Position, fix: LoggedPosition) -> tuple[float, float]:
-    """Return the distance from a logged position to a position of the vehicle, in metres north and in metres east."""
+    """Return the distance between a logged position and a position of the vehicle, in metres north and in metres
+    east.
+    """
     east_deg = (position.lon_deg - fix.lon_e7 / 1e7) * math.cos(math.radians(position.lat_deg))
     return (position.lat_deg - fix.lat_e7 / 1e7) * _METRES_PER_DEGREE, east_deg * _METRES_PER_DEGREE
 

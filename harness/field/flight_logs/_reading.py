@@ -36,7 +36,7 @@ def flight_log_kind(path: Path, beginning: bytes) -> LogKind | None:
     """Return the format of the flight log that begins with these bytes. Return None if the bytes do not begin a flight
     log.
 
-    A damaged beginning is recognised by the suffix of the file, together with a mark of the format.
+    If the beginning is damaged, the format is recognised by the suffix of the file and by typical bytes of the format.
     """
     from harness.field.flight_logs._telemetry import begins_with_frame  # pymavlink takes 0.1 s to import
 

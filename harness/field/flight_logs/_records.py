@@ -1,4 +1,4 @@
-"""Define the records in a flight log. The docstring of the package explains their times."""
+"""Define the types of records in a flight log. The docstring of the package explains their times."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ class ModeChange(NamedTuple):
     name: str
     """The name of the mode, or its number if it has no known name."""
     failsafe: str | None = None
-    """The failsafe that changed the mode, such as "battery failsafe". Only DataFlash logs have it."""
+    """The failsafe that caused the change of mode, such as "battery failsafe". Only DataFlash logs contain it."""
 
 
 class ArmingChange(NamedTuple):
@@ -81,15 +81,15 @@ class EkfStatus(NamedTuple):
 
 
 class GpsTime(NamedTuple):
-    """The GPS time that belongs to a time on the log's clock. There is at most one record per second."""
+    """The GPS time at a certain time of the log's clock. There is at most one record per second."""
 
     at_us: int
     utc_us: int
-    """UTC according to this record alone. The `utc_us` of other records are from the median of many of these."""
+    """UTC according to this record alone. The `utc_us` of other records comes from the median of many such records."""
     week: int
     week_ms: int
     leap_seconds: int
-    """GPS time minus UTC at this time, from a table, because the logs do not have it."""
+    """GPS time minus UTC at this time. It comes from a table, because logs do not contain it."""
 
 
 class RadioStatus(NamedTuple):
@@ -105,7 +105,7 @@ class RadioStatus(NamedTuple):
     """Free space in the transmit buffer."""
     rx_errors: int
     fixed: int
-    """Number of packets that error correction repaired."""
+    """Number of packets that the error correction of the radio repaired."""
 
 
 class Parameter(NamedTuple):
@@ -118,11 +118,11 @@ class Parameter(NamedTuple):
 
 
 class ClockJump(NamedTuple):
-    """A jump of the log's clock. A jump is recorded when two records have new times that agree with each other and not
-    with the old time.
+    """A jump of the log's clock. It is recorded when two records have new times that are consistent with each other but
+    not with the old time.
 
-    A restart of the autopilot, a corrected clock of the computer, and a pause of the log look the same. Only a clock
-    that goes back is certainly wrong.
+    A restart of the autopilot, a correction of the computer's clock, and a pause of the log look the same. Only if the
+    time decreases, the clock was certainly wrong.
     """
 
     at_us: int
@@ -140,9 +140,11 @@ class VehicleLog:
     """The records of one vehicle in a flight log."""
 
     vehicle: int | None
-    """The MAVLink system ID. None if a DataFlash log does not have the parameter."""
+    """The MAVLink system ID. None if the parameter is missing in a DataFlash log."""
     mav_type: int | None
-    """MAV_TYPE: 1 plane, 2 quadcopter, 10 rover. A DataFlash log gives 2 for every kind of copter."""
+    """The type of the vehicle (MAV_TYPE): 1 plane, 2 quadcopter, 10 rover. A DataFlash log has 2 for every kind of
+    copter.
+    """
     positions: list[Position]
     modes: list[ModeChange]
     arming: list[ArmingChange]
@@ -169,12 +171,14 @@ class FlightLog:
     path: Path
     kind: LogKind
     vehicles: list[VehicleLog]
-    """One vehicle for DataFlash. One or more for telemetry, in order of their system IDs."""
+    """The vehicles in the log. A DataFlash log has one. A telemetry log has one or more, in the order of their system
+    IDs.
+    """
     radio: list[RadioStatus]
-    """The radio at the autopilot (DataFlash), or at the recording computer (telemetry)."""
+    """The states of the radio at the autopilot (DataFlash), or at the recording computer (telemetry)."""
     clock_jumps: list[ClockJump]
     problems: list[str]
-    """Sentences without the name of the file."""
+    """A sentence for each problem of the file. The sentences do not contain the name of the file."""
 
 
 _TYPE_NAMES = {

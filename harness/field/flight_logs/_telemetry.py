@@ -1,10 +1,10 @@
 """Read telemetry logs. They contain MAVLink frames of version 1 or 2, each preceded by the time of its arrival.
 
-The time is a big-endian u64 in microseconds since the Unix epoch. A frame of a known message counts only with the right
-checksum. A frame of another message counts if a frame or the end of the file follows it.
+The time is a big-endian u64 in microseconds since the Unix epoch. A frame of a known message is used only if its
+checksum is correct. A frame of an unknown message counts if a frame or the end of the file follows it.
 
-Frames of the autopilot (component 1) of each system are decoded, and RADIO_STATUS of any system. Only the messages in
-`_HANDLERS` are decoded.
+The reader decodes frames of the autopilot (component 1) of each system, and RADIO_STATUS of any system. Only the
+messages in `_HANDLERS` are decoded.
 """
 
 import math
@@ -28,7 +28,7 @@ from harness.field.flight_logs._records import (
 )
 
 MAX_MESSAGES = 10_000_000
-"""Maximum number of messages in a file, about two hours of ten vehicles."""
+"""Maximum number of messages that are read from a file. They correspond to about two hours of ten vehicles."""
 _CHUNK_BYTES = 1024 * 1024
 _STAMP_BYTES = 8
 _V1, _V2 = 0xFE, 0xFD
@@ -50,7 +50,7 @@ class SystemLog:
 
 
 class TelemetryReader:
-    """A reader of one telemetry log. The method `read` stores the records in collectors."""
+    """A reader for one telemetry log. The method `read` stores the records in collectors."""
 
     def __init__(self) -> None:
         self.budget = RecordBudget()
@@ -217,8 +217,8 @@ def _values(message: int, payload: bytes) -> Values:
 
 
 def _frame_at(buffer: bytes, at: int) -> tuple[int, int, int, int, bytes] | None:
-    """Return the end, system ID, component ID, message ID and payload of the frame at a position. Return None if there
-    is no frame.
+    """Return the end, system ID, component ID, message ID and payload of the frame at a position. Return None if no
+    frame begins there.
     """
     if len(buffer) < at + _STAMP_BYTES:
         return None

@@ -1,7 +1,7 @@
 """Read all files of a flight. Find out, for each file, its agent, its flight and the part that can be used.
 
 Field data is often broken. Lines are truncated, two flights are in one file, a file exists twice, and unrelated files
-lie in the same directory. Ingesting uses everything usable, and reports everything that it leaves out.
+lie in the same directory. This package uses every usable part, and reports every part that it omits.
 """
 
 from harness.field.ingest._ingest import FileRemark, Flight, IngestResult, UnusedPart

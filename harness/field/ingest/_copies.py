@@ -1,4 +1,4 @@
-"""Combine several copies of the same trace. One copy may contain lines that are lost in the others."""
+"""Combine several copies of the same trace. One copy may contain lines that another copy has lost."""
 
 from collections.abc import Iterator
 
@@ -11,10 +11,10 @@ from ucp.trace import HandlerRun
 def split_into_flights(
     incarnations: list[TraceIncarnation], left_out: list[UnusedPart]
 ) -> Iterator[list[TraceIncarnation]]:
-    """Yield groups of traces of one agent with the same header. The traces of each group belong to one flight.
+    """Group traces of one agent that have the same header. Yield groups whose traces belong to the same flight.
 
-    Successive incarnations belong to the same flight, overlapping ones to different flights. Copies are combined into
-    one.
+    Successive incarnations belong to the same flight. Overlapping incarnations belong to different flights. Copies are
+    combined into one trace.
     """
     flights: list[list[TraceIncarnation]] = []
     for incarnation in sorted(incarnations, key=_quality, reverse=True):
@@ -65,7 +65,7 @@ def _key(run: HandlerRun) -> tuple[object, ...]:
 
 
 def _is_copy(incarnation: TraceIncarnation, other: TraceIncarnation) -> bool:
-    """Return true if most handler runs of one trace are also in the other trace."""
+    """Return true if most handler runs of one trace also occur in the other trace."""
     if not incarnation.runs:
         return not other.runs and incarnation.path != other.path
     if incarnation.runs == other.runs[: len(incarnation.runs)]:
@@ -77,9 +77,10 @@ def _is_copy(incarnation: TraceIncarnation, other: TraceIncarnation) -> bool:
 
 
 def _overlap(incarnation: TraceIncarnation, other: TraceIncarnation, *, anywhere: bool = False) -> bool:
-    """Return true if the times of two traces overlap. One agent cannot have such traces in the same flight.
+    """Return true if the times of two traces overlap. Two such traces of one agent cannot belong to the same flight.
 
-    Incarnations in the same file follow each other, whatever their times are. With `anywhere` this does not count.
+    Incarnations in the same file count as successive, regardless of their times. If `anywhere` is true, the times count
+    even then.
     """
     if (incarnation.path == other.path and not anywhere) or not incarnation.runs or not other.runs:
         return False
@@ -87,7 +88,7 @@ def _overlap(incarnation: TraceIncarnation, other: TraceIncarnation, *, anywhere
 
 
 def _fill_gaps(incarnation: TraceIncarnation, copy: TraceIncarnation) -> int:
-    """Insert handler runs that are missing in the trace `incarnation` and present in its copy. Return the number of
+    """Insert handler runs that are missing in the trace `incarnation` and that its copy contains. Return the number of
     inserted handler runs.
     """
     where = {_key(run): position for position, run in enumerate(copy.runs)}

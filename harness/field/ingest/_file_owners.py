@@ -1,5 +1,5 @@
-"""Find the mission of a packet capture, and the flight of a file with public keys. Neither file names its mission or
-flight.
+"""Find the mission of a packet capture, and the flight of a file with public keys. The files themselves do not name
+them.
 """
 
 import base64
@@ -22,9 +22,9 @@ MAX_FRAMES_READ = 5000
 
 @dataclass(frozen=True)
 class CaptureSummary:
-    """The facts about a packet capture by which its flight can be found.
+    """The facts about a packet capture that are needed to find its flight.
 
-    `hashes` are the block and chain hashes in its datagrams, in hex.
+    `hashes` are the block and chain hashes in its datagrams, in hexadecimal.
     """
 
     path: Path
@@ -32,7 +32,7 @@ class CaptureSummary:
     epoch_us: int | None
     hashes: frozenset[str]
     source: Path
-    """The original file. It differs from `path` if an import made the capture."""
+    """The original file of the capture. It differs from `path` if an import created the capture."""
 
 
 def summarise_capture(
@@ -55,7 +55,7 @@ def summarise_capture(
 
 
 PUBLIC_SCHEMA = '"ucp-keys/1"'
-"""A text that each file of public keys contains."""
+"""A text that every file with public keys contains."""
 
 
 def read_public_keys(path: Path, left_out: list[UnusedPart]) -> "PublicKeys | None":
@@ -78,9 +78,9 @@ def read_public_keys(path: Path, left_out: list[UnusedPart]) -> "PublicKeys | No
 def assign_keys(
     flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys"]], left_out: list[UnusedPart]
 ) -> None:
-    """Assign public keys to each flight. A flight gets the keys with which a signature in its exports is valid.
+    """Assign public keys to each flight. A flight gets the keys that verify a signature in its exports.
 
-    If any block is signed, unused keys belong to another mission and are left out.
+    If any block is signed, unused keys belong to another mission and are omitted.
     """
     signed = {id(flight): [*_signed(flight)] for flight in flights} if found else {}
     unused = dict(found)

@@ -1,6 +1,6 @@
 """Find the files to read: the files that the user gave, and the files in the given directories, each once.
 
-FIFOs, devices and loops of links are left out.
+FIFOs, devices and loops of links are omitted.
 """
 
 import filecmp
@@ -21,14 +21,14 @@ _HARNESS_FILES = {
     "channel.jsonl",
     *("report.html", "report.md", "junit.xml", "chains.svg"),
 }
-"""Files in a run directory that the harness wrote, as opposed to agents."""
+"""Names of files in a run directory that the harness wrote. All other files are from agents."""
 _OTHER_RUN_FILES = re.compile(r"(\d+|capture|lab|rogue)\.(log|mission\.json|control|store)")
-"""Other files in a run directory that are no records of an agent."""
+"""Names of other files in a run directory that contain no records of an agent."""
 _INCARNATION_DIRECTORY = re.compile(r"\d+-\d+")
 
 
 def files_of(paths: Iterable[Path], left_out: list[UnusedPart]) -> list[Path]:
-    """Return the regular files in `paths`, each once. Raises FieldError if a path does not exist."""
+    """Return the regular files at `paths`, each once. Raises FieldError if a path does not exist."""
     files: dict[Path, Path] = {}
     by_size: dict[int, list[Path]] = {}
     for path in paths:
@@ -63,10 +63,9 @@ def files_of(paths: Iterable[Path], left_out: list[UnusedPart]) -> list[Path]:
 
 
 def is_incarnation_copy(path: Path) -> bool:
-    """Return true if the file is a copy that a run wrote for one start of an agent, in addition to the file of all
-    starts.
+    """Return true if the file is the copy of a single incarnation in a run directory.
 
-    The files of the agent usually contain the same records.
+    The main file of the agent usually contains the same records.
     """
     return path.parent.parent.name == "agents" and _INCARNATION_DIRECTORY.fullmatch(path.parent.name) is not None
 
@@ -76,7 +75,7 @@ def _walk(
 ) -> Iterator[Path]:
     """Yield the files below a path.
 
-    Links inside a directory are not followed, because their targets are often unrelated.
+    Links inside a directory are not followed, because their targets often do not belong to the flight.
     """
     try:
         if path.is_symlink() and not named:
@@ -101,5 +100,7 @@ def _walk(
 
 
 def _files_first(path: Path) -> tuple[bool, int, str]:
-    """Return a sort key that puts files before directories, and short names before long ones, so that 9 precedes 10."""
+    """Return a sort key that puts files before directories, and short names before long names, so that 9 comes before
+    10.
+    """
     return path.is_dir(), len(path.name), path.name

@@ -1,8 +1,8 @@
 """Group records by flight. All agents of a flight have the same mission and time, and each agent occurs once.
 
 A mission is identified by its roster and its inception data (BD_0). One mission may have several flights, each with its
-own mission second 0. Exports and captures do not contain the flight. They are assigned to the flight that shares the
-most blocks with them.
+own mission second 0. Exports and captures do not name their flight. They are assigned to the flight with which they
+have the most blocks in common.
 """
 
 import base64
@@ -36,8 +36,8 @@ class _MissionInHeader(NamedTuple):
 
 @dataclass
 class _FlightRecords:
-    """The records of one flight that were read so far. `hashes` contains the hexadecimal hashes of the blocks and
-    chains in them.
+    """The records of one flight that were read so far. `hashes` contains the hexadecimal hashes of all blocks and
+    chains in these records.
     """
 
     mission: _MissionInHeader
@@ -64,7 +64,7 @@ class _FlightRecords:
 
     @cached_property
     def time_span(self) -> tuple[float, float]:
-        """The times of the first and the last handler run, in seconds since the Unix epoch by the agents' clocks."""
+        """The times of the first and the last handler run on the agents' clocks, in seconds since the Unix epoch."""
         times = [
             run.t
             for incarnations in self.incarnations.values()
@@ -103,7 +103,7 @@ def group_by_flight(
 def _by_mission(
     incarnations: Iterable[TraceIncarnation], left_out: list[UnusedPart]
 ) -> tuple[list[_FlightRecords], list[TraceIncarnation]]:
-    """Return the records of each mission, separated by start time, and the traces without a header."""
+    """Group the records by mission and start time. Return these groups, and the traces without a header."""
     by_header: dict[tuple[_MissionInHeader, int], list[TraceIncarnation]] = defaultdict(list)
     without_header: list[TraceIncarnation] = []
     last: TraceIncarnation | None = None
@@ -140,10 +140,10 @@ def _mission_of(header: TraceHeader) -> _MissionInHeader:
 def _assign_to_flights(
     groups: list[_FlightRecords], mission: _MissionInHeader, agent_id: int, flights: list[list[TraceIncarnation]]
 ) -> None:
-    """Assign the records of one agent's flights to the flights of the other agents, by the number of directories in
-    common.
+    """Assign the records of one agent to the flights of the other agents. Records belong to the flight with the most
+    directories in common.
 
-    This is only a guess, for flights that nothing else distinguishes.
+    This is only a guess. It is used if no record distinguishes the flights.
     """
 
     def shared_directories(flight_incarnations: list[TraceIncarnation], records: _FlightRecords) -> int:
@@ -217,8 +217,8 @@ def _hashes_of(incarnation: TraceIncarnation) -> set[str]:
 def _add_without_header(
     groups: list[_FlightRecords], incarnation: TraceIncarnation, left_out: list[UnusedPart], remarks: list[FileRemark]
 ) -> None:
-    """Add a trace without a header to the flight with which it shares the most hashes. The trace gets the header of
-    this flight.
+    """Add a trace without a header to the flight with which it has the most hashes in common. The trace gets a header
+    of this flight.
     """
     agent_id, hashes = incarnation.agent_id, _hashes_of(incarnation)
     if agent_id is None or not incarnation.runs:
@@ -262,7 +262,7 @@ MAX_DRIFT = 0.05
 
 def _drift(incarnation: TraceIncarnation) -> float:
     """Return the drift of an agent's clock. It is computed from the timer that expired earliest in proportion to its
-    duration, and is 0 without timers.
+    duration. Without timers, it is 0.
     """
     started: dict[str, tuple[float, float]] = {}
     drifts = []
@@ -371,8 +371,8 @@ def _add_capture(groups: list[_FlightRecords], capture: CaptureSummary) -> None:
 
 
 def _add_logged(groups: list[_FlightRecords], path: Path, agent_id: int, event: LoggableEvent) -> None:
-    """Add an event to the flight that was in progress at the time of the event. Without such a flight, add it to the
-    flight with files in the same directory.
+    """Add an event to the flight that was in progress at the time of the event. If no flight was in progress then, add
+    it to the flight with files in the same directory.
     """
 
     def under_way(records: _FlightRecords) -> bool:

@@ -42,21 +42,20 @@ class Flight:
     """The records of one flight of a swarm, by agent ID."""
 
     initial_data: bytes | None
-    """BD_0 of the mission. None if no file contains it."""
+    """The data of the inception block (BD_0). None if no file contains it."""
     traces: dict[int, Trace] = field(default_factory=dict)
     exports: dict[int, Export] = field(default_factory=dict)
     captures: dict[int, Path] = field(default_factory=dict)
     roster: tuple[int, ...] = ()
-    """The roster in the traces. Empty without traces."""
+    """The roster according to the traces. It is empty without traces."""
     epoch_us: int | None = None
-    """Mission second 0 in microseconds since the Unix epoch. None if no trace or capture contains it."""
+    """The time of mission second 0 in microseconds since the Unix epoch. None if no trace or capture contains it."""
     more_captures: list[Path] = field(default_factory=list)
     """Further captures of the same vehicles, and captures of observation points without a vehicle."""
     logged: dict[int, list[LoggableEvent]] = field(default_factory=dict)
-    """Events for the agents to log, recorded by a separate recorder. The trace of an agent contains its events in
-    any case."""
+    """Events of the agents that a separate recorder recorded. The events in traces are not included."""
     sources: dict[int, list[Path]] = field(default_factory=dict)
-    """The files that the trace of each agent was read from."""
+    """Agent ID -> the files from which its trace was read."""
     flight_logs: list[MatchedLog] = field(default_factory=list)
     """The flight logs of the vehicles that carried these agents."""
     public_keys: "PublicKeys | None" = None
@@ -64,7 +63,7 @@ class Flight:
 
     @property
     def agents(self) -> list[int]:
-        """The IDs of all agents with any record, in ascending order."""
+        """The IDs of all agents that have at least one record, in ascending order."""
         return sorted({*self.traces, *self.exports, *self.captures, *self.logged})
 
     @property
@@ -76,7 +75,8 @@ class Flight:
 class IngestResult:
     """The flights in the files (the one with the most records first), and the omitted files.
 
-    `remarks` concern files that are used, for example a changed clock or a header taken from another agent's trace.
+    `remarks` concerns files that are used, for example a changed clock, or a header that was taken from another agent's
+    trace.
     """
 
     flights: list[Flight]

@@ -1,7 +1,7 @@
 """Repair the order of lines in a damaged trace, in which lines were swapped or occur twice.
 
-Only lines that cannot be right where they are count: the time goes back for one line, a handler comes before the one
-that triggered it, or an effect on record happens twice.
+A line is moved or removed only if its place is impossible: the time decreases for one line, a handler run comes before
+the run that triggered it, or a recorded effect happens twice.
 """
 
 from collections.abc import Iterator, Sequence
@@ -11,13 +11,13 @@ from ucp.trace import HandlerRun
 from ucp.trigger import LocalTrigger, MessageTrigger
 
 MAX_REPEATED = 10_000
-"""Maximum number of lines in a part that is there twice."""
+"""Maximum number of lines in a part of a trace that occurs twice."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReorderedPart:
-    """A part of a trace that was repaired. `first` and `last` are its positions before the repair, and `why` is the
-    reason for it.
+    """A part of a trace that was repaired. `first` and `last` are its positions before the repair. `why` is the reason
+    for the repair.
     """
 
     first: int
@@ -26,9 +26,7 @@ class ReorderedPart:
 
 
 def in_order(runs: Sequence[HandlerRun]) -> tuple[list[int], list[ReorderedPart]]:
-    """Return the positions of the handler runs to keep in the right order, and the parts of the trace that must be
-    repaired.
-    """
+    """Return the positions of the handler runs to keep, in the correct order, and the repaired parts of the trace."""
     places = [*_repeated(runs)]
     repeated = {position for place in places for position in range(place.first, place.last + 1)}
     order = [position for position in range(len(runs)) if position not in repeated]
@@ -68,7 +66,7 @@ def _repeated(runs: Sequence[HandlerRun]) -> Iterator[ReorderedPart]:
 
 
 def _happens_once(part: Sequence[HandlerRun]) -> bool:
-    """Return true if these handler runs had an effect that an agent cannot have twice at the same time."""
+    """Return true if these handler runs had an effect that an agent cannot have twice."""
     return any(
         run.changes or run.sent or run.tally or run.started or not isinstance(run.trigger, MessageTrigger)
         for run in part

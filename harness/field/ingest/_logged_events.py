@@ -22,7 +22,7 @@ MAX_EVENTS = 1_000_000
 
 
 class EventLine(BaseModel):
-    """One event. `time_us` is in microseconds since the Unix epoch."""
+    """One recorded event. `time_us` is in microseconds since the Unix epoch."""
 
     model_config = ConfigDict(extra="ignore")
 

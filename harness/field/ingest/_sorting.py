@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from ucp.secure.opening import DatagramOpener
 
 MAX_DOCUMENTS = 1000
-"""Maximum number of exports in one file."""
+"""Maximum number of chain exports in one file."""
 MAX_LISTED_ALIKE = 3
-"""Maximum number of listed files of one directory that are left out for the same reason."""
+"""Maximum number of omitted files of one directory that are listed with the same reason."""
 _BAGS = (b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd")
 _ARCHIVES = (b"PK\x03\x04", b"7z\xbc\xaf", b"\xfd7zXZ", b"BZh", b"Rar!")
 _BLANK = " \t\r\n\0\ufeff"
@@ -42,8 +42,8 @@ _BLANK = " \t\r\n\0\ufeff"
 
 @gc_paused()
 def ingest_files(paths: Iterable[Path], opener: "DatagramOpener | None" = None) -> IngestResult:
-    """Return the records in files and directories, grouped by flight. Neither the names of files nor damage in them
-    matter.
+    """Return the records in files and directories, grouped by flight. The names of the files do not matter, and damaged
+    files are used as far as possible.
 
     `opener` decrypts captures of a secured mission. Raises FieldError if a path does not exist. Every other problem is
     reported in `left_out` of the result.
@@ -161,7 +161,7 @@ def _describe_content(data: bytes) -> str:
 
 
 def _summarise(left_out: list[UnusedPart]) -> Iterator[UnusedPart]:
-    """Yield the omitted files. Many files of one directory that have the same reason become one entry."""
+    """Yield the omitted files. If many files of one directory have the same reason, they become one entry."""
     alike: dict[tuple[Path, str], list[UnusedPart]] = {}
     for each in left_out:
         alike.setdefault((each.path.parent, each.why) if each.line is None else (each.path, str(each.line)), []).append(

@@ -1,7 +1,7 @@
 """Read damaged traces from the field. Divide them at restarts of the agent, and use every undamaged line.
 
-A header line begins an incarnation. A file may contain incarnations of several agents and missions, and may begin
-within one.
+A header line begins an incarnation. A file may contain incarnations of several agents and missions, and may begin in
+the middle of one.
 """
 
 import base64
@@ -23,20 +23,23 @@ from ucp.messages import MAGIC
 from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
 
 MAX_TRACE_BYTES = 256 * 1024 * 1024
-"""Only the beginning of a larger file is read."""
+"""Maximum number of bytes that are read from a file. The rest of a larger file is ignored."""
 MAX_INCARNATIONS = 1000
 MAX_DAMAGED = 1_000_000
 MAX_PLACES = 1000
-"""Maximum number of damaged places that are listed separately."""
+"""Maximum number of damaged places that are listed one by one."""
 MAX_RUNS = 1_000_000
-"""Maximum number of handler runs in a file. In a swarm of 20 agents without loss, an agent has about a tenth of it
-in 2 hours."""
+"""Maximum number of handler runs in a file. In a swarm of 20 agents without loss, an agent reaches about a tenth of it
+in 2 hours.
+"""
 MAX_BYTES_BEFORE_TRACE, MAX_LINES_BEFORE_TRACE = 8 * 1024 * 1024, 100_000
-"""A file is no trace if it has no line of a trace within these limits."""
+"""Limits within which a trace must have its first valid line. A file without such a line is not a trace."""
 ROUNDING_S = 2e-3
-"""Maximum time by which a line may be earlier than the line before, because times may be rounded to milliseconds."""
+"""Maximum number of seconds by which a line may be earlier than the line before it. Times may be rounded to
+milliseconds.
+"""
 FAR_AHEAD_S = 3600.0
-"""Maximum time between two handler runs of an incarnation. No agent is idle for longer."""
+"""Maximum number of seconds between two handler runs of an incarnation. No agent is idle for longer."""
 _MAX_LISTED = 3
 _BEGINNINGS = (b'{"t":', b'{"schema":', b'{"t" :', b'{"schema" :', b'{ "t":', b'{ "schema":')
 _MARKERS = (b'"handler"', b'"ucp-trace/', b'"dropped"', b'"command"')
@@ -52,9 +55,9 @@ class TraceIncarnation:
     header: TraceHeader | None
     first_line: int
     agent: int | None = None
-    """The agent ID, if the source of the lines determines it."""
+    """The agent ID, if it follows from the source of the lines. None otherwise."""
     counts: str = "line"
-    """The unit of line numbers."""
+    """The unit of line numbers, such as "line" or "message"."""
     runs: list[HandlerRun] = field(default_factory=list)
     run_lines: list[int] = field(default_factory=list)
     asides: list[tuple[int, DroppedDatagram | CommandEntry]] = field(default_factory=list)
@@ -65,8 +68,8 @@ class TraceIncarnation:
 
     @property
     def agent_id(self) -> int | None:
-        """The ID of the agent, from the header, the source of the lines, the sent datagrams or the file name. The first
-        of these that has an ID decides. None if the ID is unknown.
+        """The ID of the agent. It comes from the header, the source of the lines, the sent datagrams or the file name,
+        in this order. None if the ID is unknown.
         """
         if self.header is not None:
             return self.header.agent_id
@@ -93,7 +96,7 @@ class TraceIncarnation:
         return zip(self.asides, self.aside_lines, strict=True)
 
     def add_gap(self, lines: int, lost_bytes: int) -> None:
-        """Record lost or damaged lines. If they follow other lost lines directly, both form one gap."""
+        """Record lost or damaged lines. If they directly follow other lost lines, all of them form one gap."""
         position = len(self.runs)
         if self.gaps and self.gaps[-1].position == position:
             last = self.gaps.pop()
@@ -101,7 +104,7 @@ class TraceIncarnation:
         self.gaps.append(TraceGap(position, lines, lost_bytes))
 
     def put_in_order(self) -> Iterator[UnusedPart]:
-        """Repair the order of lines, and remove repeated lines. Yield an entry for each repaired place."""
+        """Repair the order of lines, and remove repeated lines. Yield an entry for each repair."""
         order, places = in_order(self.runs)
         if not places:
             return
@@ -152,10 +155,10 @@ class _DamagedLines:
 
 
 class TraceReader:
-    """A reader for the lines of a trace in any condition. `incarnations` contains the parts of the trace between
-    restarts that were read so far.
+    """A reader for the lines of a trace in any condition. `incarnations` contains the incarnations that were read so
+    far.
 
-    `gave_up` is true if further lines are not needed, because a limit is exceeded.
+    `gave_up` is true if a limit is exceeded, so that further lines are not needed.
     """
 
     def __init__(self, path: Path, agent_id: int | None = None, counts: str = "line") -> None:
@@ -172,7 +175,7 @@ class TraceReader:
         self._cut_off: int | None = None
 
     def add_line(self, number: int, line: bytes, finish: bool = True) -> None:
-        """Read one line. A line without a line end may be truncated."""
+        """Read one line. If it has no line end, it may be truncated."""
         self._read_bytes += len(line)
         self._lines += 1
         self.gave_up = not self.incarnations and (
@@ -242,14 +245,14 @@ class TraceReader:
             self.incarnations[-1].add_gap(0, 0)
 
     def _add_earlier_gap(self, number: int, lines: int, lost_bytes: int) -> None:
-        """Record that an earlier import of this trace had lost lines at this place."""
+        """Record lost lines that an earlier import of this trace already reported at this place."""
         if self.incarnations:
             self.incarnations[-1].add_gap(lines, lost_bytes)
         what = "the part before this" if not lines else "1 line" if lines == 1 else f"{lines} lines"
         self._report(number, f"{what} {'were' if lines > 1 else 'was'} lost before this file was written")
 
     def finish(self, left_out: list[UnusedPart]) -> list[TraceIncarnation]:
-        """Return the parts of the trace. If there are any, add descriptions of the damage to `left_out`."""
+        """Return the incarnations of the trace. If there are any, add descriptions of the damage to `left_out`."""
         incarnations = [life for life in self.incarnations if life.runs or life.asides or life.header]
         left_out += self._left_out() if incarnations else ()
         places = [place for incarnation in incarnations for place in incarnation.put_in_order()]
@@ -276,9 +279,7 @@ class TraceReader:
 
 
 def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield (number, line, true if the line has a line end). Only the last part of a line that is too long is
-    returned.
-    """
+    """Yield (number, line, true if the line has a line end). If a line is too long, only its last part is returned."""
     number, kept = 1, b""
     while text := file.readline(MAX_LINE_BYTES):
         if not text.endswith(b"\n") and len(text) == MAX_LINE_BYTES:
@@ -297,7 +298,7 @@ def _entry(line: bytes) -> TraceHeader | Entry | None:
 
 
 def _parse(line: bytes) -> TraceHeader | Entry | None:
-    """Return the entry in a line without a check of its time. Return None if the entry is incomplete."""
+    """Return the entry in a line. Its time is not checked. Return None if the entry is incomplete."""
     if not any(word in line for word in _MARKERS):
         return None
     try:
@@ -318,9 +319,7 @@ def _texts_in_base64(entry: TraceHeader | Entry) -> Iterator[str]:
 
 
 def _recover_tail(text: bytes) -> tuple[int, TraceHeader | Entry] | None:
-    """Return the position and content of a complete entry at the end of a damaged line. Return None if there is no such
-    entry.
-    """
+    """Search for a complete entry at the end of a damaged line. Return its position and content, or None."""
     start = max(text.rfind(beginning) for beginning in _BEGINNINGS)
     entry = _entry(text[start:]) if start > 0 else None
     return None if entry is None else (start, entry)

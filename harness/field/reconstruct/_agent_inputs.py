@@ -1,4 +1,4 @@
-"""Divide a trace into the inputs of the agent, each with the handler runs that the input caused."""
+"""Divide a trace into the inputs of the agent. Each input has the handler runs that it caused."""
 
 import base64
 import math
@@ -17,7 +17,7 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 
 
 class UnusableInputError(Exception):
-    """An error: an input is not recorded or is impossible. The message is a sentence."""
+    """An error: an input is not on record, or it is impossible. The message is one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class RecordedInput:
     """One input of an agent. `at_s` is a time on the agent's clock, and `line` is the line number in the agent's trace
     (from 1).
 
-    `runs` are the handler runs that it caused, including those of local events. If the record `is_partial`, some of
+    `runs` are the handler runs that the input caused, including those of local events. If `is_partial` is true, some of
     them may be lost.
     """
 
@@ -71,7 +71,7 @@ class RecordedInput:
 
 
 class MissingInputs(Protocol):
-    """Records other than the trace of the agent. They may contain inputs that a trace of version 1 lacks."""
+    """Records other than the agent's trace. They may contain inputs that a trace of version 1 does not contain."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]: ...
 
@@ -81,10 +81,10 @@ class MissingInputs(Protocol):
 def inputs_by_incarnation(
     trace: Trace, header: CheckedHeader, missing: MissingInputs
 ) -> tuple[list[list[RecordedInput]], str | None]:
-    """Return the inputs of each incarnation, and the reason why the inputs after them are unusable. The reason is None
-    if all inputs are usable.
+    """Return the usable inputs of each incarnation, and the reason why later inputs are unusable. The reason is None if
+    all inputs are usable.
 
-    The reason names the line.
+    The reason names the line of the trace.
     """
     reader = _InputReader(header, missing)
     incarnations: list[list[RecordedInput]] = []

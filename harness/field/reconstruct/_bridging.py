@@ -1,10 +1,9 @@
-"""Find the state of an agent after lost trace lines. For this, guess inputs that lead the agent to the next recorded
-state.
+"""Bridge lost trace lines: guess inputs that lead the agent to its next known state.
 
-The lost inputs are unknown, but their result is not: a chain, and the events in the current block. The inference plays
-the other agents of a swarm that already holds this chain. They answer each question of the agent, approve its blocks in
-the order of the chain, and send it the blocks that it lacks. The events come from the agent's own later blocks. The
-agent itself is the rehearsed core, so the scenario can play the same inputs.
+The lost inputs are unknown. The state after them is known: a chain, and the events in the current block. The module
+simulates peers that already hold this chain. They answer each query of the agent, approve its blocks in the order of
+the chain, and send it the blocks that it lacks. The events come from the agent's own later blocks. The agent itself is
+a real agent core, so a scenario can play the same inputs.
 """
 
 from collections import deque
@@ -36,16 +35,16 @@ from ucp.messages import (
 )
 
 FIRST_SEQUENCE = 0xF000_0000
-"""Sequence number of the first inferred message. Agents never send that many messages."""
+"""Sequence number of the first guessed message. Agents never send that many messages."""
 STEPS_PER_BLOCK = 200
-"""Maximum number of inferred inputs for each block of the chain."""
+"""Maximum number of guessed inputs for each block of the chain."""
 
 
 @dataclass(frozen=True)
 class KnownState:
     """The known state of an idle agent after lost trace lines. `why` is the reason why the lines are missing.
 
-    `current_block` is None if it is empty, or its content has no later effect.
+    `current_block` is None if the block is empty, or if its content has no later effect.
     """
 
     chain: tuple[Block, ...]
@@ -54,8 +53,8 @@ class KnownState:
 
 
 class InferredInputPath:
-    """The guessed inputs that lead an agent to a known state. They are computed one at a time. `reached` is true when
-    the agent is in this state.
+    """The guessed inputs that lead an agent to a known state. The inputs are computed one at a time. `reached` is true
+    when the agent has reached the state.
     """
 
     def __init__(self, agent: Agent, known: KnownState) -> None:
@@ -111,8 +110,8 @@ class InferredInputPath:
         return self._datagram(owner, CommitBlock(block, self._chain_hashes[held + 1]))
 
     def _log(self, event_data: bytes) -> Cause | None:
-        """Return the next event that is missing in the block under construction. Return None if no event is missing or
-        if the events in the block are different.
+        """Return the next event that the block under construction lacks. Return None if it lacks none, or if its events
+        differ from the known ones.
         """
         logged = bytes(self._agent.state.current_block)
         if not event_data.startswith(logged):
@@ -128,7 +127,7 @@ class InferredInputPath:
         return DatagramReceived(encode(sender, self._sequence, message))
 
     def _answer(self, message: Message) -> None:
-        """Answer a query as agents do that hold the known chain."""
+        """Return the answer to a query. The answering agents hold the known chain."""
         answer: Message
         known = {chain_hash: height for height, chain_hash in enumerate(self._chain_hashes)}
         chain = self._known.chain

@@ -1,14 +1,15 @@
 """Estimate the offsets and drifts of the agents' clocks. The only data are the times at which messages were sent and
 received.
 
-Each message was received after it was sent. Let t be the time on the clock of agent A, and u that on the clock of B.
-Then the messages from A to B are points (t sent, u received) above the line that converts t to u. The messages from B
-to A are points (t received, u sent) below it. Fast messages are close to the line. The estimate is the line with the
-greatest distance to both groups of points, as in synchronising traces by the minimal delays of NTP. A line is an offset
-and a drift. Drift is assumed only if the points contradict a line without drift, because a few messages do not prove a
-drift.
+Each message was received after it was sent. Let t be the time on the clock of agent A, and u the time on the clock of
+agent B. The clocks are related by a line that converts t to u. A message from A to B is a point (t sent, u received)
+above this line. A message from B to A is a point (t received, u sent) below it. Fast messages are close to the line.
+The estimate is the line with the greatest distance to both groups of points, similar to NTP, which uses the messages
+with minimal delays. A line has an offset and a drift. Drift is assumed only if the points contradict a line without
+drift, because a few messages do not prove a drift.
 
-No clock is trusted more than another. The reference is the clock of the agent that exchanged the most messages.
+No clock is assumed to be more accurate than another. The reference is the clock of the agent that exchanged the most
+messages.
 """
 
 from collections import defaultdict
@@ -18,7 +19,7 @@ from dataclasses import dataclass
 from harness.field.replay._peer_messages import DeliveredMessage
 
 MIN_RATE, MAX_RATE = 0.55, 1.8
-"""Limits of a plausible clock rate."""
+"""Limits of plausible clock rates."""
 SEARCH_STEPS = 100
 MESSAGES_FOR_DRIFT = 8
 """Minimum number of messages in each direction for an estimate of drift."""
@@ -27,7 +28,9 @@ OFFSET_DIGITS, DRIFT_DIGITS = 6, 9
 
 @dataclass(frozen=True)
 class ClockLine:
-    """A clock relative to a reference clock: it shows offset_s + rate * t when the reference shows t."""
+    """A linear relation between a clock and a reference clock. When the reference clock shows t, this clock shows
+    offset_s + rate * t.
+    """
 
     offset_s: float = 0.0
     rate: float = 1.0
@@ -36,7 +39,7 @@ class ClockLine:
         return self.offset_s + self.rate * t
 
     def at(self, shown: float) -> float:
-        """Return the time on the reference clock at the moment when this clock shows `shown`."""
+        """Return the time on the reference clock when this clock shows `shown`."""
         return (shown - self.offset_s) / self.rate
 
     def after(self, first: "ClockLine") -> "ClockLine":
@@ -57,8 +60,8 @@ def estimate(
 ) -> dict[int, ClockLine]:
     """Return each agent's clock relative to a common reference clock.
 
-    `ahead_s` has clocks relative to GPS time. It places the clocks of agents that exchanged no messages with the
-    reference. Without it, these clocks are assumed to equal the reference.
+    `ahead_s` contains differences of clocks from GPS time. They are used for agents that exchanged no messages with the
+    reference. Without them, the clocks of these agents are assumed to equal the reference clock.
     """
     between: dict[tuple[int, int], tuple[list[Point], list[Point]]] = defaultdict(lambda: ([], []))
     for delivery in deliveries:
@@ -120,7 +123,7 @@ def _turn(a: Point, b: Point, c: Point) -> float:
 
 
 def fit_line(above: list[Point], below: list[Point]) -> ClockLine:
-    """Return the line between two sets of points that is as far as possible from both sets."""
+    """Return the line that separates two sets of points and has the greatest distance from both."""
     lower, upper = _hull(above, 1), _hull(below, -1)
 
     def room(rate: float) -> float:

@@ -34,8 +34,8 @@ class FirstDifference:
     """The first step at which the simulation differs from a record. `at_s` is a mission second of the reconstructed
     scenario.
 
-    `line` is the line of the trace, None if the record has no further steps. `recorded` and `played` describe both
-    steps.
+    `line` is the line of the trace. It is None if the record has no further steps. `recorded` and `played` describe
+    both steps.
     """
 
     agent_id: int
@@ -55,13 +55,13 @@ class FirstDifference:
 
 
 PlayedStep = tuple[float, int | None, HandlerRun]
-"""Mission second, line of the trace, and handler run."""
+"""A simulated step: mission second, line of the trace, and handler run."""
 
 
 def first_difference(
     table: InputTimetable, rehearsals: Mapping[int, SoloSimulation], simulated: Simulated
 ) -> FirstDifference | None:
-    """Return the difference with the earliest mission time. Return None if all steps that have an effect are equal."""
+    """Return the difference with the earliest mission time. Return None if all steps with an effect are equal."""
     differences = []
     for agent_id in rehearsals:
         recorded = [*_effective(_recorded(table, agent_id))]
@@ -83,7 +83,7 @@ def _played(trace: Trace | None) -> Iterator[PlayedStep]:
 
 
 def _effective(steps: Iterable[PlayedStep]) -> Iterator[PlayedStep]:
-    """Yield the steps that have an effect. Messages that only changed a vote count are left out."""
+    """Yield the steps that have an effect. Messages that only changed a vote count have none."""
     return (
         step for step in steps if step[2].changes or step[2].sent or not isinstance(step[2].trigger, MessageTrigger)
     )
@@ -123,7 +123,8 @@ RecordedInputs = Sequence[Sequence[RecordedInput]]
 class SoloSimulations:
     """The simulations of single agents. Each agent is simulated alone with its recorded inputs.
 
-    `rehearsals` has each agent that can be played, and `why` the reasons for incomplete ones.
+    `rehearsals` contains the simulations of all agents that can be simulated. `why` contains the reasons why some are
+    incomplete.
     """
 
     def __init__(self, flight: Flight, other_records: OtherRecords) -> None:
@@ -146,7 +147,8 @@ class SoloSimulations:
     def rehearse(self, header: CheckedHeader) -> None:
         """Simulate an agent with the inputs in its trace.
 
-        If that does not lead to its export, use its capture if that explains more inputs.
+        If the simulation does not end in the state of the agent's export, use the capture of its vehicle instead,
+        provided that it explains more inputs.
         """
         agent_id = header.agent_id
         rehearsal = self._by_trace(header) if agent_id in self._flight.traces else None
@@ -184,7 +186,7 @@ class SoloSimulations:
     def _explain_deviations(
         self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: SoloSimulation
     ) -> SoloSimulation:
-        """Explain the deviations of an agent by a known programming error, if possible. Otherwise simulate the agent up
+        """Explain the deviations of an agent by a known mistake (quirk), if possible. Otherwise simulate the agent up
         to the first deviation.
         """
         agent_id, finding = header.agent_id, judged.first_finding
@@ -210,8 +212,8 @@ class SoloSimulations:
     def _play_around_lost_lines(
         self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, whole: SoloSimulation
     ) -> SoloSimulation:
-        """Simulate an agent whose recorded steps follow the protocol. Inputs on lost lines are replaced by guessed
-        inputs if possible.
+        """Simulate an agent whose recorded steps follow the protocol. Guessed inputs replace the inputs on lost lines,
+        if possible.
         """
         agent_id = header.agent_id
         early = (
@@ -238,7 +240,7 @@ class SoloSimulations:
     def _name_alternative(
         self, header: CheckedHeader, incarnations: RecordedInputs, judged: JudgedTrace, at: ProtocolDeviation
     ) -> None:
-        """Add a remark if damage to a single line explains the trace as well as a known programming error does."""
+        """Add a remark if damage to a single line explains the trace as well as a known mistake (quirk) does."""
         doubt = next((sentence for sentence in judged.lost if f" {PERHAPS} " in sentence), None)
         if doubt is None:
             return
@@ -285,8 +287,8 @@ class SoloSimulations:
     def _explain_by_quirk(
         self, header: CheckedHeader, incarnations: Incarnations, at: ProtocolDeviation
     ) -> SoloSimulation | None:
-        """Return a simulation in which a known programming error explains the whole record. Return None if there is no
-        such error.
+        """Return a simulation in which a known mistake (quirk) explains the whole record. Return None if no known
+        mistake does.
 
         Quirks of the handlers that ran at the deviation are tried first.
         """
@@ -314,8 +316,8 @@ class SoloSimulations:
         return explaining[names[0]]
 
     def _explain_by_tolerance(self, header: CheckedHeader, incarnations: Incarnations) -> SoloSimulation | None:
-        """Return a simulation in which the agent may ignore messages or let timers expire early, if the record has no
-        deviation then. Return None otherwise.
+        """Return a simulation of an agent that may ignore messages or let timers expire early, if it explains the whole
+        record. Return None otherwise.
         """
         agent = f"agent {header.agent_id}"
         ignoring = rehearse(header, incarnations, tolerance=ToleratedDeviations(ignoring=True))

@@ -1,13 +1,14 @@
-"""Guess the inputs of an agent that has no complete trace. The sources are its packet capture and the events in its
-blocks.
+"""Guess the inputs of an agent without a complete trace. The sources are the packet capture of its vehicle and the
+events in its blocks.
 
 The capture contains the received and sent datagrams with their times. The blocks contain the logged events. The expiry
-of timers is not recorded. Usually a timer expires on time, but a process is sometimes late, and another input may then
-come first.
+of timers is not recorded. Usually a timer expires on time. A process is sometimes late, and another input may then come
+first.
 
-Therefore the reference core plays all inputs in order of time, and must send the datagrams in the capture. If it does
-not, the search tries other orders: datagrams that arrived shortly after a timer's deadline are played before the timer,
-the last such choice first. A reconcile without a cause in the records is attributed to the operator.
+The search gives all inputs to an agent core in order of time, and compares the datagrams that the core sends with the
+capture. If they differ, the search tries other orders: datagrams that arrived shortly after a timer's deadline come
+before the expiry. The last such timer is changed first. If a reconcile has no recorded cause, the operator is assumed
+to have requested it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,11 +43,11 @@ from ucp.trace import HandlerRun
 
 MAX_TRIES = 400
 MAX_INPUTS = 200_000
-"""Maximum number of inputs played in all tries together, some seconds of work."""
+"""Maximum number of inputs that all attempts together may play. They take some seconds."""
 MAX_LATE_WALL_S = 0.1
-"""Maximum delay of a timer. If it is later, the process was paused."""
+"""Maximum delay of a timer in seconds of wall time. If a timer is later, the process was paused."""
 MAX_UNREAD_WALL_S = 0.005
-"""Maximum time that a datagram waits in a socket."""
+"""Maximum number of seconds of wall time that a datagram waits in a socket."""
 ROUNDING_S = 1e-3
 Pause = tuple[float, float]
 """The start and the end of a pause of the process."""
@@ -55,15 +56,15 @@ JUST_AFTER_S = 1e-6
 MAX_STARTS = 50
 TRIES_PER_START = 5
 ANSWERED_QUERIES = (BlockAddRequest, ChainContainQuery, ChainHashSuccessorQuery)
-"""Messages that an agent always answers, except during a reconcile."""
+"""Queries that an agent always answers, except during a reconcile."""
 SENT_ON_TIMER_EXPIRY = (BlockAddRequest, CommitBlock, ChainContainQuery, ChainHashSuccessorQuery, RequestForBlock)
-"""Messages that an agent usually sends when a timer expires. A received datagram can cause queries, too."""
+"""Messages that an agent usually sends when a timer expires. Received datagrams can cause some of them, too."""
 
 
 @dataclass
 class InferredInputs:
     """The guessed inputs of each incarnation, which explain the sent datagrams. `problem` names the first datagram that
-    they do not explain.
+    the inputs do not explain.
     """
 
     incarnations: list[list[RecordedInput]] = field(default_factory=list)
@@ -85,7 +86,7 @@ class _IncarnationRecord:
     is_last: bool
 
     def since(self, at_s: float) -> "_IncarnationRecord":
-        """Return the records of the agent from its restart at `at_s` on."""
+        """Return the part of the agent's records from its restart at `at_s` on."""
         received = [sighting for sighting in self.received if sighting.at_s >= at_s]
         logged_events = [timed for timed in self.logged_events if timed[0] >= at_s]
         return _IncarnationRecord(received, self.sent, logged_events, self.is_last)
@@ -112,8 +113,8 @@ def infer(
 
 
 def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent]) -> Iterator[_IncarnationRecord]:
-    """Yield the records of each incarnation. A restart is found because the agent numbers its datagrams from
-    0 again.
+    """Yield the records of each incarnation. A restart is visible because the agent numbers its datagrams from 0
+    again.
     """
     received = [sighting for sighting in capture.sightings if not sighting.outbound and sighting.at_s >= 0]
     sent = [sighting for sighting in capture.sightings if sighting.outbound]
@@ -131,7 +132,7 @@ def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent])
 
 
 def _last_seen(received: Sequence[CapturedDatagram], last_s: float, restart_s: float) -> float:
-    """Return a time until which the agent certainly ran. It ran until the first query that it did not answer."""
+    """Return a time until which the agent was certainly running: the time of the first query that it did not answer."""
     later = (sighting for sighting in received if last_s < sighting.at_s)
     questions = (sighting.at_s for sighting in later if isinstance(decode(sighting.datagram).message, ANSWERED_QUERIES))
     return min(next(questions, restart_s), restart_s)
@@ -140,8 +141,8 @@ def _last_seen(received: Sequence[CapturedDatagram], last_s: float, restart_s: f
 def _infer_restarted(
     header: CheckedHeader, record: _IncarnationRecord, late_s: float, stored: StoredState, tries: int
 ) -> "_InputSequence":
-    """Guess the inputs after a restart with or without data on the disk. The restart happened some time before the
-    first sent datagram.
+    """Guess the inputs after a restart, once with and once without data on the disk. The restart happened some time
+    before the first sent datagram.
     """
     first_s = record.sent[0].at_s if record.sent else NEVER
     times = sorted(
@@ -170,8 +171,8 @@ def _infer_incarnation(
     tries: int,
     start_s: float = 0.0,
 ) -> "_InputSequence":
-    """Try different orders of the inputs. Return the order that explains all sent datagrams, or the one that explains
-    the longest sequence of inputs.
+    """Try different orders of the inputs. Return an order that explains all sent datagrams. If none does, return the
+    one that explains the longest sequence of inputs.
     """
     deferred: dict[int, int] = {}
     pauses: list[Pause] = []
@@ -193,8 +194,8 @@ def _infer_incarnation(
 
 
 def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
-    """Choose the next order of inputs to try, by changing the last timer that allows a change. Return false if no timer
-    does.
+    """Choose the next order of inputs to try: change the last timer that allows another position. Return false if no
+    timer allows one.
     """
     for place in range(len(choices) - 1, -1, -1):
         if deferred.get(place, 0) < choices[place]:
@@ -208,7 +209,7 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 class _InputSequence:
     """One possible order of the inputs of an agent in one incarnation.
 
-    `deferred` maps timers, by number, to their deviation from the likely order.
+    `deferred` maps the number of a timer to its deviation from the most likely position.
     """
 
     def __init__(
@@ -224,11 +225,13 @@ class _InputSequence:
         self.inputs: list[RecordedInput] = []
         self.problem: str | None = None
         self.choices: list[int] = []
-        """Number of other possible orders for each timer."""
+        """For each timer, the number of other positions that are possible."""
         self._header = header
         self._agent = _agent(header)
         self.pause: Pause | None = None
-        """A pause that the attempt found: the agent had something to send, but sent nothing for a long time."""
+        """A pause of the process that this order implies: the agent had a message to send, but sent nothing for a long
+        time.
+        """
         self._pauses = pauses
         self._inputs_to_play: list[tuple[float, Cause]] = [
             (self._end_of_pause(sighting.at_s), DatagramReceived(sighting.datagram)) for sighting in record.received
@@ -245,7 +248,7 @@ class _InputSequence:
         self._stored = stored
         self._explained = 0
         self._ended = False
-        """True if the incarnation has ended, because no further datagram was sent."""
+        """True if the incarnation has ended: the capture contains no further sent datagram."""
         self._now = start_s
 
     def stored_at_end(self) -> StoredState:
@@ -277,8 +280,8 @@ class _InputSequence:
             self._fail(self._sent[self._explained])
 
     def _end_of_pause(self, at_s: float, after_s: float = 0.0) -> float:
-        """Return the time at which an input is handled that arrives at `at_s`. If the agent was paused then, this is
-        the end of the pause.
+        """Return the time at which the agent handles an input that arrives at `at_s`. If the agent was paused then,
+        this is the end of the pause.
 
         After a pause, the process first reads its socket, then it handles timers, then events.
         """
@@ -289,8 +292,8 @@ class _InputSequence:
         return None if deadline is None else self._end_of_pause(deadline, JUST_AFTER_S)
 
     def _begin_requested_reconcile(self, next_s: float) -> bool:
-        """Begin a reconcile if the capture shows that one began before the next input. The operator must have requested
-        it. Return true in this case.
+        """Begin a reconcile if the capture shows that one began before the next input without another cause. The
+        operator must have requested it. Return true in this case.
         """
         if self._explained == len(self._sent) or self._agent.state.reconcile_in_progress:
             return False
@@ -301,7 +304,7 @@ class _InputSequence:
         return True
 
     def _expire_timer(self, deadline: float, position: int) -> int:
-        """Let the timer expire after the inputs that precede its expiry. Return the position of the next input."""
+        """Let the timer expire after the inputs that come before its expiry. Return the position of the next input."""
         count, fewest, most = self._inputs_before_timer(deadline, position)
         place = len(self.choices)
         self.choices.append(most - fewest)
@@ -318,10 +321,10 @@ class _InputSequence:
         return position
 
     def _inputs_before_timer(self, deadline: float, position: int) -> tuple[int, int, int]:
-        """Return the likely, the smallest and the largest number of inputs before the expiry of the timer.
+        """Return the most likely, the smallest and the largest number of inputs before the expiry of the timer.
 
-        The datagrams that the expiry caused show its time. Datagrams that arrived directly before may have waited in
-        the socket.
+        The time of the expiry follows from the datagrams that it caused. Datagrams that arrived directly before it may
+        have waited in the socket.
         """
         latest_s = deadline + self._late_s
         for sighting in self._sent[self._explained :]:

@@ -18,7 +18,8 @@ from ucp.trace import HandlerRun
 class JudgedTrace:
     """The trace of an agent, compared with the reference implementation.
 
-    `deviations` are the accusations. `lost` has the reasons why parts of the trace could not be judged.
+    `deviations` contains the differences from the reference. `lost` contains the reasons why parts of the trace could
+    not be judged.
     """
 
     def __init__(self, flight: Flight, agent_id: int) -> None:
@@ -29,9 +30,9 @@ class JudgedTrace:
         record = RecordedTrace(Path(f"agent {agent_id}"), "", trace, IngestedRecords(flight), [])
         player = RecordPlayer(record)
         self._known: dict[int, KnownState] = {}
-        """Handler run, by identity, after which the state is known again -> the state."""
+        """Handler run after which the state is known again -> this state. The key is the `id` of the handler run."""
         self._played: set[int] = set()
-        """Handler runs, by identity, that the reference could play."""
+        """The `id` of each handler run that the reference could play."""
         self._names = ReplayNames(record)
         self._export = flight.exports.get(agent_id)
         self._is_last_line_lost = False
@@ -57,9 +58,7 @@ class JudgedTrace:
     def with_known_states(
         self, incarnations: Sequence[Sequence[RecordedInput]]
     ) -> list[list[RecordedInput | KnownState]]:
-        """Return the inputs that can be simulated. Lost inputs are replaced by the known state of the agent
-        after them.
-        """
+        """Return the inputs that can be simulated. The known state after lost inputs replaces these inputs."""
         parts = [[*self._parts(inputs)] for inputs in incarnations]
         for before, after in zip(parts, incarnations[1:], strict=False):
             if after and isinstance(after[0].cause, BootedFromDisk) and (disk := _disk(after[0])) is not None:
@@ -90,9 +89,7 @@ class JudgedTrace:
 
 
 def _disk(boot: RecordedInput) -> KnownState | None:
-    """Return the recorded content of the disk at a restart. Return None if some of its blocks were not yet
-    committed.
-    """
+    """Return the recorded content of the disk at a restart. Return None if some of its blocks were not in the chain."""
     run = boot.runs[0]
     try:
         blocks = [*stored_blocks(run.input)]

@@ -1,7 +1,7 @@
-"""Find the mission and the settings of a flight. They are recorded, or must be guessed from the sent messages.
+"""Find the mission and the settings of a flight. If no record contains them, they are guessed from the sent messages.
 
-Some settings are visible in messages and blocks: whether votes name a chain, and the size of a full block. For the
-others, each value is tried alone, and the one that explains the most messages is assumed.
+Messages and blocks reveal some settings: whether votes name a chain, and the size of a full block. For each other
+setting, every value is tried, and the value that explains the most messages is assumed.
 """
 
 import base64
@@ -24,20 +24,18 @@ from ucp.messages import BlockAddResponse, decode
 from ucp.settings import CHOICES, Settings
 
 TRIES = 10
-"""Number of input orders that are tried for one agent and one combination of settings."""
+"""Maximum number of input orders that are tried for one agent and one combination of settings."""
 
 
 def likely_settings(
     other_records: OtherRecords, captures: dict[int, AgentCapture], header_of: Callable[[int, Settings], CheckedHeader]
 ) -> Settings:
-    """Return the settings with which the inputs of the most agents can be guessed completely from their packet
-    captures.
-    """
+    """Return the settings with which the packet captures explain the most agents completely."""
     events = {agent_id: other_records.events(agent_id) for agent_id in captures}
 
     def explained(settings: Settings) -> tuple[int, int]:
-        """Return the number of agents whose inputs are completely explained, and the number of explained inputs of all
-        agents.
+        """Return the number of agents whose inputs are completely explained with these settings, and the number of
+        explained inputs of all agents.
         """
         inferred = [
             infer(header_of(agent_id, settings), capture, events[agent_id], tries=TRIES)
@@ -56,7 +54,7 @@ def likely_settings(
 
 
 SHOWN_BY_VOTES = "vote_names_chain"
-"""The setting that `_visible_settings` reads from the votes."""
+"""The setting that the votes reveal."""
 
 
 def _alternatives(visible: Settings) -> Iterator[Settings]:
@@ -80,8 +78,8 @@ def _visible_settings(other_records: OtherRecords) -> Settings:
 
 
 def _max_block_bytes(blocks: Iterable[bytes], largest: int) -> int:
-    """Return the setting max_block_bytes, as the blocks reveal it. A block is full when an event of the largest size
-    might not fit into it.
+    """Return the setting max_block_bytes as the sizes of the blocks reveal it. A block is full if an event of the
+    largest size might not fit into it.
     """
     least, most = largest, MAX_EVENT_DATA_BYTES
     for event_data in blocks:
@@ -119,7 +117,7 @@ def known_mission(
 ) -> tuple[MissionConfiguration, dict[int, CheckedHeader]]:
     """Return the mission, and the trace header of each agent that has enough records to be simulated.
 
-    Raises FieldError if no agent has enough.
+    Raises FieldError if no agent has enough records.
     """
     initial_data = _initial_data(flight)
     headers: dict[int, CheckedHeader] = {}

@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
 
 class OtherRecords:
-    """All datagrams and blocks in the files of a flight."""
+    """All datagrams and blocks in the records of a flight."""
 
     def __init__(self, flight: Flight, opener: "DatagramOpener | None" = None, depot: "Depot | None" = None) -> None:
         """Read the files. In a secured mission, `opener` decrypts datagrams, and `depot` decrypts event data."""
         self.sealed: dict[int, dict[bytes, bytes]] = defaultdict(dict)
-        """The sealed data of each agent's blocks. The key is the encoded event that filled the block."""
+        """Agent ID -> encoded event that filled a block -> encrypted event data of the block."""
         self._depot = depot
         self.captures: dict[int, AgentCapture] = {}
         self.problems: list[str] = []
@@ -64,16 +64,16 @@ class OtherRecords:
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
         """Return the datagrams with this sender and this sequence number.
 
-        Several if it restarted, or if an attacker imitated it.
+        The result has several datagrams if the sender restarted, or if an attacker imitated it.
         """
         return [*self._datagrams.get((sender, sequence), ())]
 
     def senders(self) -> set[int]:
-        """Return the agent IDs of all senders in the records."""
+        """Return the agent IDs of all senders of recorded datagrams."""
         return {sender for sender, _ in self._datagrams}
 
     def all_datagrams(self) -> Iterator[bytes]:
-        """Yield each datagram of the flight. Equal datagrams are yielded once."""
+        """Yield each recorded datagram of the flight. Equal datagrams are yielded once."""
         for datagrams in self._datagrams.values():
             yield from datagrams
 
@@ -82,8 +82,8 @@ class OtherRecords:
         return [*self._event_data.values()]
 
     def with_seal(self, header: CheckedHeader) -> CheckedHeader:
-        """Return the header of a trace. If the mission encrypts event data, add the recorded encrypted data of the
-        agent.
+        """Return the header of a trace. If the mission encrypts event data, it also contains the encrypted data that
+        the agent recorded.
         """
         if sealed_to(header.initial_data) is None:
             return header
@@ -114,9 +114,7 @@ class OtherRecords:
         return events
 
     def _open(self, block: Block) -> bytes:
-        """Return the event data of a block in decrypted form, if the key of the depot decrypts them. Otherwise return
-        them unchanged.
-        """
+        """Decrypt the event data of a block if the depot's key is given. Otherwise return them unchanged."""
         if self._depot is None:
             return block.event_data
         from ucp.secure.sealing import NotOpenedError
@@ -130,7 +128,7 @@ class OtherRecords:
 
     @property
     def _reason_unreadable(self) -> str:
-        """The reason why event data cannot be divided into events, as the end of a sentence. It is "" if they are not
+        """The reason why event data cannot be divided into events, as the end of a sentence. Empty if they are not
         encrypted.
         """
         exports = self._exports.values()
@@ -151,7 +149,7 @@ class OtherRecords:
 
 
 def _seals(trace: Trace) -> Iterator[tuple[bytes, bytes]]:
-    """Yield each event that completed a block, together with the encrypted data of this block."""
+    """Yield each event that completed a block, with the encrypted event data of this block."""
     for run in trace.runs:
         if (sealed := sealed_of(run.sealed)) is not None and run.input is not None:
             with suppress(ValueError, MalformedEventsError):

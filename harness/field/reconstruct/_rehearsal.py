@@ -1,10 +1,11 @@
-"""Simulate one agent alone with its recorded inputs, to find out how far its record follows the protocol.
+"""Simulate one agent alone with its recorded inputs, to find the part of its record that follows the protocol.
 
-The agent core, or a core with a known quirk, plays each recorded input at its recorded time. The resulting handler
-runs must equal the recorded ones. The reference cannot play: the scenario needs agents, and known quirks exist only
-for the core. It judges, however: `_comparing` names a deviation from the protocol by the step judge, which uses it.
-In this way the first deviation of an agent is known before a whole flight is simulated. The rehearsal also determines
-which datagrams had an effect, which timers were started, and which datagrams were sent.
+The agent core, with or without a known mistake (quirk), gets each recorded input at its recorded time. The resulting
+handler runs must equal the recorded ones. The reference implementation is not used for this, because the scenario will
+be played by agents, and quirks exist only for the agent core. The reference only names the deviations from the
+protocol: `_comparing` gets them from the step judge. The first deviation of an agent is therefore known before the
+whole flight is simulated. The simulation also determines which datagrams had an effect, which timers were started, and
+which datagrams were sent.
 """
 
 import base64
@@ -40,8 +41,8 @@ MAX_NAME = 40
 
 @dataclass(frozen=True, slots=True)
 class TimerStart:
-    """A timer that the agent started. `number` counts the timers of the agent, and `place` is the position of the input
-    that started this timer.
+    """A timer that the agent started. The timers of the agent are numbered in `number`. `place` is the position of the
+    input that started this timer.
 
     `duration_s` is measured on the agent's own clock.
     """
@@ -58,7 +59,7 @@ class ProtocolDeviation:
     line: int
     at_s: float
     description: str
-    """A text that completes "agent 32 ..."."""
+    """The deviation as text that completes a sentence such as "agent 32 ..."."""
     algorithms: frozenset[int]
     """The Algorithms of the recorded handler runs at this place."""
 
@@ -67,8 +68,8 @@ class ProtocolDeviation:
 class PlayedInput:
     """An input that was simulated and can be simulated again. `sent` contains the datagrams that the input caused.
 
-    `matters` is false for a message that no handler uses. `expired` is the timer that expired, if the input is that.
-    `stopped` are timers that were stopped before their expiry.
+    `matters` is false for a message without effect. If the input is a timer expiry, `expired` is this timer. `stopped`
+    contains the timers that the input stopped before their expiry.
     """
 
     incarnation: int
@@ -84,8 +85,8 @@ class SoloSimulation:
     """The simulation of one agent with its recorded inputs. If the record deviates from the protocol, `played` contains
     only the inputs before `deviation`.
 
-    `chain` has the block hashes of the agent's chain at that point. `running_at_end` has the timers that ran at the end
-    of each incarnation.
+    `chain` contains the block hashes of the agent's chain after the last input. `running_at_end` contains the timers
+    that were running at the end of each incarnation.
     """
 
     agent_id: int
@@ -95,27 +96,27 @@ class SoloSimulation:
     chain: list[str] = field(default_factory=list)
     running_at_end: list[list[TimerStart]] = field(default_factory=list)
     truncated: bool = False
-    """True if the record ends before all effects of its last input. The input is played completely."""
+    """True if the record ends before all effects of its last input. This input is simulated completely."""
     matches_exactly: bool = True
-    """True if branches and tallies are equal to the recorded ones, too."""
+    """True if branches and tallies also equal the recorded ones."""
     ignored: list[RecordedInput] = field(default_factory=list)
-    """Messages that the agent ignored although they should have had an effect. They are not played."""
+    """Messages that the agent ignored although they should have had an effect. The simulation omits them."""
     inferred: int = 0
-    """Number of inputs that were inferred in place of lost lines."""
+    """Number of guessed inputs that replace lost lines."""
     stopped: str | None = None
-    """The reason why lines were lost, if the state after them could not be reached. The rehearsal ends there."""
+    """The reason why lines were lost, if the simulation could not reach the state after them. It ends at this place."""
 
 
 @dataclass(frozen=True, slots=True)
 class ToleratedDeviations:
-    """The kinds of deviations to ignore. Timers may expire early, and the agent may ignore messages."""
+    """The kinds of deviations that the simulation tolerates: early timers, and ignored messages."""
 
     early_timers: bool = False
     ignoring: bool = False
 
 
 Incarnations = Sequence[Sequence[RecordedInput | KnownState]]
-"""The inputs of each incarnation. A known state stands for lost inputs, which lead to this state."""
+"""The inputs of each incarnation. A known state replaces lost inputs that lead to this state."""
 
 
 def rehearse(
@@ -175,7 +176,7 @@ class _IncarnationSimulation:
         self._early_s = math.inf if tolerance.early_timers else header.early_s
         self._ignoring = tolerance.ignoring
         self._running_timers: dict[int, TimerStart] = {}
-        """The timers that run, by number."""
+        """Number of a timer -> the timer, for the timers that are running."""
         timers.update(self.agent.state)
 
     def running_at_end(self) -> list[TimerStart]:
@@ -209,7 +210,7 @@ class _IncarnationSimulation:
     def play(
         self, index: int, recorded_input: RecordedInput, stored: StoredState | None, *, is_last: bool
     ) -> ProtocolDeviation | None:
-        """Simulate an input. Return the deviation if the result differs from the record. Return None otherwise."""
+        """Simulate an input. If the result differs from the record, return the deviation. Otherwise return None."""
         expired = (
             self._timers.running.get(recorded_input.cause.name)
             if isinstance(recorded_input.cause, TimerExpired)
@@ -245,8 +246,8 @@ class _IncarnationSimulation:
         return None
 
     def _sent(self, recorded_input: RecordedInput) -> list[bytes]:
-        """Return the datagrams that the record contains as sent. If the record lacks them, return those of the
-        simulated agent.
+        """Return the datagrams that the agent sent according to the record. If the record does not contain them, return
+        those of the simulated agent.
         """
         encoded = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
         recorded = [sent.datagram for run in recorded_input.runs for sent in run.sent]
@@ -266,7 +267,9 @@ class _IncarnationSimulation:
         played.stopped = [started for number, started in before.items() if number not in self._running_timers]
 
     def _feed(self, recorded_input: RecordedInput, stored: StoredState | None) -> str | None:
-        """Give an input to the simulated agent. Return the reason if the input is impossible. Return None otherwise."""
+        """Give an input to the simulated agent. If the input is impossible, return the reason. Otherwise return
+        None.
+        """
         agent, now = self.agent, recorded_input.at_s
         match recorded_input.cause:
             case EventLogged(event):
@@ -292,7 +295,7 @@ class _IncarnationSimulation:
         return None
 
     def _matters(self, datagram: bytes) -> bool:
-        """Return true if an agent that follows the protocol uses the datagram."""
+        """Return true if the datagram has an effect on an agent that follows the protocol."""
         try:
             sender, _, message = decode(datagram)
         except MalformedDatagramError:
@@ -325,7 +328,7 @@ def _matches_exactly(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -
 
 
 def _difference(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | None:
-    """Return a description of the first difference that has an effect. Return None if there is no such difference."""
+    """Describe the first difference that has an effect. Return None if no difference has one."""
     runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
     for ours, theirs in zip_longest(runs, recorded):
         if ours is None:

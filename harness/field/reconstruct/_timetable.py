@@ -1,12 +1,12 @@
 """Put the inputs of all agents on one common time axis.
 
-Three rules hold. The inputs of each agent keep their order. A message arrives after it was sent. A timer expires no
-sooner than its duration after its start. Each input happens as early as these rules allow, but not before its recorded
-time on the agent's clock. Therefore the simulated chains equal the recorded ones, even if a clock was changed or is
-known only roughly. Only times are stretched.
+The common times follow three rules. The inputs of each agent keep their order. A message arrives after it was sent. A
+timer does not expire before its duration is over. Each input gets the earliest time that these rules allow, but not
+before its recorded time on the agent's clock. The simulated chains therefore equal the recorded ones, even if a clock
+was changed or is known only roughly. Only intervals of time become longer.
 
-A received datagram that no played agent sent is a stray. The scenario sends it as a separate datagram. A datagram that
-was received before it was sent, according to the records, becomes a stray, too.
+A *stray* is a received datagram that no simulated agent sent. The scenario sends it as a separate datagram. If a
+datagram was received before it was sent, according to the records, it also becomes a stray.
 """
 
 import math
@@ -21,13 +21,17 @@ from harness.field.reconstruct._rehearsal import PlayedInput, SoloSimulation, Ti
 from harness.field.replay._peer_messages import DeliveredMessage
 
 MIN_GAP_S = 2e-5
-"""Minimum time between two inputs of an agent, and between the sending and the arrival of a message."""
+"""Minimum number of seconds between two inputs of an agent, and between the sending and the arrival of a message."""
 DIGITS = 6
 MILLION = 10.0**DIGITS
 MAX_WAIT_S = 86400.0
-"""Maximum mission second of the first input. If it is later, the clocks do not count from the start of the mission."""
+"""Maximum mission second of the first input. If it is later, the clocks do not start at the beginning of the
+mission.
+"""
 MAX_CLOCK_ERROR_S = 1.0
-"""Maximum time by which a datagram may seem to be sent after its arrival. It selects one of several equal datagrams."""
+"""Maximum number of seconds by which a datagram may seem to be sent after its arrival. The limit is used to select one
+of several equal datagrams.
+"""
 
 
 @dataclass(slots=True)
@@ -50,7 +54,8 @@ class IncarnationTimes:
     """The mission seconds of the first and the last input of an incarnation. `boots` is true if the incarnation began
     with data on the disk.
 
-    The incarnation existed at `present_s`: the first message that it received was sent then, or another input came.
+    The incarnation was running at `present_s`, the time at which its first received message was sent, or its first
+    other input.
     """
 
     number: int
@@ -62,9 +67,9 @@ class IncarnationTimes:
 
 @dataclass
 class InputTimetable:
-    """The inputs of all agents in mission time. Each element of `clocks` relates an agent's clock to mission time.
+    """The inputs of all agents in mission time. `clocks` relates each agent's clock to mission time.
 
-    `contradictions` has a sentence for each record that no order of inputs explains.
+    `contradictions` has a sentence for each record that contradicts every order of inputs.
     """
 
     clocks: dict[int, ClockLine]
@@ -73,7 +78,7 @@ class InputTimetable:
     """All datagrams that each agent sends, in order."""
     sent_at_s: dict[int, list[float]] = field(default_factory=dict)
     lateness: dict[int, dict[int, float]] = field(default_factory=dict)
-    """The delays of timers, by their numbers."""
+    """Agent -> number of a timer -> delay of the timer in seconds."""
     contradictions: list[str] = field(default_factory=list)
 
     def incarnations(self, agent_id: int) -> list[IncarnationTimes]:
@@ -95,7 +100,9 @@ class InputTimetable:
 
 
 def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, float] = {}) -> InputTimetable:
-    """Return the inputs of all agents on one time axis. `ahead_s` relates the clocks of the agents to GPS time."""
+    """Return the inputs of all agents on one time axis. `ahead_s` contains the differences of the agents' clocks from
+    GPS time.
+    """
     senders = _DatagramsBySender(rehearsals)
     clocks = estimate(rehearsals, senders.deliveries(), ahead_s)
     clocks = _from_zero(clocks, rehearsals)
@@ -103,10 +110,10 @@ def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, fl
 
 
 def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSimulation]) -> dict[int, ClockLine]:
-    """Return the clocks of all agents relative to mission time, which has a new second 0.
+    """Choose mission second 0. Return the clocks of all agents relative to it.
 
-    Mission second 0 is the time at which the first clock shows 0. If the first input is earlier, or much later, mission
-    second 0 is directly before it.
+    It is the time at which the first clock shows 0. If the first input is earlier or much later, it is directly before
+    this input.
     """
     played = {agent: rehearsal.played[0] for agent, rehearsal in rehearsals.items() if rehearsal.played}
     first = min((clocks[agent].at(of_agent.input.at_s) for agent, of_agent in played.items()), default=0.0)
@@ -121,13 +128,13 @@ def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSim
 
 
 class _DatagramsBySender:
-    """The datagrams that each simulated agent sent. The simulated agents that received them can be found."""
+    """The datagrams that each simulated agent sent. They can be searched for the sender of a received datagram."""
 
     def __init__(self, rehearsals: Mapping[int, SoloSimulation]) -> None:
         self._rehearsals = rehearsals
         self.sent: dict[int, list[bytes]] = {agent: [] for agent in rehearsals}
         self._sent_by: dict[int, list[int]] = {agent: [] for agent in rehearsals}
-        """The position of the input that caused each datagram."""
+        """Sender -> for each of its datagrams, the position of the input that caused it."""
         self._numbers: dict[bytes, list[tuple[int, int]]] = defaultdict(list)
         for agent, rehearsal in rehearsals.items():
             for place, played in enumerate(rehearsal.played):
@@ -137,7 +144,7 @@ class _DatagramsBySender:
                     self._sent_by[agent].append(place)
 
     def of(self, datagram: bytes, receiver: int) -> list[tuple[int, int]]:
-        """Return (agent, number) for each time that the datagram was sent by an agent that is not the receiver."""
+        """Return (agent, number) for each time that an agent other than the receiver sent this datagram."""
         return [sent for sent in self._numbers.get(datagram, ()) if sent[0] != receiver]
 
     def sent_s(self, agent: int, number: int) -> float:
@@ -145,7 +152,7 @@ class _DatagramsBySender:
         return self._rehearsals[agent].played[self._sent_by[agent][number]].input.at_s
 
     def deliveries(self) -> list[DeliveredMessage]:
-        """Return one delivery for each reception of a datagram that was sent exactly once."""
+        """Return one delivery for each reception of a datagram that was sent only once."""
         found = []
         for receiver, rehearsal in self._rehearsals.items():
             for played in rehearsal.played:
@@ -169,7 +176,7 @@ class _TimetablePlanner:
         self._played = {agent: rehearsal.played for agent, rehearsal in rehearsals.items()}
         self._next = dict.fromkeys(rehearsals, 0)
         self._at: dict[int, list[float]] = {agent: [0.0] * len(played) for agent, played in self._played.items()}
-        """The time on each agent's own clock at its planned inputs, by position."""
+        """Agent -> the times of its planned inputs on its own clock, by position."""
         self._ready: list[tuple[float, int]] = []
         self._waiting: dict[tuple[int, int], list[int]] = defaultdict(list)
         self._as_strays: set[tuple[int, int]] = set()
@@ -191,8 +198,8 @@ class _TimetablePlanner:
         return self._table
 
     def _queue(self, agent: int) -> None:
-        """Find the next relevant input of the agent. It is ready, or it waits until another agent has sent
-        the message.
+        """Find the next input of the agent that needs a time. The input is ready, or waits until another agent has sent
+        a message.
         """
         played = self._played[agent]
         place = self._next[agent]
@@ -227,7 +234,7 @@ class _TimetablePlanner:
     def _break_cycle(self) -> None:
         """Resolve a deadlock in which each agent waits for a message that another agent has not yet sent.
 
-        The earliest waiting input becomes a stray.
+        The waiting input with the earliest time becomes a stray.
         """
         waiting = [
             (self._recorded_s(agent, self._next[agent]), agent, sent)
@@ -283,14 +290,12 @@ class _TimetablePlanner:
         self._queue(agent)
 
     def _expiry(self, agent: int, timer: TimerStart) -> tuple[float, float]:
-        """Return the time at which a timer would expire without delay, once on the agent's clock and once in mission
-        seconds.
-        """
+        """Return the time at which a timer expires without delay, on the agent's clock and in mission seconds."""
         expiry_local = self._at[agent][timer.place] + timer.duration_s
         return expiry_local, self._table.clocks[agent].at(expiry_local)
 
     def _keep_running(self, agent: int, timer: TimerStart, until_s: float) -> None:
-        """Delay the timer so that it does not expire before `until_s`."""
+        """Delay the timer so that it still runs at `until_s`."""
         _, expiry_s = self._expiry(agent, timer)
         if expiry_s < until_s + MIN_GAP_S:
             self._delay(agent, timer, _rounded_up(until_s + 2 * MIN_GAP_S - expiry_s))

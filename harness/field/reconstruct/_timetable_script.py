@@ -1,6 +1,4 @@
-"""Write the inputs of all agents as a scenario. The scenario contains exact events, datagrams, timer delays
-and faults.
-"""
+"""Write the inputs of all agents as a scenario with exact events, datagrams, timer delays and faults."""
 
 import base64
 import dataclasses
@@ -21,9 +19,9 @@ from ucp.settings import Settings
 
 HALF_GAP_S = MIN_GAP_S / 2
 Sealed = Mapping[int, Mapping[bytes, bytes]]
-"""The sealed data of blocks, by agent and by the event that filled the block."""
+"""Agent -> event that filled a block -> encrypted event data of the block."""
 MIN_PAUSE_S = 0.5
-"""Minimum delay of a timer that shows a pause of its agent."""
+"""Minimum delay of a timer, in seconds, from which the agent is assumed to have been paused."""
 
 
 def scenario_document(
@@ -33,10 +31,10 @@ def scenario_document(
     lost: Collection[int],
     sealed: Sealed,
 ) -> Document:
-    """Return the scenario as a document. An agent without simulated inputs does not take part in it.
+    """Return the scenario as a document. An agent without simulated inputs is not in the scenario.
 
-    `lost` agents, and agents whose record ends early, are switched off after their last input. `sealed` has the sealed
-    data of agents.
+    The agents in `lost`, and agents whose record ends early, are switched off after their last input. `sealed` contains
+    encrypted event data.
     """
     incarnations = {
         agent: _all_incarnations(table.incarnations(agent), len(rehearsal.running_at_end))
@@ -76,8 +74,8 @@ def _all_incarnations(known: Sequence[IncarnationTimes], count: int) -> list[Inc
 
 
 def _start_times(incarnations: Sequence[IncarnationTimes]) -> list[float]:
-    """Return the start times of an agent's incarnations. The first one starts at 0. The others start at the recorded
-    restart, or just before their first reception.
+    """Return the start times of an agent's incarnations. The first incarnation starts at 0. Later ones start at the
+    recorded restart, or just before their first reception.
     """
     start_times = [0.0]
     for before, incarnation in pairwise(incarnations):
@@ -127,7 +125,7 @@ def _events(table: InputTimetable, sealed: Sealed) -> list[Document]:
 
 
 class _StrayDatagrams:
-    """The datagrams that no agent in the scenario sends. The scenario must deliver them itself."""
+    """Datagrams that no agent in the scenario sends. The scenario must send them itself."""
 
     def __init__(self) -> None:
         self._reached: dict[bytes, list[dict[int, float]]] = defaultdict(list)
@@ -154,7 +152,7 @@ def _with_text_keys(reached: Mapping[int, float]) -> Document:
 
 
 def _source(datagram: bytes) -> int:
-    """Return the agent ID in the datagram's sender field."""
+    """Return the agent ID in the sender field of the datagram."""
     try:
         return decode(datagram).sender
     except MalformedDatagramError:
@@ -169,7 +167,7 @@ def _fates(
 ) -> Iterator[Document]:
     """Yield the scripted delivery of each datagram that arrives.
 
-    All others are lost. Datagrams that no agent can send to the receiver become strays.
+    All other datagrams are lost. Datagrams that no agent can send to the receiver become strays.
     """
     arrivals: dict[tuple[int, int], list[tuple[int, float]]] = defaultdict(list)
     for receiver, inputs in table.inputs.items():
@@ -190,7 +188,7 @@ def _fates(
 
 
 def _can_be_sent(timed_input: TimedInput, table: InputTimetable, start_times: Sequence[float]) -> bool:
-    """Return true if a simulated agent sent the datagram while the receiver was already running."""
+    """Return true if a simulated agent sent the datagram when the receiver was already running."""
     if timed_input.sender is None or timed_input.number is None:
         return False
     return table.sent_at_s[timed_input.sender][timed_input.number] >= start_times[timed_input.played.incarnation]
@@ -203,7 +201,7 @@ def _entries(
     incarnations: Mapping[int, Sequence[IncarnationTimes]],
     lost: Collection[int],
 ) -> Iterator[tuple[float, Document]]:
-    """Yield the faults of agents, and the commands of the operator."""
+    """Yield the timeline entries of the scenario: faults of agents, and commands of the operator."""
     yield from _pauses(table)
     if absent := [agent for agent in roster if agent not in rehearsals]:
         yield 0.0, {"kill": absent}

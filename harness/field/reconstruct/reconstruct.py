@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from ucp.secure.sealing import Depot
 
 SEED = 1
-"""The seed of the simulation. The scenario does not depend on it."""
+"""The seed of the simulation. The scenario does not depend on the seed."""
 
 
 @dataclass(frozen=True)
 class AgentOutcome:
-    """The result for one agent: the number of blocks in its simulated chain, and the reason `why` this chain differs
-    from the recorded one. `why` is None if they are equal.
+    """The result for one agent: the number of blocks in its simulated chain. `why` is the reason why this chain differs
+    from the recorded one. It is None if both are equal.
     """
 
     agent_id: int
@@ -47,8 +47,8 @@ class AgentOutcome:
 class Reconstruction:
     """A scenario and the part of the flight that it reproduces.
 
-    `agents` are those with a record, and `remarks` the assumptions. `difference` is the first step at which the
-    simulation differs from the record of an agent that should be played completely.
+    `agents` contains the agents with a record. `remarks` contains the assumptions. `difference` is the first step at
+    which the simulation differs from a record that should be simulated completely.
     """
 
     document: Document
@@ -58,7 +58,7 @@ class Reconstruction:
     simulated: Simulated
     table: InputTimetable = field(repr=False)
     wrong_signatures: list[str] = field(default_factory=list)
-    """A sentence on each wrong signature in the exports of a secured flight."""
+    """A sentence about each wrong signature in the exports of a secured flight."""
 
     @property
     def problems(self) -> list[str]:
@@ -236,7 +236,9 @@ def _blocks(simulated: Simulated, agent_id: int) -> int:
 
 
 def _expected(simulated: Simulated, reproduced: set[int]) -> Document:
-    """Return the expectations of the scenario: the reproduced chains, and the bad verdicts on the recorded flight."""
+    """Return the section `expect` of the scenario: the reproduced chains, and the bad verdicts on the recorded
+    flight.
+    """
     exports = simulated.evidence.exports
     chains = {str(agent): exports[agent].top_chain_hash for agent in sorted(reproduced) if agent in exports}
     bad = {key: simulated.result.judgements[key].verdict for key in simulated.result.bad}
@@ -250,7 +252,7 @@ WIDTH = 116
 
 
 def write(reconstruction: Reconstruction, path: Path, sources: Sequence[Path], left_out: Sequence[str]) -> None:
-    """Write the scenario to a file. Raises MachineError if that fails."""
+    """Write the reconstructed scenario to a file. Raises MachineError if that fails."""
     sentences = _sentences(reconstruction, path, sources, left_out)
     comment = [line for sentence in sentences for line in wrap(sentence, WIDTH)]
     try:

@@ -2,7 +2,7 @@
 
 `_record_search` finds the record in a directory, `_agent_record` holds its lines, and `_player` plays them. The player
 saves its state at intervals, so it can go back exactly. `breakpoints` stop it at a line, a handler, a block or a
-difference. `_resumption` finds the place where an agent can be followed again after a gap. `_other_agents` shows the
+difference. `_resumption` finds the place after a gap at which the comparison can continue. `_other_agents` shows the
 steps of the other agents at the same time. `prompt` is the interactive command line.
 """
 

@@ -32,7 +32,8 @@ from ucp.trigger import MessageTrigger
 class RecordEntry:
     """An entry of the record: one line of the trace. Line numbers and incarnations count from 1.
 
-    `gap` describes missing lines directly before it, such as "2 lines are damaged", else None.
+    `gap` describes missing lines directly before this line, such as "2 lines are damaged". It is None if no lines are
+    missing.
     """
 
     line: int
@@ -55,13 +56,14 @@ class FlightRecords(Protocol):
         """Return the content of run.json. Return None for a real flight."""
 
     def capture(self, agent_id: int) -> AgentCapture | None:
-        """Return the capture of the agent's vehicle. Return None if there is no capture or if it is not needed."""
+        """Return the capture of the agent's vehicle. Return None if no capture exists, or if it is not needed."""
 
 
 class RecordedTrace:
-    """The trace of one agent. `path` is its file, and `argument` is its name on the command line.
+    """The trace of one agent. `path` is the file of the trace, and `argument` is the name that the user gave on the
+    command line.
 
-    Raises FieldError if no part of it can be played.
+    Raises FieldError if no part of the trace can be played.
     """
 
     def __init__(self, path: Path, argument: str, trace: Trace, flight: FlightRecords, problems: list[str]) -> None:
@@ -73,7 +75,9 @@ class RecordedTrace:
         self.agent_id = trace.header.agent_id
         self.incarnations = len(trace.starts) + 1
         self.doubts: dict[int, str] | None = None
-        """Positions at which damage to a single line explains a deviation, with the reason. None until it is tried."""
+        """Position -> the damage to a single line that explains a deviation there. None until such explanations were
+        searched.
+        """
         if not trace.header.has_inputs:
             raise FieldError(
                 f"{path}: it has the version ucp-trace/1, which lacks received messages; agents must write ucp-trace/2"
@@ -96,8 +100,8 @@ class RecordedTrace:
 
     @cached_property
     def unrecorded(self) -> dict[int, str]:
-        """The positions of entries whose deviations lost lines may explain. The values are reasons, such as "lines are
-        missing ...".
+        """Position of an entry whose deviations lost lines may explain -> the reason, such as "lines are missing
+        ...".
         """
         lost = {} if self.is_counted else lost_lines(self.trace)
         of_runs = [position for position, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
@@ -105,17 +109,15 @@ class RecordedTrace:
 
     @property
     def doubtful_runs(self) -> dict[int, str]:
-        """The positions in the trace of handler runs whose deviations may come from damage to a single line, with the
-        reason.
-        """
+        """Position of a handler run whose deviations damage to a single line may explain -> the damage."""
         of_entries = [number for number, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
         doubts = self.doubts or {}
         return {number: doubts[entry] for number, entry in enumerate(of_entries) if entry in doubts}
 
     @property
     def is_counted(self) -> bool:
-        """True if run.json proves that no line of the trace is missing. The proof is the agent's own count of its
-        handler runs.
+        """True if run.json proves that no line of the trace is missing. run.json contains the number of handler runs
+        that the agent counted.
         """
         run = self.flight.record
         recorded = run.agents.get(str(self.agent_id)) if run is not None else None
@@ -144,7 +146,7 @@ class RecordedTrace:
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
         """Return false if the records prove that this message did not reach the agent before `at_s`.
 
-        A capture of the vehicle proves it, and so does a trace of the sender that lacks no line.
+        A capture of the vehicle can prove this, and so can a complete trace of the sender.
         """
         if self.arrivals and self.arrivals[0].at_s < at_s < self.arrivals[-1].at_s:
             return any(
@@ -155,9 +157,7 @@ class RecordedTrace:
 
     @cached_property
     def _sent_by_complete_traces(self) -> dict[int, list[Message]]:
-        """The messages that each other agent sent, by agent ID. Agents with missing lines in their traces are
-        left out.
-        """
+        """Agent ID -> the messages that the agent sent. Agents with missing lines in their traces are not included."""
         sent = {}
         lacking = {agent_id for agent_id, _ in lacking_traces(self.flight.traces)}
         for agent_id, trace in self.flight.traces.items():
@@ -170,7 +170,7 @@ class RecordedTrace:
 
     @cached_property
     def arrivals(self) -> list[CapturedDatagram] | None:
-        """The datagrams that reached the vehicle of the agent, in order. None if there is no capture of the vehicle."""
+        """The datagrams that reached the vehicle of the agent, in order. None without a capture of the vehicle."""
         capture = self.flight.capture(self.agent_id)
         return None if capture is None else [seen for seen in capture.sightings if not seen.outbound]
 
@@ -202,11 +202,11 @@ class RecordedTrace:
         return exported_s if exported_s >= self.end_s else None
 
     def ends_open(self, follower: StepComparer) -> str | None:
-        """Return a sentence about an early end of the record. The record ends early if the agent left no export and
-        other agents continued after it.
+        """Return a sentence if the record ends early: the agent left no export, and other agents continued after its
+        last line.
 
-        Without any export, the mission may have ended at different times, and only a due timer proves an early end.
-        `follower` is in the state after the last line.
+        If no agent left an export, the agents may have been stopped at different times. Only a due timer then proves an
+        early end. `follower` has the state after the last line.
         """
         trace, flight = self.trace, self.flight
         if trace.cut_off or trace.problem or self.agent_id in flight.exports:
@@ -231,8 +231,8 @@ class RecordedTrace:
     def was_paused(self, since: float, until: float) -> bool:
         """Return true if the agent was paused, or may have been paused, between two mission seconds.
 
-        The record of a run contains the pauses. Without it, an agent may have been paused if it wrote no line while a
-        timer was overdue, and caught up with its next line.
+        run.json contains the pauses of a run. Without run.json, the agent may have been paused if it wrote no line
+        while a timer was overdue, and handled the timer with its next line.
         """
         if self.flight.record is not None:
             return Evidence({}, record=self.flight.record).was_paused(self.agent_id, since, until)
@@ -255,7 +255,7 @@ def _are_alike(ours: Message, other: Message) -> bool:
 
 
 def _entries(trace: Trace) -> Iterator[RecordEntry]:
-    """Yield the lines of a trace in order."""
+    """Yield the lines of a trace as entries, in order."""
     missing = {gap.position: _missing(gap.lines) for gap in trace.gaps}
     missing |= dict.fromkeys(trace.jumps, "the agent's clock was set")
     asides = deque(zip((position for position, _ in trace.asides), trace.numbered_asides(), strict=True))

@@ -1,9 +1,9 @@
 """Find messages that reached the vehicle of an agent but are missing in its trace.
 
-An agent writes a line for each message that it handles or drops. A capture of its vehicle shows the messages that
-arrived. A few messages without a line prove nothing, because lines may be lost, or the socket of the agent may discard
-messages. Messages without a line at many separate places are a deviation. Only messages that would have had an effect
-count, because the agents of a simulation do not get the others.
+An agent writes a line for each message that it handles or drops. A capture of its vehicle contains the messages that
+arrived. If a few messages have no line, this proves nothing, because lines may be lost, or the socket of the agent may
+discard messages. If messages at many separate places have no line, this is a deviation. Only messages that would have
+had an effect count, because simulated agents do not receive others.
 """
 
 from bisect import bisect_right
@@ -20,13 +20,13 @@ from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
 
 MAX_PLACES = 3
-"""Number of places at which lines may be lost, or the socket may discard messages."""
+"""Maximum number of places at which messages without a line are explained by lost lines or a full socket."""
 MAX_TRIED = 200
-"""Maximum number of messages whose effect is computed."""
+"""Maximum number of messages without a line for which the effect is computed."""
 
 
 class PlayedAgent(Protocol):
-    """A player of an agent's record that is at some position in the record."""
+    """An object that plays an agent's record and is at some position in it."""
 
     @property
     def lost(self) -> str | None: ...
@@ -37,8 +37,8 @@ class PlayedAgent(Protocol):
 
 
 def ignored_messages(record: RecordedTrace, play_to: Callable[[int], PlayedAgent]) -> tuple[int, StepDeviation] | None:
-    """Return the first message that the agent ignored, with its position. Return None if the agent ignored no or only a
-    few messages.
+    """Return the first message that the agent ignored, with its position. Return None if the agent ignored only a few
+    messages or none.
 
     `play_to` plays the entries up to a position.
     """
@@ -66,8 +66,8 @@ def ignored_messages(record: RecordedTrace, play_to: Callable[[int], PlayedAgent
 
 
 def _without_line(record: RecordedTrace) -> Iterator[tuple[int, CapturedDatagram]]:
-    """Yield the messages that arrived between two lines of an incarnation and have no line themselves. Each has the
-    position of the next entry.
+    """Yield the messages that arrived between two lines of an incarnation but have no line. Each has the position of
+    the next entry.
     """
     known = {(run.sender, run.sequence) for entry in record.entries if (run := _received(entry)) is not None}
     times = [entry.content.t for entry in record.entries]

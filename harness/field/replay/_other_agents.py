@@ -1,4 +1,4 @@
-"""Show the steps of the other agents at the current moment of a replay, as far as these agents left records."""
+"""Show the steps of the other agents near the current moment of a replay, as far as their records exist."""
 
 from bisect import bisect_right
 from collections.abc import Iterator
@@ -18,16 +18,18 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 NEAR_S = 2.0
-"""Maximum time between a shown step and the moment, in mission seconds before and after."""
+"""Maximum number of mission seconds between the current moment and a shown step."""
 STEPS_SHOWN = 2
-"""Maximum number of shown steps before, and after, the moment. Steps related to the current one are shown as well."""
+"""Maximum number of steps shown before the current moment, and after it. Steps related to the current one are shown as
+well.
+"""
 
 
 class OtherAgents:
     """The records of the agents that are not replayed. Each record is read when it is first used.
 
-    The agents of a run share one clock. Agents in the field have separate clocks, whose offsets follow from the
-    messages between two agents.
+    The agents of a run share one clock. In the field, agents have separate clocks. The offset between two clocks is
+    computed from the messages between the two agents.
     """
 
     def __init__(self, record: RecordedTrace) -> None:
@@ -40,8 +42,8 @@ class OtherAgents:
         return {agent_id: _OtherAgent(record, trace) for agent_id, trace in others.items()}
 
     def at(self, player: RecordPlayer) -> Iterator[Text]:
-        """Yield text about each other agent: its steps at this moment, its state, and its relation to the
-        current step.
+        """Yield text about each other agent: its steps near this moment, its state, and its messages that are related
+        to the current step.
         """
         entry = player.entry
         now = entry.content.t if entry else 0.0
@@ -83,13 +85,15 @@ class _OtherAgent:
         return clocks[other].after(clocks[own].inverse())
 
     def runs_near(self, now: float) -> range:
-        """Return the positions of the agent's last handler runs before this moment, and of its first ones after it."""
+        """Return the positions of the agent's last handler runs before this moment, and of its first handler runs after
+        it.
+        """
         first, until = (bisect_right(self._times, now + seconds) for seconds in (-NEAR_S, NEAR_S))
         middle = bisect_right(self._times, now)
         return range(max(first, middle - STEPS_SHOWN), min(until, middle + STEPS_SHOWN))
 
     def state_text(self, now: float, top: str) -> str:
-        """Return a text about the state of the agent at this moment."""
+        """Describe the state of the agent at this moment."""
         number = bisect_right(self._times, now) - 1
         if number < 0:
             return "nothing yet"
@@ -102,8 +106,8 @@ class _OtherAgent:
         )
 
     def related_lines(self, their_run: int, run: HandlerRun) -> Iterator[Text]:
-        """Yield the lines of the agent that are related to the current step: the step that sent the message which
-        triggered it, and the steps that received its messages.
+        """Yield the lines of the other agent that are related to the current step: the step that sent the message of
+        the current step, and the steps that received messages from the current step.
         """
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger) and trigger.sender == their_run:
@@ -129,7 +133,9 @@ class _OtherAgent:
 
 
 def _ahead_s(our_trace: Trace, their_run: Trace) -> float:
-    """Return the difference between two agents' mission clocks, from the start times in both traces."""
+    """Return the difference between the mission clocks of two agents in seconds, from the start times in both
+    traces.
+    """
     own, other = (trace.header.clock.get("epoch_us") for trace in (our_trace, their_run))
     speedup = our_trace.header.clock.get("speedup", 1.0)
     if not (isinstance(own, int) and isinstance(other, int) and isinstance(speedup, int | float)):

@@ -1,4 +1,4 @@
-"""Find the messages between the replayed agent and one other agent that occur in the records of both agents."""
+"""Find the messages between the replayed agent and one other agent that the records of both agents contain."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,9 +12,7 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class DeliveredMessage:
-    """A message with the time at which it was sent, on the sender's clock, and the time at which it was received, on
-    the receiver's clock.
-    """
+    """A message with its sending time on the sender's clock and its receiving time on the receiver's clock."""
 
     sender: int
     receiver: int
@@ -46,8 +44,8 @@ class PeerMessages:
                 self._received.setdefault((trigger.message, trigger.sequence), []).append(number)
 
     def runs_that_sent(self, message: object, sequence: object) -> list[int]:
-        """Return the positions of the handler runs that sent a message of this type with this sequence number. There is
-        at most one in each incarnation.
+        """Return the positions of the handler runs that sent a message of this type with this sequence number. Each
+        incarnation has at most one such run.
         """
         return self._sent.get((message, sequence), [])
 
@@ -58,7 +56,7 @@ class PeerMessages:
         return self._received.get((message, sequence), [])
 
     def __iter__(self) -> Iterator[PeerMessage]:
-        """Yield the messages that both records certainly contain, in the order of the replayed agent's record."""
+        """Yield the messages that are certainly in both records, in the order of the replayed agent's record."""
         own, other = self._agents
         for position, entry in enumerate(self._record.entries):
             run = entry.content

@@ -1,7 +1,7 @@
 """Play a record: give the recorded inputs to the reference core or to the agent core, forward or back. The result is
 the same each time.
 
-To go back, the player restores a checkpoint and plays forward from there. Reversing single steps instead would need an
+To go back, the player restores a checkpoint and plays forward from it. To reverse single steps, it would need an
 inverse of each handler.
 """
 
@@ -27,15 +27,19 @@ from ucp.messages import Message
 from ucp.trace import HandlerRun
 
 CHECKPOINT_STEPS = 1000
-"""Number of steps between checkpoints. Going back plays half of them on average, which takes some milliseconds."""
+"""Number of steps between two checkpoints. To go back, the player replays half of this number on average, which takes
+some milliseconds.
+"""
 
 MAX_DOUBTS = 3
-"""Maximum number of places in a record at which a damaged line is a better explanation than a mistake of the agent."""
+"""Maximum number of places in a record at which damage to a line is accepted as a better explanation than a mistake of
+the agent.
+"""
 MAX_TRIED = 20
-"""Maximum number of deviations for which damage is tried as an explanation."""
+"""Maximum number of deviations for which damage to a line is tried as an explanation."""
 
 PERHAPS = "perhaps"
-"""A word in the reasons why steps are not judged, before the damage that may explain a deviation."""
+"""A word before the damage that may explain a deviation. It occurs in the reasons why steps are not judged."""
 
 _OF_TIMERS = frozenset(handler.name for handler in ON_TIMER.values())
 
@@ -49,10 +53,10 @@ class ReplayResult:
     unjudged: int = 0
     """Number of handler runs that could not be compared."""
     lost: list[str] = field(default_factory=list)
-    """Reasons why they could not be compared, as sentences."""
+    """Reasons why handler runs could not be compared, as sentences."""
     deviations: list[StepDeviation] = field(default_factory=list)
     positions: list[int] = field(default_factory=list)
-    """The position at which each deviation was found. A missing step is found at the next entry."""
+    """The position of each deviation in the record. A missing step is found at the entry after it."""
 
     def copy(self) -> "ReplayResult":
         return ReplayResult(self.steps, self.unjudged, list(self.lost), list(self.deviations), list(self.positions))
@@ -63,7 +67,7 @@ class ReplayResult:
             self.positions.append(position)
 
     def insert(self, position: int, deviation: StepDeviation) -> None:
-        """Add a deviation that was found after deviations at later positions."""
+        """Insert a deviation before the deviations at later positions."""
         number = bisect_left(self.positions, position)
         self.deviations.insert(number, deviation)
         self.positions.insert(number, position)
@@ -84,8 +88,8 @@ class RecordPlayer:
     """A player of a record. `position` is the number of entries that were played, and `result` is the result of these
     entries.
 
-    `until_s` is the last mission second to play. `implementation` plays the record: the reference, which judges agents,
-    or the core in use (`harness.checker.steps.core_in_use`).
+    `until_s` is the last mission second to play. `implementation` handles the recorded inputs. It is the reference,
+    which judges agents, or the installed core (`harness.checker.steps.core_in_use`).
     """
 
     def __init__(
@@ -103,7 +107,7 @@ class RecordPlayer:
         self._clock_set = ClockChangeDetector(record)
         self._resumption = ResumptionSearch(record, self._blocks)
         self.resumed_at: int | None = None
-        """The position after the last entry at which the state became known again. None if there was none."""
+        """The position after the last entry at which the state became known again. None if this did not happen."""
         self._follower, self._incarnation = self._new_follower(), 1
         self._checkpoints = {0: _PlayerCheckpoint(self._follower.copy(), 1, self.result.copy())}
 
@@ -127,7 +131,7 @@ class RecordPlayer:
         return self.position == len(self.entries)
 
     def deviations_here(self) -> list[StepDeviation]:
-        """Return the deviations at the last played entry, including those that only the following entry reveals."""
+        """Return the deviations at the last played entry, including those that only the next entry reveals."""
         result = self.result
         here = result.deviations[bisect_left(result.positions, self.position) :]
         upcoming = None if self.at_end else self.entries[self.position]
@@ -163,8 +167,8 @@ class RecordPlayer:
         return entry
 
     def to(self, position: int, *, replay: bool = False) -> None:
-        """Go forward or back to a position. If `replay` is true, play the entry at this position again even if the
-        player is already there.
+        """Go forward or back to a position. If `replay` is true, play the entry at this position again if the player is
+        already there.
         """
         position = max(0, min(position, len(self.entries)))
         if position < self.position or replay:
@@ -212,7 +216,7 @@ class RecordPlayer:
         return self
 
     def _earlier(self) -> "RecordPlayer":
-        """Return a copy of this player, moved to the beginning of the record."""
+        """Return a copy of this player at the beginning of the record."""
         earlier = copy(self)
         earlier.to(0, replay=True)
         return earlier
@@ -267,8 +271,8 @@ class RecordPlayer:
             result.lost.append(follower.lost)
 
     def _excuse(self, deviations: list[StepDeviation]) -> str | None:
-        """Return a reason for the deviations that is not an error of the agent, such as missing lines. Return None if
-        there is no such reason.
+        """Return a reason why the deviations may not be errors of the agent, such as missing lines. Return None without
+        such a reason.
         """
         if (why := self.record.unrecorded.get(self.position)) is not None:
             return f"{why},"
@@ -277,11 +281,11 @@ class RecordPlayer:
         return shift or self._doubt(deviations)
 
     def _doubt(self, deviations: list[StepDeviation]) -> str | None:
-        """Return a description of damage to a single line that would also explain the deviations. Return None if there
-        is no such damage.
+        """Describe damage to a single line that would also explain the deviations. Return None if no damage explains
+        them.
 
-        Such damage is a coincidence, and occurs at most a few times in a record. If it explains more places, the
-        deviations count.
+        Such damage is rare. If it explains more than a few places in a record, the deviations count as mistakes of the
+        agent.
         """
         if self.record.is_counted:
             return None
@@ -302,7 +306,7 @@ class _DoubtingPlayer(RecordPlayer):
     def __init__(self, record: RecordedTrace) -> None:
         super().__init__(record)
         self.found: dict[int, str | None] = {}
-        """The positions of deviations, each with the damage that explains it, or None."""
+        """Position of a deviation -> the damage that explains it, or None."""
 
     def _doubt(self, deviations: list[StepDeviation]) -> str | None:
         if self.position not in self.found:

@@ -1,7 +1,7 @@
 """Find the records at a path: a trace, the directory of a run, or a directory with any files.
 
-In the directory of a run, the files have known names, and only the needed ones are read. In every other directory all
-files are ingested first.
+In the directory of a run, the files have known names, and only the needed files are read. In every other directory, all
+files are read first.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,7 +23,7 @@ from harness.gc_pause import gc_paused
 from ucp.plain_file import open_plain_file
 
 AGENTS = "agents"
-"""Directory of the agents' files in a run directory."""
+"""Name of the directory with the agents' files in a run directory."""
 
 
 class _RunRecords:
@@ -47,7 +47,7 @@ class _RunRecords:
         return self._archive.judged_record
 
     def capture(self, agent_id: int) -> None:
-        """Return None. A capture is not needed, because counters in the record of the run show whether an agent ignored
+        """Return None. Captures are not needed for a run, because counters in its record show whether an agent ignored
         messages.
         """
 
@@ -109,7 +109,7 @@ def _capture(flight: Flight, agent_id: int) -> AgentCapture | None:
 
 
 def open_record(path: Path, agent_id: int | None = None) -> RecordedTrace:
-    """Return the record in a trace file, or the record of one agent in a directory. Raises FieldError if no record can
+    """Return the record in a trace file, or the record of an agent in a directory. Raises FieldError if no record can
     be played.
     """
     records = open_records(path, agent_id)
@@ -120,8 +120,8 @@ def open_record(path: Path, agent_id: int | None = None) -> RecordedTrace:
 
 
 def open_records(path: Path, agent_id: int | None = None) -> list[RecordedTrace]:
-    """Return all records in a trace file or a directory, or only those of one agent. Raises FieldError if no record can
-    be played.
+    """Return all records in a trace file or a directory. If `agent_id` is given, return only the records of this agent.
+    Raises FieldError if no record can be played.
     """
     files = _files_in(path, agent_id) if path.is_dir() else [path]
     directory = path if path.is_dir() else _directory_of(path)
@@ -145,7 +145,8 @@ def open_records(path: Path, agent_id: int | None = None) -> list[RecordedTrace]
 def _playable(records: Iterable[Callable[[], RecordedTrace]]) -> list[RecordedTrace]:
     """Return the records that can be played.
 
-    The problems of the other records are added to the first record. Raises FieldError if no record can be played.
+    The reasons why other records cannot be played are added to the first record. Raises FieldError if no record can be
+    played.
     """
     playable, problems = [], []
     for open_record_of in records:
@@ -169,7 +170,7 @@ def _read(file: Path) -> Trace | None:
 
 
 def _directory_of(file: Path) -> Path:
-    """Return the directory of the run that wrote the file. If no run wrote it, return the directory that contains the
+    """Return the directory of the run to which the file belongs. If it belongs to no run, return the directory of the
     file.
     """
     run_records = file.parent.parent
@@ -179,7 +180,7 @@ def _directory_of(file: Path) -> Path:
 def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
     """Return the traces of all agents or of one agent, if the file names identify them without doubt.
 
-    Otherwise return nothing. Then all files must be ingested, which takes longer.
+    Otherwise return an empty result. All files must then be read, which takes longer.
     """
     agents = agents_directory(directory)
     if (directory / RUN_FILE).is_file():
@@ -192,7 +193,7 @@ def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
 
 
 def _belongs_to_another(path: Path, agent_id: int) -> bool:
-    """Return true if a file certainly contains no record of the agent, judged by the file's name or first line."""
+    """Return true if the name or the first line of a file shows that it contains no record of the agent."""
     if path.name.endswith((".chain.json", ".mission.json", ".log", ".store")):
         return True
     try:
@@ -204,8 +205,8 @@ def _belongs_to_another(path: Path, agent_id: int) -> bool:
 
 
 def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) -> list[RecordedTrace]:
-    """Return the records in files of any kind. If only some of the files were read and they contain too few records,
-    return an empty list.
+    """Return the records in files of any kind. Return an empty list if only some of the files were read and they
+    contain too few records.
     """
     ingested = ingest_files(sources)
     flights = [flight for flight in ingested.flights if flight.traces]
@@ -240,7 +241,7 @@ def _open_ingested(path: Path, agent_id: int | None, sources: Sequence[Path]) ->
 
 
 def _remarks(ingested: IngestResult, agent_id: int) -> Iterator[str]:
-    """Yield the remarks on all files, except those that belong to other agents."""
+    """Yield the remarks on all files, except on files of other agents."""
     of_others = {
         file
         for flight in ingested.flights

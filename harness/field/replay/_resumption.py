@@ -1,12 +1,12 @@
 """Find a place after a gap in a trace at which the state of the agent is known. Also detect changes of the agent's
 clock.
 
-The state of an idle agent consists of its chain and its current block. The top chain hash identifies the chain, if the
-records of the flight contain each step from the inception block to it. The current block follows from the block that
-the agent later completes.
+The state of an idle agent consists of its chain and its current block. The top chain hash identifies the chain if the
+records of the flight contain every chain hash from the inception block up to it. The content of the current block is
+known from the block that the agent later completes.
 
-A message between two agents shows the difference of their clocks, except for the time that the message takes. If this
-difference jumps by the same amount for most other agents, the clock of this agent was changed.
+Each message between two agents shows the difference of their clocks, apart from the time that the message takes. If
+this difference changes by the same amount for most other agents, the clock of this agent was changed.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ from ucp.trace import HandlerRun
 from ucp.trigger import EventTrigger, LocalTrigger
 
 _ChainSteps = dict[bytes, tuple[bytes, str]]
-"""Chain hash -> the chain hash before it, and the block between both."""
+"""Chain hash -> the previous chain hash, and the block between the two."""
 
 
 class ResumptionSearch:
@@ -38,8 +38,8 @@ class ResumptionSearch:
         self._inception = InceptionBlock(record.header.initial_data).chain_hash
 
     def resume(self, follower: StepComparer, position: int) -> bool:
-        """Set a new follower to the agent's state after the entry at `position`. Return false if this state
-        is unknown.
+        """Set a new `StepComparer` to the agent's state after the entry at `position`. Return false if this state is
+        unknown.
         """
         entry = self._record.entries[position]
         run = entry.content
@@ -78,7 +78,7 @@ class ResumptionSearch:
 
     @cached_property
     def _own_steps(self) -> _ChainSteps:
-        """The steps by which chains grew, according to the exports and the trace of this record."""
+        """The pairs of successive chain hashes in the exports and in the trace of this agent."""
         steps: _ChainSteps = {}
         for export in self._record.flight.exports.values():
             predecessors = self._inception
@@ -91,8 +91,8 @@ class ResumptionSearch:
 
     @cached_property
     def _all_steps(self) -> _ChainSteps:
-        """The steps by which chains grew, according to all records. Computing them reads every trace, which takes some
-        time.
+        """The pairs of successive chain hashes in all records. Computing them takes some time, because it reads every
+        trace.
         """
         steps = self._own_steps.copy()
         for trace in self._record.flight.traces.values():
@@ -115,7 +115,7 @@ class ResumptionSearch:
                 top = bytes.fromhex(run.state.top) if _is_hex(run.state.top) else None
 
     def _block_in_progress(self, position: int) -> bytes | None:
-        """Return the content of the block under construction after an entry, computed from the events that follow.
+        """Return the content of the block under construction after an entry. It is computed from the following events.
         Return None if it is unknown.
         """
         logged = bytearray()
@@ -130,8 +130,8 @@ class ResumptionSearch:
         return b""  # The block is never completed, so its content has no effect.
 
     def _sequence(self, position: int) -> int:
-        """Return the sequence number of the first message that is sent after an entry. Return 0 if there is no such
-        message.
+        """Return the sequence number of the first message that the agent sends after an entry. Return 0 if it sends
+        none.
         """
         return next((run.sent[0].seq for _, run in self._following_runs(position) if run.sent), 0)
 
@@ -154,11 +154,11 @@ def _is_hex(text: str) -> bool:
 
 
 WITHIN = 200
-"""Number of lines before and after an entry that are searched for a clock change."""
+"""Number of lines before and after an entry in which a clock change is searched."""
 MESSAGES = 3
-"""Number of messages with one agent, before and after, whose median is compared."""
+"""Number of messages with one other agent, before and after the entry, from which medians are computed."""
 MIN_SHIFT_S = 1.0
-"""Minimum change of a clock that is detected."""
+"""Minimum change of a clock in seconds that is detected."""
 
 
 class ClockChangeDetector:
@@ -168,8 +168,8 @@ class ClockChangeDetector:
         self._record = record
 
     def shift_near(self, position: int) -> str | None:
-        """Return a text such as "its clock was set by +30.0 s" if the clock changed near this entry. Return None if it
-        did not.
+        """Return a text such as "its clock was set by +30.0 s" if the clock changed near this entry. Otherwise return
+        None.
         """
         if self._record.flight.record is not None:
             return None  # The agents of a run share one clock.
@@ -184,8 +184,8 @@ class ClockChangeDetector:
 
     @cached_property
     def _differences(self) -> list[list[tuple[int, float]]]:
-        """Return, for each other agent, the positions of the messages with that agent, and the difference between both
-        clocks at each.
+        """Return, for each other agent, the positions of the messages with it, and the difference of both clocks at
+        each message.
         """
         own = self._record.agent_id
         differences = []

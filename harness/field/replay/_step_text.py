@@ -24,7 +24,7 @@ BLOCKS_SHOWN = 8
 
 
 class StepText:
-    """Texts about the record of a player. `names` contains the names of the blocks in the record."""
+    """A writer of texts about the record of a player. `names` contains the names of the blocks in the record."""
 
     def __init__(self, player: RecordPlayer, names: ReplayNames) -> None:
         self._player = player
@@ -48,7 +48,9 @@ class StepText:
         return shown(f"{'✘' if differs else ' '}{where}{text}", style="red" if differs else "")
 
     def step(self) -> Iterator[Text]:
-        """Yield the lines about the last step: its cause, the rule of its Algorithm, its effects and its deviations."""
+        """Yield the lines about the last step: its trigger, the rule of its Algorithm, its effects and its
+        deviations.
+        """
         player = self._player
         entry = player.entry
         if entry is None:
@@ -92,14 +94,14 @@ class StepText:
             yield _row("counted", ", ".join(self._counted(key, count) for key, count in run.tally.items()))
 
     def deviation(self, deviation: StepDeviation) -> Text:
-        """Return the line about a deviation. If the deviation belongs to an earlier step, the line names that step."""
+        """Return the line about a deviation. If the deviation belongs to an earlier step, the line names this step."""
         entry = self._player.entry
         own = entry is not None and entry.line == deviation.line and isinstance(entry.content, HandlerRun)
         whose = "" if own else f"of line {deviation.line}, {deviation.handler}: "
         return shown(f"  ✘ {whose}{deviation.difference(self._names.of)}", style="bold red")
 
     def side_by_side(self, deviation: StepDeviation) -> Table | Text:
-        """Return a table of the recorded step and the step of the reference, with marked differences."""
+        """Return a table of the recorded step and the step of the reference. Differences are marked."""
         if deviation.run is None or deviation.expected is None:
             return self.deviation(deviation)
         table = Table("", "the agent's record", "the reference", box=None, padding=(0, 2, 0, 0))
@@ -161,7 +163,7 @@ class StepText:
         return ", ".join(text)
 
     def chain(self, chain_hash: bytes) -> str:
-        """Return a text about a chain hash. The text states whether the chain hash belongs to the agent's own chain."""
+        """Describe a chain hash. The text states whether it belongs to the agent's own chain."""
         chain = self._player.state.chain
         if chain_hash == chain.top_chain_hash:
             own = "our top"

@@ -1,4 +1,4 @@
-"""Handle breakpoints in a record, and find the source lines of handlers."""
+"""Parse breakpoints in a record, and find the source lines of handlers."""
 
 import inspect
 from collections.abc import Callable, Iterator
@@ -18,13 +18,13 @@ from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
 
 Breakpoint = Callable[[RecordEntry], bool]
-"""A condition that selects entries."""
+"""A function that returns true for the entries at which the replay stops."""
 
 _BY_ALGORITHM = {str(handler.algorithm): name for name, handler in HANDLERS.items()}
 
 
 def parse_breakpoint(text: str, names: ReplayNames) -> Breakpoint:
-    """Return the breakpoint that a text describes: a line ("812"), a handler (its name, or "A13"), or a block ("4.11").
+    """Convert text to a breakpoint: a line ("812"), a handler (its name, or "A13"), or a block ("4.11").
 
     Raises FieldError for any other text.
     """
@@ -47,7 +47,7 @@ def parse_breakpoint(text: str, names: ReplayNames) -> Breakpoint:
 
 def next_stop(player: RecordPlayer, stops_at: Breakpoint, backward: bool = False) -> int | None:
     """Return the position after the next entry that matches the breakpoint. If `backward` is true, search for the
-    previous one. Return None if no entry matches.
+    previous matching entry. Return None if no entry matches.
     """
     numbers = range(player.position - 2, -1, -1) if backward else range(player.position, len(player.entries))
     return next((number + 1 for number in numbers if stops_at(player.entries[number])), None)
@@ -82,9 +82,9 @@ def blocks_of(entry: RecordEntry) -> set[str]:
 @cache
 def source_of(handler: str) -> str:
     """Return the place of a handler's first statement, such as "ucp/reconcile.py:187". A debugger always stops at a
-    breakpoint there.
+    breakpoint on this line.
 
-    The path is relative to the working directory, if the code is in it.
+    If the code is in the working directory, the path is relative to it.
     """
     code = HANDLERS[handler].run.__code__
     defined = code.co_firstlineno + sum(1 for line in _decorators(handler))
@@ -94,6 +94,8 @@ def source_of(handler: str) -> str:
 
 
 def _decorators(handler: str) -> Iterator[str]:
-    """Yield the lines of the handler's source before `def`. They run only when the module is imported."""
+    """Yield the lines of the handler's source before `def`. A debugger does not stop there, because they run only when
+    the module is imported.
+    """
     lines, _ = inspect.getsourcelines(HANDLERS[handler].run)
     return takewhile(lambda line: not line.startswith("def "), lines)

@@ -1,7 +1,7 @@
-"""Prepare the records of a real flight for the checker. There is no run.json, and trace lines may be missing.
+"""Prepare the records of a real flight for the checker. A real flight has no run.json, and trace lines may be missing.
 
-Each trace is judged as `replay` judges it. The other checks read a trace only up to the first place at which lines are
-missing.
+The steps in each trace are judged in the same way as by the command `replay`. The other checks read a trace only up to
+the first place at which lines are missing.
 """
 
 from collections.abc import Mapping
@@ -45,7 +45,9 @@ def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
 
 
 def _up_to_loss(trace: Trace, doubtful: Mapping[int, str]) -> Trace:
-    """Return the part of a trace before the first missing or doubtful line. The reason becomes its problem."""
+    """Return the part of a trace before the first missing or doubtful line. The reason becomes the problem of the
+    trace.
+    """
     lost = {**doubtful, **lost_lines(trace)}
     lost |= {gap.position: "lines are damaged" for gap in trace.gaps}
     lost |= dict.fromkeys(trace.jumps, "the clock of the agent was set")
@@ -64,8 +66,8 @@ def _up_to_loss(trace: Trace, doubtful: Mapping[int, str]) -> Trace:
 
 
 def _judge_steps(evidence: Evidence, results: Mapping[int, ReplayResult | str]) -> Judgement:
-    """Judge the results of all replays. If the result of an agent is a text, it is the reason why the agent's trace
-    cannot be judged.
+    """Return the judgement on the results of all replays. A result that is a text is the reason why the trace of this
+    agent cannot be judged.
     """
     deviations: list[StepDeviation] = []
     judged, unjudged, lost = 0, 0, list[str]()

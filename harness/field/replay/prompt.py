@@ -18,7 +18,7 @@ from harness.field.replay.breakpoints import Breakpoint, next_stop, parse_breakp
 from harness.field.replay.replay_names import ReplayNames
 
 LINES_AROUND = 5
-"""Number of lines that `list` shows before and after."""
+"""Number of lines that the command `list` shows before and after the current one."""
 SHORT_FORMS = {
     "n": "next",
     "b": "back",
@@ -56,7 +56,7 @@ class ReplayPrompt(cmd.Cmd):
         self._other_agents = OtherAgents(player.record)
 
     def begin(self, at_start: bool) -> None:
-        """Show the beginning of the record, or go to the first breakpoint."""
+        """Show the beginning of the record. If `at_start` is false, go to the first breakpoint instead."""
         self._show()
         if not at_start:
             self.do_continue("")
@@ -70,7 +70,7 @@ class ReplayPrompt(cmd.Cmd):
     def onecmd(self, line: str) -> bool:
         """Execute a command. Return true if the replay must end.
 
-        Short forms and unique beginnings of names are accepted. An empty line repeats the last command.
+        The user may enter short forms and unique beginnings of command names. An empty line repeats the last command.
         """
         name, argument, _ = self.parseline(line)
         if line == "EOF":

@@ -19,14 +19,14 @@ from ucp.agent import HANDLERS
 
 SCHEMA: Literal["ucp-replay/1"] = "ucp-replay/1"
 MAX_DIFFERENCES = 1000
-"""Maximum number of listed differences per record. Further ones are only counted."""
+"""Maximum number of differences that are listed for each record. Further ones are only counted."""
 
 Verdict = Literal["as specified", "deviates", "not judged"]
 
 
 class DifferenceRecord(BaseModel):
-    """A step that differs from the reference core. `algorithm`, `handler` and `source` are null if the step ran none of
-    the 20 handlers.
+    """A step that differs from the reference core. `algorithm`, `handler` and `source` are null if the step is no run
+    of one of the 20 handlers.
     """
 
     line: int
@@ -68,7 +68,9 @@ def document(records: Iterable[ReplayedRecord]) -> dict[str, Any]:
 
 
 def verdict(result: ReplayResult) -> Verdict:
-    """Return the verdict on a replay. A record without compared steps is "not judged", never "as specified"."""
+    """Return the verdict on a replay. The verdict on a record without compared steps is "not judged", never "as
+    specified".
+    """
     if result.deviations:
         return "deviates"
     return "as specified" if result.steps else "not judged"

@@ -18,12 +18,12 @@ _NAME = re.compile(r"\d+\.\d+")
 
 
 def is_block(text: str) -> bool:
-    """Return true if a text may be the name of a block or the beginning of a block hash."""
+    """Return true if a text has the form of a block name or of the beginning of a block hash."""
     return bool(_NAME.fullmatch(text) or (_HASH.fullmatch(text) and not text.isdigit()))
 
 
 class ReplayNames:
-    """The names of blocks by hash, and the hashes by name. Names come from exports, or from traces if there are no
+    """The names of blocks by hash, and the hashes by name. The names come from exports, or from traces without
     exports.
     """
 
@@ -36,7 +36,7 @@ class ReplayNames:
     def prefix_of(self, text: str) -> str:
         """Return the hash of the block with this name.
 
-        If no block has it, return the text itself as a prefix of a hash.
+        If no block has this name, return the text itself as the beginning of a hash.
         """
         return self._hashes.get(text, text)
 
@@ -77,8 +77,8 @@ class RecordedBlocks(BlockIndex):
                 self.add(block)
 
     def _sources(self) -> Iterator[Iterator[Block]]:
-        """Yield the blocks from the trace, from the exports, and from the traces of the flight. The fastest source is
-        first.
+        """Yield the blocks from the trace, from the exports, and from the traces of the flight, in this order. The
+        first source is the fastest.
         """
         yield _blocks_of(self._record.trace)
         yield self._of_exports()

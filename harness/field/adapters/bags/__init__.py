@@ -1,8 +1,8 @@
 """Read ROS bags (recordings of ROS messages) in order of time: version 1, and version 2 in MCAP or SQLite files.
 
 The readers need neither an index nor `metadata.yaml`, because a bag has neither if its recorder was killed or its
-vehicle lost power. They skip a damaged place and continue behind it. A size that a file claims is trusted up to a
-bound. The package `rosbags` decodes the messages (`harness.field.adapters.rosbag_adapter`).
+vehicle lost power. They skip a damaged place and continue after it. They limit every size that a file states. The
+package `rosbags` decodes the messages (`harness.field.adapters.rosbag_adapter`).
 """
 
 import mmap
@@ -25,13 +25,14 @@ from harness.field.adapters.bags._decompression import (
 from ucp.plain_file import open_plain_file
 
 MAGICS = (_version_1.MAGIC, _mcap_bag.MAGIC, _sqlite.MAGIC, ZSTD_MAGIC)
-"""The first bytes of bags, and of files compressed with zstd."""
+"""The first bytes of bags, including those of files compressed with zstd."""
 
 
 class BagMessage(NamedTuple):
     """A message in a ROS bag.
 
-    `number` counts the messages of the file from 1. `time_ns` is the recording time since the epoch.
+    `number` counts the messages of the file from 1. `time_ns` is the recording time in nanoseconds since the Unix
+    epoch.
     """
 
     number: int

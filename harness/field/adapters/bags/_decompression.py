@@ -1,4 +1,4 @@
-"""Represent messages in a ROS bag, and decompress data without exceeding a size limit."""
+"""Represent messages in a ROS bag, and decompress data within a size limit."""
 
 import bz2
 from collections.abc import Hashable, Iterator
@@ -13,12 +13,12 @@ Buffer = bytes | mmap
 """The content of a file or of a chunk."""
 
 MAX_MESSAGE_BYTES = 64 * 1024 * 1024
-"""Maximum size of a message. A chain export of about 35,000 blocks has this size."""
+"""Maximum size of a message in bytes. A chain export of about 35,000 blocks has this size."""
 MAX_CHUNK_BYTES = 256 * 1024 * 1024
 MAX_FILE_BYTES = 1024 * 1024 * 1024
 MAX_RECORDS = 5_000_000
 MAX_TRIES = 2_000_000
-"""Maximum number of positions per file at which the reader looks for a record after a damaged one."""
+"""Maximum number of positions in a file at which the reader searches for the next undamaged record."""
 
 
 class RawMessage(NamedTuple):
@@ -31,7 +31,7 @@ class RawMessage(NamedTuple):
 
 
 class UnreadablePart(NamedTuple):
-    """A place in a file that cannot be read. `why` completes a sentence."""
+    """A place in a file that cannot be read. `why` is the reason, and completes a sentence."""
 
     why: str
 
@@ -40,10 +40,10 @@ Item = RawMessage | UnreadablePart
 
 
 class BagTopics:
-    """The topics of the channels in a ROS bag.
+    """Topics by channel in a ROS bag.
 
-    A message on a channel without a known topic is kept until the end, because an index at the end of the file may
-    declare the topic. Messages of one channel stay in order.
+    A message whose channel has no known topic is kept until the end, because an index at the end of the file may
+    declare the topic. Messages of one channel keep their order.
     """
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class BagTopics:
         self._waiting_bytes = 0
 
     def message(self, channel: Hashable, time_ns: int, data: bytes) -> Iterator[Item]:
-        """Yield the message, or store it for later if the topic of its channel is still unknown."""
+        """Yield the message. If the topic of its channel is still unknown, store it for later."""
         if channel in self.known and channel not in self._waiting_channels:
             yield RawMessage(*self.known[channel], time_ns, data)
         elif self._waiting_bytes < MAX_CHUNK_BYTES:
@@ -76,12 +76,12 @@ class BagTopics:
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _READ_BYTES = 1024 * 1024
 _STEP_BYTES = 16 * 1024
-"""Size of the compressed steps. At most this many bytes before damaged data are lost."""
+"""Number of compressed bytes per step of the decompression. At most this many bytes before damaged data are lost."""
 
 
 def decompress(compression: str, data: bytes, max_bytes: int = MAX_CHUNK_BYTES) -> tuple[bytes, str]:
-    """Return as much of the content as can be decompressed, and the reason why it is incomplete. The reason is "" for
-    complete content.
+    """Decompress as much of the data as possible. Return the content, and the reason why it is incomplete. The reason
+    is "" if the content is complete.
     """
     if compression in ("", "none"):
         return data, ""
@@ -112,8 +112,8 @@ def message_data(data: bytes) -> bytes:
 
 
 def decompress_file(path: Path, copy: Path) -> str:
-    """Decompress a zstd file into the file `copy`. Return the reason why the content is incomplete, or "" for complete
-    content.
+    """Decompress a zstd file into the file `copy`. Return the reason why the content is incomplete, or "" if it is
+    complete.
     """
     decompressor: Any = _decompressor("zstd")
     written = 0

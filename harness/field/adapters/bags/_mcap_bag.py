@@ -46,9 +46,10 @@ class _McapReader:
         self.closed = False
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Yield the messages in the whole file, or in one compressed part of the file (a chunk).
+        """Yield the messages in the file, or in one compressed part of the file (a chunk).
 
-        If the chunk is not `whole`, an incomplete last record is no damage.
+        `whole` is false for a chunk that was decompressed only in part. An incomplete last record is then not reported
+        as damage.
         """
         while (
             position < len(buffer)
@@ -92,8 +93,8 @@ class _McapReader:
             yield from self._topics.message(number, log_time, record[_MESSAGE_HEAD.size :])
 
     def _next(self, buffer: Buffer, start: int) -> int | None:
-        """Return the position of the next undamaged record. Such a record is followed by another record or by the end
-        of the buffer.
+        """Return the position of the next undamaged record. A record counts as undamaged if another record or the end
+        of the buffer follows it.
         """
         for match in _BEGINNING.finditer(buffer, start):
             if next(self._tries, None) is None:
@@ -105,8 +106,8 @@ class _McapReader:
 
 
 def _record_at(buffer: Buffer, position: int) -> tuple[int, int, int]:
-    """Return (operation, start, end) of the record at a position. Return zeros if there is no record. A record that is
-    a chunk may be truncated.
+    """Return (operation, start, end) of the record at a position. Return zeros if no record begins there. A chunk
+    record may be truncated.
     """
     if position + _RECORD.size > len(buffer):
         return 0, 0, 0

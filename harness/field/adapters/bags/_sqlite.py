@@ -31,7 +31,7 @@ _FIRST = -(2**63)
 def items(path: Path, scratch: Path) -> Iterator[Item]:
     """Yield the messages in the database.
 
-    A database that was not closed has messages in its journal. SQLite then repairs a copy of both files.
+    If a database was not closed, its journal also contains messages. SQLite then repairs a copy of both files.
     """
     journal = path.with_name(f"{path.name}{JOURNAL}")
     if journal.is_file() and 0 < journal.stat().st_size < MAX_FILE_BYTES:
@@ -52,8 +52,8 @@ def items(path: Path, scratch: Path) -> Iterator[Item]:
 
 
 def _pages_of_truncated(path: Path) -> SqlitePages | None:
-    """Return the pages of a file that is shorter than its header states. Return None for a file with the
-    stated length.
+    """Return the pages of a file that is shorter than its header states. Return None if the file has the stated
+    length.
     """
     with open_plain_file(path) as file:
         header = file.read(FILE_HEADER_BYTES)
@@ -66,7 +66,7 @@ def _pages_of_truncated(path: Path) -> SqlitePages | None:
 
 
 def _rows_in_pages(pages: SqlitePages) -> Iterator[Item]:
-    """Yield the messages in the pages in order of time, and then an entry about the damage."""
+    """Yield the messages in the pages in order of time. Then yield an entry about the damage."""
     topics: dict[Any, tuple[str, str]] = {}
     messages: dict[int, list[Any]] = {}
     for number, values in pages.rows():

@@ -1,8 +1,8 @@
 """Read the rows of a truncated SQLite file directly from its pages, because the index of the pages is lost.
 
-SQLite finds a row by inner pages of a tree. In a file that grew while it was recorded, an inner page often lies behind
-the rows that it leads to. If the end of the file is lost, SQLite then finds no row at all. Each leaf page, however,
-contains its rows completely, except for the overflow pages of large ones. The format of pages is described in
+SQLite finds rows through the inner pages of a tree. In a file that grew during a recording, inner pages are often
+behind the pages with their rows. If the end of the file is lost, SQLite therefore finds no rows. Each leaf page,
+however, contains its rows completely, except for the overflow pages of large ones. The format of pages is described in
 https://www.sqlite.org/fileformat2.html.
 """
 
@@ -15,7 +15,7 @@ _INTEGER_BYTES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
 
 Value = int | bytes | str | None
 Row = tuple[int, list[Value]]
-"""The number of a row, and its values. A value that is its number is None."""
+"""The number of a row, and its values. A value that equals the row number is None."""
 
 
 class SqlitePages:
@@ -44,7 +44,7 @@ class SqlitePages:
                     continue
 
     def _row(self, offset: int) -> Row:
-        """Return the row that begins at `offset` of a page. Raises IndexError or ValueError if it is damaged."""
+        """Return the row that begins at `offset` in a page. Raises IndexError or ValueError if it is damaged."""
         payload_bytes, offset = self._varint(self._data, offset)
         number, offset = self._varint(self._data, offset)
         payload = self._payload(offset, payload_bytes)

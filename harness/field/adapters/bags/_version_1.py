@@ -21,12 +21,12 @@ _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
 _OPERATIONS = range(2, 8)
 _LONGEST_HEAD = 64 * 1024
 _HEAD_BEFORE = 300
-"""Maximum number of bytes in a record header before the operation field. Writers put other fields there."""
+"""Maximum number of header bytes before the operation field of a record. Writers put other fields there."""
 _OPERATION = re.compile(rb"\x04\0\0\0op=[\x02-\x07]")
 MAX_DEPTH = 2
 
 _Record = tuple[dict[str, bytes], bytes, int]
-"""Fields of the header, the data, and the position of the next record."""
+"""A record: the fields of its header, its data, and the position of the next record."""
 
 
 def items(bag: Buffer) -> Iterator[Item]:
@@ -45,9 +45,10 @@ class _BagVersion1Reader:
         self.records = iter(range(MAX_RECORDS))
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Yield the messages in the whole file, or in one compressed part of the file (a chunk).
+        """Yield the messages in the file, or in one compressed part of the file (a chunk).
 
-        If the chunk is not `whole`, an incomplete last record is no damage.
+        `whole` is false for a chunk that was decompressed only in part. An incomplete last record is then not reported
+        as damage.
         """
         while position < len(buffer) and next(self.records, None) is not None:
             record = _record_at(buffer, position)
@@ -99,7 +100,7 @@ def _declared_length(buffer: Buffer, end: int, data: bytes) -> int:
 
 
 def _record_at(buffer: Buffer, position: int) -> _Record | None:
-    """Return the record at a position. Return None if there is no record. A record that is a chunk may be truncated."""
+    """Return the record at a position. Return None if no record begins there. A chunk record may be truncated."""
     if position + _U32.size > len(buffer):
         return None
     (length,) = _U32.unpack_from(buffer, position)

@@ -88,8 +88,8 @@ def draw(record: MergedRecord, reconciliation: ReconciledExports | None = None) 
 
 
 def _title(record: MergedRecord) -> str:
-    """Return the data of the inception block as the title if they are readable text. Otherwise return a title with the
-    hash of that block.
+    """Return the title of the page. It is the data of the inception block if they are readable text, and otherwise a
+    text with the hash of this block.
     """
     text = base64.b64decode(record.header.inception.block_data).decode("utf-8", errors="replace")
     if text and text.isprintable() and "\ufffd" not in text:
@@ -98,7 +98,7 @@ def _title(record: MergedRecord) -> str:
 
 
 def _headline(record: MergedRecord) -> tuple[str, str]:
-    """Return a short headline for the page, and the name of the headline's style."""
+    """Return a short headline about the record, and the style of the headline."""
     losses = []
     if record.missing:
         losses.append("1 vehicle" if len(record.missing) == 1 else f"{len(record.missing)} vehicles")
@@ -176,7 +176,7 @@ def _vehicles(record: MergedRecord, ink: Mapping[int, AgentColours]) -> list[dic
 
 
 def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, AgentColours]) -> list[dict[str, Any]]:
-    """Return the changes (such as flight modes) of all vehicles with a flight log and an agent, in order of time."""
+    """Return the changes in flight logs, such as flight modes, of all vehicles with an agent, in order of time."""
     found = [change for match in matches if match.agent_id is not None for change in changes(match)]
     return [
         {

@@ -1,5 +1,5 @@
-"""Draw which vehicle holds which block. Each vehicle has a row, and each block has a column, in the order of the
-record.
+"""Draw which vehicle holds which block. Each vehicle has a row, and each block has a column. The columns have the order
+of the record.
 """
 
 import math
@@ -39,7 +39,7 @@ PLACES = {
 
 
 def draw(record: MergedRecord) -> Markup:
-    """Draw the columns in groups: blocks in all chains, in some chains, in no chain, and lost blocks."""
+    """Draw the columns in four groups: blocks in all chains, in some chains, in no chain, and lost blocks."""
     columns = _columns(record)
     groups = [(group, list(members)) for group, members in groupby(columns, key=lambda column: column[0])]
     available_px = WIDTH - LEFT - RIGHT - GAP * (len(groups) - 1)
@@ -78,13 +78,13 @@ def draw(record: MergedRecord) -> Markup:
 
 
 Column = tuple[str, str, Mapping[int, str]]
-"""The group, the name, and the place of the block on each vehicle."""
+"""A column for a block: its group, its name, and the place of the block on each vehicle."""
 
 
 class _BlockRange(NamedTuple):
-    """The columns from `begin` up to `end`, for blocks that the agent holds in the same place `place`.
+    """A range of columns from `begin` to before `end`. The agent holds the blocks of these columns at the same place.
 
-    `fraction` is "part" if not all.
+    `fraction` is "part" if it does not hold all of them.
     """
 
     place: str
@@ -112,8 +112,8 @@ def _group_of(block: RecordedBlock) -> str:
 
 
 def _places(block: RecordedBlock) -> dict[int, str]:
-    """Return the place of the block on each agent: chain, deque or others. If an agent holds the block in two places,
-    the first place counts.
+    """Return agent ID -> the place at which the agent holds the block: chain, deque or others. If an agent holds the
+    block at two places, the first one counts.
     """
     places: dict[int, str] = {}
     for held in block.line.held:
@@ -155,10 +155,10 @@ def _group(
 
 
 def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Iterator[_BlockRange]:
-    """Yield ranges of consecutive blocks that the agent holds in the same place.
+    """Yield ranges of consecutive blocks that the agent holds at the same place.
 
-    Columns narrower than a pixel are combined into cells. A cell shows the place at which the agent holds most of its
-    blocks, and whether it holds all of them.
+    Columns that are narrower than a pixel are combined. A combined cell shows the place at which the agent holds most
+    of its blocks, and whether it holds all of them.
     """
     columns_per_cell = max(1, math.ceil(MIN_CELL_PX / column_px))
     cells = [members[at : at + columns_per_cell] for at in range(0, len(members), columns_per_cell)]

@@ -1,8 +1,8 @@
-"""Draw a map of logged events. The path of each vehicle is a line, and an event without a position is at the last
+"""Draw a map of logged events. The path of each vehicle is a line, and an event without a position is drawn at the last
 position of its vehicle.
 
-A ring marks blocks that only one vehicle holds, which the next loss would have destroyed. If blocks of a vehicle were
-lost, its line is dotted between the positions before and after them.
+A ring marks a block that only one vehicle holds. The loss of this vehicle would have destroyed the block. If blocks of
+a vehicle were lost, its line is dotted between the positions before and after these blocks.
 """
 
 import math
@@ -89,7 +89,7 @@ def draw(
 
 
 class _MetricProjection:
-    """Converts positions to metres north and east of the median of all positions."""
+    """A converter from positions to metres north and east of the median of all positions."""
 
     def __init__(self, tracks: Sequence[EventTrack]) -> None:
         positions = [position for track in tracks for _, position in track.fixes]
@@ -149,9 +149,9 @@ def _paths(
 def _pieces(
     track: EventTrack, path: Sequence[PositionFix], lost: Mapping[int, Sequence[int]]
 ) -> Iterable[tuple[bool, Sequence[PositionFix]]]:
-    """Yield the pieces of a path, as (true if the piece is a gap, positions).
+    """Divide a path into pieces. Yield (true if the piece is a gap, positions).
 
-    A gap is where blocks between two positions were lost.
+    A gap is a piece between two positions where blocks were lost.
     """
     missing = lost.get(track.agent_id, ())
     ordinals = [_ordinal(entry.block) for entry in track.entries if entry.is_position]
@@ -170,7 +170,7 @@ def _ordinal(name: str) -> int | None:
 
 
 def _logged(track: EventTrack, single_copies: set[str]) -> Iterable[tuple[bool, int, LogEntry]]:
-    """Yield each event to mark on the map, as (true if only one vehicle holds its block, agent ID, event)."""
+    """Yield each event that the map marks, as (true if only one vehicle holds its block, agent ID, event)."""
     for entry in track.entries:
         rare = entry.block in single_copies
         if entry.position is not None and (rare or not entry.is_position):

@@ -1,5 +1,5 @@
-"""Draw a chart over time with a row for each vehicle. A row shows the events, below them the blocks, shaded by the
-number of holders, and marks for changes in the flight log.
+"""Draw a chart over time with a row for each vehicle. A row shows the events, and below them the blocks, which are
+shaded by the number of their holders. Marks show changes in the flight log.
 """
 
 from bisect import bisect_left
@@ -18,18 +18,18 @@ WIDTH, LEFT, RIGHT, TOP, BOTTOM = 900, 76, 24, 8, 34
 LANE, BARS, BOXES = 44, 20, 12
 BINS = 260
 MAX_GAP_PX = 0.6
-"""Maximum invisible gap between two blocks, in pixels."""
+"""Maximum width in pixels of a gap between two blocks that is not visible."""
 OUTLIER_SHARE = 0.01
-"""Share of events at both ends of the time span whose clocks may be wrong."""
+"""Share of the events at each end of the time span that is ignored, because the clocks of these events may be wrong."""
 SHADES = 4
 MAX_NAMED = 8
-"""Maximum number of changes in the text of a mark."""
+"""Maximum number of changes that the text of a mark lists."""
 
 
 @dataclass(frozen=True)
 class TimeSpan:
-    """An interval of time in microseconds. `outside` counts the events with times outside the interval, because of
-    wrong clocks.
+    """An interval of time in microseconds. `outside` is the number of events outside the interval. Their times come
+    from wrong clocks.
     """
 
     first_us: int
@@ -51,7 +51,7 @@ def time_span_of(record: MergedRecord) -> TimeSpan | None:
 
 
 def extended(time_span: TimeSpan, marks: Iterable["Mark"]) -> TimeSpan:
-    """Return the interval, extended to the marks before and after it. A mark is ignored if its distance exceeds the
+    """Extend the interval to marks before and after it, and return it. A mark is ignored if its distance exceeds the
     length of the interval, because its clock must be wrong.
     """
     length = time_span.last_us - time_span.first_us
@@ -60,7 +60,7 @@ def extended(time_span: TimeSpan, marks: Iterable["Mark"]) -> TimeSpan:
 
 
 Mark = tuple[int, str]
-"""A time on the clock of the agent in microseconds, and the change of its vehicle, such as "mode LAND"."""
+"""A mark: the time on the agent's clock in microseconds, and a change of its vehicle, such as "mode LAND"."""
 
 
 def draw(
@@ -135,7 +135,7 @@ def _lane(
 
 
 def _marks(marks: Iterable[Mark], time_span: TimeSpan, axis: svg.Axis, top: float) -> Iterable[Markup]:
-    """Draw the changes of a vehicle. Changes at the same pixel share a mark."""
+    """Draw the changes of a vehicle. Changes at the same pixel share one mark."""
     at_px: dict[int, list[str]] = defaultdict(list)
     for at_us, words in marks:
         if time_span.first_us <= at_us <= time_span.last_us:
@@ -171,8 +171,8 @@ def _bars(
 
 
 def shade(holders: int, vehicles: int) -> int:
-    """Return the number of the shade for a number of holders. 0 means one holder, and the last number means all
-    vehicles.
+    """Return the number of the shade for a block with this number of holders. 0 stands for one holder, and the last
+    number stands for all vehicles.
     """
     if holders <= 1:
         return 0
@@ -225,7 +225,7 @@ def _losses(
     axis: svg.Axis,
     top: float,
 ) -> Iterable[Markup]:
-    """Draw hatched areas for lost blocks, and for the end of a vehicle's record if the end is missing."""
+    """Draw hatched areas for lost blocks, and for the missing end of a vehicle's record."""
     extents = {block.line.name: _extent(block, time_span, axis) for block in blocks}
     ordinals = sorted(int(name.partition(".")[2]) for name in extents if name.partition(".")[2].isdecimal())
     gaps: dict[tuple[float, float], list[str]] = {}
