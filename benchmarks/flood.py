@@ -3,9 +3,9 @@
 A secured agent runs as a process in a lab. A vehicle of its mission asks it 20 questions per second, and a process in
 the same place sends forged datagrams. For each class, a row has the number of forged datagrams per second that were
 sent and read, the share of the questions that the agent answered, and the processor time of the agent for one datagram
-that it read. The kernel discards datagrams that the agent
-does not read in time. The share therefore depends on the machine: the flood, the network and the agent need two free
-cores.
+that it read. The kernel discards datagrams that the agent does not read in time. The share therefore depends on the
+machine: the flood, the network and the agent need two free cores. On a busy machine, `--speedup 0.1 --per-s 4000` plays
+the same flood in slow motion: 40,000 datagrams arrive in a mission second.
 """
 
 import argparse
@@ -29,8 +29,8 @@ from ucp.messages import ChainContainQuery, encode
 from ucp.secure.bundle import KeySet, write_bundle
 
 QUESTIONS_PER_S = 20
-BURST = 200
-"""Number of forged datagrams without a pause."""
+BURST_S = 0.005
+"""Seconds between two bursts of forged datagrams."""
 DISTINCT = 2000
 """Number of different forged datagrams of a class."""
 
@@ -40,7 +40,9 @@ CLASSES: dict[str, Forge] = {
     "not secured": lambda good, rng: encode(ASKING_PEER, rng.randrange(2**32), ChainContainQuery(rng.randbytes(32))),
     "wrong tag": lambda good, rng: good[:8] + rng.randbytes(4) + good[12:],
     "unknown boot": lambda good, rng: good[:18] + make_boot(2**60, rng.randbytes(8)) + good[34:],
-    "far epoch": lambda good, rng: good[:14] + rng.randrange(4000).to_bytes(4, "big") + good[18:],
+    "far epoch": lambda good, rng: (
+        good[:8] + rng.randbytes(4) + good[12:14] + rng.randrange(2, 4000).to_bytes(4, "big") + good[18:]
+    ),
     "forged revocation": lambda good, rng: good[:3] + b"\x0a" + good[4:8] + rng.randbytes(4) + good[12:],
     "replay": lambda good, rng: good,
 }
@@ -54,15 +56,15 @@ def forged(name: str, good: bytes) -> list[bytes]:
 
 def flood(send: Callable[[bytes], object], datagrams: Sequence[bytes], per_s: float, seconds: float) -> int:
     """Send forged datagrams at this rate, and return their number."""
-    source, began, sent = cycle(datagrams), time.monotonic(), 0
+    source, began, sent, burst = cycle(datagrams), time.monotonic(), 0, round(per_s * BURST_S)
     while (passed := time.monotonic() - began) < seconds:
         if sent > passed * per_s:
             time.sleep(0.001)
             continue
-        for datagram in islice(source, BURST):
+        for datagram in islice(source, burst):
             with suppress(BlockingIOError):
                 send(datagram)
-        sent += BURST
+        sent += burst
     return sent
 
 
@@ -119,14 +121,14 @@ async def row(peers: SecuredPeers, name: str, per_s: float, seconds: float) -> s
     return f"{name:20}{sent / seconds:10.0f}{read / seconds:10.0f}{answered / asked:10.0%}{each}"
 
 
-async def flood_all(command: Sequence[str], per_s: float, seconds: float) -> None:
+async def flood_all(command: Sequence[str], per_s: float, seconds: float, speedup: float) -> None:
     """Print a row for each class."""
     keys = KeySet.derived(os.urandom(32), ROSTER)
 
     def prepare(directory: Path) -> None:
         write_bundle(directory / BUNDLE, keys.bundle(AGENT))
 
-    mission = {"features": ["secured"], "security": {"bundle": BUNDLE}, "speedup": 1}
+    mission = {"features": ["secured"], "security": {"bundle": BUNDLE}, "speedup": speedup}
     sys.stdout.write(f"{'class':20}{'sent/s':>10}{'read/s':>10}{'answered':>10}{'us each':>8}\n")
     with tempfile.TemporaryDirectory() as place:
         async with UdpLab(Path(place), command, 1) as lab:
@@ -140,9 +142,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--per-s", type=float, default=40_000, help="forged datagrams per second")
     parser.add_argument("--seconds", type=float, default=5, help="duration of each flood")
+    parser.add_argument("--speedup", type=float, default=1, help="mission seconds per second")
     parser.add_argument("command", nargs="*", default=[sys.executable, "-P", "-m", "ucp.node"], help="the agent")
     arguments = parser.parse_args()
-    asyncio.run(flood_all(arguments.command, arguments.per_s, arguments.seconds))
+    asyncio.run(flood_all(arguments.command, arguments.per_s, arguments.seconds, arguments.speedup))
 
 
 if __name__ == "__main__":

@@ -102,13 +102,24 @@ class EpochSecrets:
         self._sender_keys = {known: keys for known, keys in self._sender_keys.items() if known[0] >= epoch - 1}
         self._save(self._bundle)
 
-    def sender_keys(self, epoch: int, sender: int, boot: bytes) -> SenderKeys:
-        """Return the keys with which this sender encrypts in its incarnation `boot`. `can_open(epoch)` must be true."""
-        known = self._sender_keys.get((epoch, sender, boot))
-        return known or self._derive_keys(self._secret(epoch), self._mission, epoch, sender, boot)
+    def is_near(self, epoch: int) -> bool:
+        """Return whether the epoch is the clock's, the one in which this vehicle sends, or next to one of them."""
+        return abs(epoch - self._bundle.epoch) <= 1 or abs(epoch - self.current) <= 1
+
+    def cached_keys(self, epoch: int, sender: int, boot: bytes) -> SenderKeys | None:
+        """Return the cached keys with which this sender encrypts in its incarnation `boot`. None if there are none."""
+        return self._sender_keys.get((epoch, sender, boot))
+
+    def derive_keys(self, epoch: int, sender: int, boot: bytes) -> SenderKeys:
+        """Derive the keys with which this sender encrypts in its incarnation `boot`. `can_open(epoch)` must be true."""
+        return self._derive_keys(self._secret(epoch), self._mission, epoch, sender, boot)
 
     def remember(self, epoch: int, sender: int, boot: bytes, keys: SenderKeys) -> None:
-        """Cache the keys of a sender. The caller calls this only after a signature has proved the sender authentic."""
+        """Cache the keys of a sender.
+
+        The caller calls this only for a boot that a signature has proved authentic, because an attacker without keys
+        must not fill the cache.
+        """
         if (epoch, sender, boot) in self._sender_keys:
             return
         if len(self._sender_keys) >= MAX_CACHED_KEYS:

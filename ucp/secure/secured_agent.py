@@ -114,7 +114,7 @@ class SecuredAgent(Agent):
     def _receive_control(self, data: bytes, clear: ClearHeader, now: float) -> None:
         """Handle a control datagram, which contains no message of the protocol. Raises MalformedDatagramError."""
         if clear.type == REVOCATION:
-            self._receive_revocation(self.session.open_revocation(data, clear), clear.sender, now)
+            self._receive_revocation(self.session.open_revocation(data, clear, now), clear.sender, now)
             return
         if clear.type == CHALLENGE:
             self.session.receive_challenge(data, clear, now)

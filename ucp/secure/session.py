@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from ucp.messages import TYPE_CODES, MalformedDatagramError, Message
-from ucp.secure._budget import VerificationBudget
+from ucp.secure._budget import TokenBudget
 from ucp.secure._challenges import ALL, ECHO_INTERVAL_S, TRUST_DELAY_S, PendingChallenges
 from ucp.secure._epochs import EpochSecrets
 from ucp.secure._window import ReplayWindow
@@ -50,6 +50,13 @@ processor core.
 """
 REVOCATIONS_PER_S = 50.0
 """Wrong signatures of the authority that a receiver verifies per mission second."""
+WRONG_SIGNATURES_AT_ONCE = 32
+"""Maximum number of tokens of a budget for wrong signatures."""
+UNKNOWN_BOOTS_PER_S = 5000.0
+"""Datagrams of unknown boots whose keys a receiver derives per mission second. A radio with 6 Mbit/s carries fewer
+datagrams. They take a twentieth of a processor core."""
+UNKNOWN_BOOTS_AT_ONCE = 1000
+"""Maximum number of tokens of the budget for unknown boots."""
 
 
 class _SenderIncarnation:
@@ -77,7 +84,7 @@ class Session:
 
     `boot` consists of the incarnation's start in microseconds UTC (8 bytes) and 8 random bytes. `save_bundle` is called
     with the new bundle at once, so that a later incarnation knows of this one, and after each change of the epoch.
-    `wrong_signatures_per_s` limits the wrong signatures of senders that this vehicle verifies.
+    If `has_budgets` is false, the number of wrong signatures and of unknown boots has no limit.
     """
 
     def __init__(
@@ -86,7 +93,7 @@ class Session:
         boot: bytes,
         save_bundle: Callable[[Bundle], None] = lambda _: None,
         crypto: CryptoFunctions = CRYPTO_FUNCTIONS,
-        wrong_signatures_per_s: float = WRONG_SIGNATURES_PER_S,
+        has_budgets: bool = True,
     ) -> None:
         self.agent_id = bundle.agent_id
         self.boot = boot
@@ -115,9 +122,11 @@ class Session:
         self._incarnations: dict[int, _SenderIncarnation] = {}
         self._control = 0
         """Sequence of the next control datagram."""
-        per_s = wrong_signatures_per_s / len(self.public_keys)
-        self._budgets = {agent_id: VerificationBudget(per_s) for agent_id in self.public_keys}
-        self.revocation_budget = VerificationBudget(REVOCATIONS_PER_S)
+        scale = 1.0 if has_budgets else math.inf
+        per_sender_s = scale * WRONG_SIGNATURES_PER_S / len(self.public_keys)
+        self._budgets = {agent_id: TokenBudget(per_sender_s, WRONG_SIGNATURES_AT_ONCE) for agent_id in self.public_keys}
+        self.revocation_budget = TokenBudget(scale * REVOCATIONS_PER_S, WRONG_SIGNATURES_AT_ONCE)
+        self._boot_budget = TokenBudget(scale * UNKNOWN_BOOTS_PER_S, UNKNOWN_BOOTS_AT_ONCE)
         self._own_requests: dict[int, int] = {}
         """Type of a request -> sequence number of this vehicle's newest request of this type."""
 
@@ -191,9 +200,11 @@ class Session:
         return clear + self._own_keys().encrypt(header.position, body + signature, clear)
 
     def _own_keys(self) -> SenderKeys:
-        epoch = self.epochs.current
-        keys = self.epochs.sender_keys(epoch, self.agent_id, self.boot)
-        self.epochs.remember(epoch, self.agent_id, self.boot, keys)
+        own = self.epochs.current, self.agent_id, self.boot
+        keys = self.epochs.cached_keys(*own)
+        if keys is None:
+            keys = self.epochs.derive_keys(*own)
+            self.epochs.remember(*own, keys)
         return keys
 
     # From the air
@@ -214,12 +225,12 @@ class Session:
         if not self.epochs.can_open(clear.epoch):
             raise MalformedDatagramError("epoch out of range")
         if incarnation is None and not self._is_complete:
-            self._decrypt(datagram, clear)
+            self._decrypt(datagram, clear, now)
             self.epochs.follow(clear.epoch)
             self.challenges.ask(ALL, now)
             raise MalformedDatagramError("not confirmed")
         if incarnation is not None and clear.boot != incarnation.boot and not incarnation.is_later(clear.boot):
-            self._decrypt(datagram, clear)
+            self._decrypt(datagram, clear, now)
             self.challenges.ask(clear.sender, now)
             raise MalformedDatagramError("old boot")
         if (
@@ -237,14 +248,14 @@ class Session:
             incarnation.requests[clear.type] = max(clear.sequence, incarnation.requests.get(clear.type, 0))
         return self.crypto.parse_body(clear, body)
 
-    def open_revocation(self, datagram: bytes, clear: ClearHeader) -> bytes:
+    def open_revocation(self, datagram: bytes, clear: ClearHeader, now: float) -> bytes:
         """Decrypt a revocation and return its body. Raises MalformedDatagramError.
 
         The sender need not be authentic. The caller verifies the signature of the authority.
         """
         if not self.epochs.can_open(clear.epoch):
             raise MalformedDatagramError("epoch out of range")
-        return decrypted(self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot), datagram, clear)
+        return decrypted(self._keys_of(clear, now), datagram, clear)
 
     def receive_challenge(self, datagram: bytes, clear: ClearHeader, now: float) -> None:
         """Schedule an echo that answers a challenge. Raises MalformedDatagramError.
@@ -277,7 +288,7 @@ class Session:
         """Accept the sender of an echo, if it answers a challenge of this vehicle. Raises MalformedDatagramError."""
         if not self.epochs.can_open(clear.epoch):
             raise MalformedDatagramError("epoch out of range")
-        _, body, _ = self._decrypt(datagram, clear)
+        _, body, _ = self._decrypt(datagram, clear, now)
         if len(body) != REQUEST.size + 4:
             raise MalformedDatagramError("wrong length")
         request = AnsweredRequest(*REQUEST.unpack_from(body))
@@ -301,16 +312,39 @@ class Session:
             self._incarnations |= self._held
             self._held.clear()
 
-    def _decrypt(self, datagram: bytes, clear: ClearHeader) -> tuple[SenderKeys, bytes, UnverifiedSignature]:
-        """Return the sender's keys, the body and the unverified signature of a datagram. Raises MalformedDatagramError
-        for a wrong tag.
+    def _keys_of(self, clear: ClearHeader, now: float) -> SenderKeys:
+        """Return the keys that seal the datagram with this header. Raises MalformedDatagramError without a token.
+
+        The keys of an accepted boot in the present epochs need no token. They are kept, so that an attacker cannot make
+        the receiver derive them again.
         """
-        keys = self.epochs.sender_keys(clear.epoch, clear.sender, clear.boot)
+        sealed_by = clear.epoch, clear.sender, clear.boot
+        keys = self.epochs.cached_keys(*sealed_by)
+        if keys is not None:
+            return keys
+        incarnation = self._incarnations.get(clear.sender)
+        if incarnation is not None and clear.boot == incarnation.boot and self.epochs.is_near(clear.epoch):
+            keys = self.epochs.derive_keys(*sealed_by)
+            self.epochs.remember(*sealed_by, keys)
+            return keys
+        if not self._boot_budget.has_token(now):
+            raise MalformedDatagramError("too many unknown boots")
+        self._boot_budget.take()
+        return self.epochs.derive_keys(*sealed_by)
+
+    def _decrypt(
+        self, datagram: bytes, clear: ClearHeader, now: float
+    ) -> tuple[SenderKeys, bytes, UnverifiedSignature]:
+        """Return keys, body and unverified signature of a datagram.
+
+        Raises MalformedDatagramError for a wrong tag, and without a token for its keys.
+        """
+        keys = self._keys_of(clear, now)
         return keys, *self.crypto.decrypt(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
 
     def _authenticate(self, datagram: bytes, clear: ClearHeader, now: float) -> bytes:
         """Return the decrypted body. Raises MalformedDatagramError if decryption or the signature fails."""
-        keys, body, claim = self._decrypt(datagram, clear)
+        keys, body, claim = self._decrypt(datagram, clear, now)
         if not self._budgets[clear.sender].has_token(now):
             raise MalformedDatagramError("too many wrong signatures")
         if not self.crypto.verify(claim):

@@ -48,7 +48,7 @@ class SecuredPeers:
         from ucp.secure.session import Session
 
         boot = make_boot(round(time.time() * MICROSECONDS), os.urandom(8))
-        self.sessions = {peer: Session(keys.bundle(peer), boot) for peer in (ASKING_PEER, LOST_PEER)}
+        self.sessions = {peer: Session(keys.bundle(peer), boot, has_budgets=False) for peer in (ASKING_PEER, LOST_PEER)}
         self.agent = agent
         self._opener = DatagramOpener(keys.bundle(ASKING_PEER))
         self._sequence = 0
@@ -66,7 +66,7 @@ class SecuredPeers:
             clear = read_clear_header(datagram)
             if clear.type != REVOCATION:
                 return None
-            return self.sessions[ASKING_PEER].open_revocation(datagram, clear)
+            return self.sessions[ASKING_PEER].open_revocation(datagram, clear, 0.0)
         except MalformedDatagramError:
             return None
 

@@ -4,7 +4,6 @@ vehicle.
 `ucp.secure` decides which datagrams an agent accepts. This module makes no assumption about its decisions.
 """
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -44,7 +43,7 @@ class SecurityGate:
         from ucp.secure.secured_agent import SecuredAgent
         from ucp.secure.session import Session
 
-        session = Session(self._keys.bundle(agent_id), BOOT, wrong_signatures_per_s=math.inf)
+        session = Session(self._keys.bundle(agent_id), BOOT, has_budgets=False)
         session.set_clock(0.0)  # the agent has flown since the start of the mission
         agent = SecuredAgent(session, agent_id, *arguments, **options)
         if revoked:

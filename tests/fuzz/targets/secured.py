@@ -50,7 +50,7 @@ BLOCKS = [Block(2, 1_000_000, b"of two"), Block(3, 1_000_000, b"of three"), Bloc
 BEFORE_ITS_SIGNATURE = {
     *("truncated", "oversized", "wrong magic", "not secured", "wrong version", "impossible sender", "unknown type"),
     *("own sender", "sender not on the roster", "revoked sender", "not signed by the authority", "known already"),
-    *("not confirmed", "too many wrong signatures"),
+    *("not confirmed", "too many wrong signatures", "too many unknown boots"),
     *("epoch out of range", "old boot", "replayed", "not authentic", "not signed by its sender"),
 }
 
@@ -231,6 +231,13 @@ class _Driven:
         require(ahead <= MAX_EPOCHS_FOLLOWED, "others have driven it too far")
 
 
+def _is_accepted(session: Session, sealed_by: tuple[int, int, bytes]) -> bool:
+    """Return whether the session accepts this boot. It keeps the keys of such a boot before a datagram is authentic."""
+    _, sender, boot = sealed_by
+    incarnation = session._incarnations.get(sender)
+    return incarnation is not None and incarnation.boot == boot
+
+
 def _of(agent: SecuredAgent) -> dict[str, Any]:
     """Return all data that a datagram might change."""
     state, session = agent.state, agent.session
@@ -239,7 +246,7 @@ def _of(agent: SecuredAgent) -> dict[str, Any]:
         "chain": (len(state.chain), state.chain.top_chain_hash, len(state.blocks_to_be_committed)),
         "reconcile": (state.reconcile_in_progress, len(state.reconcile_stack), state.vote_count.copy()),
         "timers": [timer.deadline for timer in state.timers],
-        "keys": {*session.epochs._sender_keys},
+        "keys": {known for known in session.epochs._sender_keys if not _is_accepted(session, known)},
         "signatures": dict(agent.signatures),
         "revoked": agent.revoked,
         "heard": {

@@ -49,6 +49,7 @@ SECURED_DROPS = (
     "known already",
     "not confirmed",
     "too many wrong signatures",
+    "too many unknown boots",
 )
 """Further reasons why an agent of a secured mission drops a datagram."""
 
