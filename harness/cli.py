@@ -164,7 +164,7 @@ COMMANDS = {
     ),
     "sitl": CommandEntry("this machine", "harness.commands.sitl:app", "Install and list ArduPilot's SITL binaries."),
     "clean": CommandEntry(
-        "this machine", "harness.commands.doctor:clean_command", "Remove the Docker containers of runs that have ended."
+        "this machine", "harness.commands.doctor:clean_command", "Remove the keys and containers of killed runs."
     ),
 }
 """Name of each command -> its entry, in the order of the help."""

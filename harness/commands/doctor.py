@@ -1,4 +1,4 @@
-"""Implement `ucp-harness doctor` and `clean`, which report what this machine can do and remove leftover containers."""
+"""Implement `ucp-harness doctor` and `clean`, which examine this machine and remove the leftovers of killed runs."""
 
 from typing import Annotated
 
@@ -60,19 +60,22 @@ def doctor_command(
 
 
 def clean_command() -> None:
-    """Remove the Docker containers of runs that have ended.
+    """Remove the keys and the Docker containers of runs that were killed.
 
-    Containers of active runs and of other programs stay.
+    Those of active runs and of other programs stay.
     """
     from harness.play.containers.docker_engine import DockerEngine
     from harness.play.containers.ownership import clean
+    from harness.play.memory_directory import KEYS_PREFIX, remove_abandoned
 
+    console = output()
+    for directory in remove_abandoned(KEYS_PREFIX):
+        console.print(f"removed {directory}", highlight=False, soft_wrap=True)
     engine = DockerEngine.connect()
     try:
         cleaned = clean(engine)
     finally:
         engine.close()
-    console = output()
     for name in cleaned.removed:
         console.print(f"removed {name}", highlight=False, soft_wrap=True)
     if not cleaned.removed:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness.errors import ScenarioError, extra
-from harness.play._memory_directory import memory_directory, no_core_files
+from harness.play.memory_directory import KEYS_PREFIX, memory_directory, no_core_files
 from harness.scenario import Scenario
 from ucp.sealed import seal_to
 
@@ -170,7 +170,7 @@ def key_directories(scenario: Scenario) -> Iterator[KeyDirectories]:
     if keys is None:
         yield KeyDirectories(None, Path())
         return
-    with memory_directory("ucp-keys-") as directory, no_core_files():
+    with memory_directory(KEYS_PREFIX) as directory, no_core_files():
         directories = KeyDirectories(keys, directory)
         for vehicle in directories.directories.values():
             vehicle.mkdir()

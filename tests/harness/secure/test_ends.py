@@ -6,11 +6,15 @@ import resource
 import signal
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from tests.harness.command import Running, write_scenario
+from harness.play.keyring.key_directory import KeyDirectory
+from tests.harness.command import Running, harness, processes, write_scenario
+from tests.harness.play.test_memory_directory import guard_of
+from tests.harness.secure.secrets import secrets, told
 
 pytestmark = pytest.mark.lab
 
@@ -19,6 +23,12 @@ MEMORY = Path("/dev/shm")  # noqa: S108
 
 def key_directories() -> set[Path]:
     return {path for place in (MEMORY, Path(tempfile.gettempdir())) for path in place.glob("ucp-keys-*")}
+
+
+def bundle_of(run: Running, agent: int) -> Path:
+    """Return the path of an agent's keys, which its mission file names."""
+    mission = json.loads((run.out / "agents" / f"{agent}.mission.json").read_text())
+    return Path(os.path.normpath(run.out / "agents" / mission["security"]["bundle"]))
 
 
 def _allow_hang_up_and_core_files() -> None:
@@ -64,10 +74,42 @@ def test_aborted_agent_with_keys_leaves_no_core_file(run: Running) -> None:
 
 def test_killed_run_leaves_no_keys(run: Running) -> None:
     run.wait_for_mission(1)
-    (mission,) = [json.loads(path.read_text()) for path in (run.out / "agents").glob("1.mission.json")]
-    bundle = Path(os.path.normpath(run.out / "agents" / mission["security"]["bundle"]))
+    bundle = bundle_of(run, 1)
     assert bundle.exists() and bundle.is_relative_to(MEMORY)
     run.process.kill()
     run.process.wait()
     run.process.poll = lambda: None  # type: ignore[method-assign]  # wait_for expects an active run
     run.wait_for(lambda: not bundle.parent.parent.exists(), "the end of the keys")
+
+
+def test_clean_removes_the_keys_of_a_run_that_was_killed_with_its_guard(run: Running) -> None:
+    run.wait_for_mission(1)
+    keys = bundle_of(run, 1).parent.parent
+    for pid in (guard_of(keys), run.process.pid):
+        os.kill(pid, signal.SIGKILL)
+    run.process.wait()
+    assert keys.exists()
+    assert f"removed {keys}" in harness("clean").stdout
+    assert not keys.exists()
+
+
+def test_arguments_and_environment_of_processes_contain_no_secret(tmp_path: Path) -> None:
+    home = KeyDirectory.new(tmp_path / "keys", [1, 2, 3], seals=True, epoch_s=600.0)
+    asked = write_scenario(tmp_path, security={"keys": str(home.directory)}, speedup=20, duration_s=2000)
+    run = Running(asked, tmp_path / "run", "--backend", "process")
+    try:
+        run.wait_for_mission(1, 2, 3)
+        shown = [content for pid in (run.process.pid, *processes(run.out)) for content in visible(pid)]
+    finally:
+        run.process.kill()
+        run.process.communicate()
+    assert sum(b"mission.json" in content for _, content in shown) >= 3
+    assert any(b"PATH=" in content for _, content in shown)
+    assert told(secrets(home, 2), shown) == []
+
+
+def visible(pid: int) -> Iterator[tuple[str, bytes]]:
+    """Yield the arguments and the environment of a process, as other programs of the user read them."""
+    for name in ("cmdline", "environ"):
+        with suppress(OSError):  # a process with keys denies access to other programs
+            yield f"{name} of process {pid}", Path(f"/proc/{pid}/{name}").read_bytes()
