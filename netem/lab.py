@@ -50,6 +50,9 @@ _CLOSE_DEADLINE_S = 5.0
 class LabProcess:
     """A program in the virtual network. The program ends at the latest when the network is closed."""
 
+    left_behind: tuple[str, ...] = ()
+    """Always empty, because child processes of the program run on when the program ends."""
+
     def __init__(self, channel: LabConnection, vehicle: int | None, pid: int, ended: asyncio.Future[int]) -> None:
         self._channel = channel
         self._ended = ended

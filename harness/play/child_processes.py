@@ -3,7 +3,9 @@
 The harness puts a random mark into the environment of each agent, and a child inherits the environment. If a process
 with the mark still runs after its agent has ended, the agent left it behind, and the harness ends it. The mark also
 identifies children that left the session of the agent. A child that cleared its environment is not found. Such a child
-ends together with the lab or the container.
+ends together with the lab.
+
+In a container, the kernel ends the children. `harness.play.containers._container_processes` finds their names.
 """
 
 import os

@@ -14,6 +14,7 @@ import docker
 import docker.errors
 from docker.types import LogConfig, Mount, Ulimit
 
+from harness.play.containers._container_processes import end_program, first_process
 from harness.play.containers._images import ContainerImage
 from harness.play.containers.docker_engine import DockerEngine
 from harness.scenario.agent_options import DockerOptions
@@ -100,6 +101,7 @@ class Container:
         self._paused = False
         self._out_of_memory = False
         self._ending: asyncio.Task[None] | None = None
+        self.left_behind: list[str] = []
 
     @property
     def returncode(self) -> int | None:
@@ -134,7 +136,13 @@ class Container:
 
     async def terminate(self, grace_s: float) -> int:
         await self.resume()
-        await self.send_signal(signal.SIGTERM)
+        init = None if self._ended.done() else await self._engine.in_thread(first_process, self._engine, self.identity)
+        try:
+            if init is None:
+                raise ProcessLookupError
+            self.left_behind = await asyncio.to_thread(end_program, init, grace_s)
+        except OSError:  # the container has just ended, or the engine runs it as another user
+            await self.send_signal(signal.SIGTERM)
         try:
             return await asyncio.wait_for(self.wait(), grace_s)
         except TimeoutError:

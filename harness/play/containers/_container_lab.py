@@ -26,6 +26,7 @@ from docker.types import Mount
 from harness.archive.directory import RunDirectory
 from harness.play.containers import _images, ownership
 from harness.play.containers._container import Container, ContainerOutput, recipe
+from harness.play.containers._container_processes import first_process
 from harness.play.containers._images import ContainerImage
 from harness.play.containers._own_folders import OwnFolders
 from harness.play.containers.docker_engine import CLEAN, DockerEngine, DockerError, DockerEvents
@@ -145,10 +146,9 @@ class ContainerLab:
 
     def _open_network(self, identity: str) -> int:
         """Return an open file descriptor of the network namespace of a container."""
-        state = self._engine.do("look at a container", self._engine.api.inspect_container, identity)["State"]
-        pid = state["Pid"]
+        pid = first_process(self._engine, identity)
         with contextlib.suppress(OSError):
-            if identity in Path(f"/proc/{pid}/cgroup").read_text():  # the process ID may belong to another process
+            if pid is not None:
                 return os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
         raise DockerError(
             "the Docker engine runs in a virtual machine or on another machine, so the harness cannot connect its "

@@ -29,6 +29,12 @@ class LabProgram(Protocol):
     def end(self) -> str:
         """A phrase for the user that describes how the program ended."""
 
+    @property
+    def left_behind(self) -> Sequence[str]:
+        """The names of the processes that `terminate` ended together with the container of the program. Without a
+        container, they run on, and the list is empty.
+        """
+
     async def wait(self) -> int:
         """Wait for the program to end and for all its output to be in its files. Return `returncode`."""
 

@@ -58,6 +58,7 @@ class ControlledProgram:
         self.children = children
         self._control = AgentControl(control)
         self._answer_limit_s = answer_limit_s
+        self._left_behind: Sequence[str] = ()
 
     @classmethod
     async def start(
@@ -138,8 +139,11 @@ class ControlledProgram:
         self._control.close()
         if (status := self.process.returncode) is not None:
             return status
-        return await self.process.terminate(STOP_GRACE_S)
+        status = await self.process.terminate(STOP_GRACE_S)
+        self._left_behind = self.process.left_behind
+        return status
 
     async def end_children(self) -> list[str]:
         """End the processes that the ended program left behind, and return their names."""
-        return await asyncio.to_thread(self.children.end_left_behind)
+        in_container, self._left_behind = self._left_behind, ()
+        return [*in_container, *await asyncio.to_thread(self.children.end_left_behind)]

@@ -11,9 +11,9 @@ import pytest
 
 from harness.play.child_processes import ChildProcesses
 from tests.harness.command import harness, write_scenario
-from tests.harness.conformance import wrong_programs
 
-AGENT = f"2={shlex.quote(sys.executable)} -P -m {wrong_programs.__name__} leaves_children"
+LEAVES_A_CHILD = f'setsid sleep 1000 </dev/null >/dev/null & exec {shlex.quote(sys.executable)} -P -m ucp.node "$0"'
+AGENT = f"2=sh -c {shlex.quote(LEAVES_A_CHILD)}"
 
 
 def test_children_outside_the_session_are_ended() -> None:
@@ -32,11 +32,18 @@ def test_processes_of_another_agent_are_spared() -> None:
         others.end()
 
 
-@pytest.mark.parametrize("backend", [pytest.param("process", marks=pytest.mark.lab), "sim"])
-def test_run_ends_and_reports_what_an_agent_leaves_behind(backend: str, tmp_path: Path) -> None:
+BACKENDS = [
+    pytest.param(("process",), marks=pytest.mark.lab, id="process"),
+    pytest.param(("docker", "--image-from-host"), marks=pytest.mark.docker, id="docker"),
+    pytest.param(("sim",), id="sim"),
+]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_run_ends_and_reports_what_an_agent_leaves_behind(backend: tuple[str, ...], tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path, vehicles={"kind": "none"}, events={"source": "scripted"}, duration_s=50)
     out = tmp_path / "run"
-    done = harness("run", scenario, "--backend", backend, "--ucp-agent", AGENT, "--seed", "1", "--out", out)
+    done = harness("run", scenario, "--backend", *backend, "--ucp-agent", AGENT, "--seed", "1", "--out", out)
     assert done.returncode == 0, done.stderr
     agents = json.loads((out / "run.json").read_text())["agents"]
     assert [agents[agent_id]["left_behind"] for agent_id in "123"] == [[], ["sleep"], []]
