@@ -115,6 +115,8 @@ def _of_the_whole(proof: Proof) -> Iterator[str]:
             f"✘ not shown, one chain: from {states} no path without losses leads to an idle swarm with one chain, "
             f"even {after}"
         )
+        if live.flaw is not None:
+            yield f"    after further votes a violation ended a path: {live.flaw.sentence}"
     if votes and live.decided:
         counts = ", ".join(f"{count:,} with {number}" for number, count in enumerate(live.astray[:-1]))
         yield f"    states without such a path, by number of further votes: {counts}"

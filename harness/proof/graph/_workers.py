@@ -20,6 +20,7 @@ from harness.errors import HarnessError
 from harness.proof._progress_bar import memory_bytes
 from harness.proof.graph._expansion import StateExpansion, expanded
 from harness.proof.model._block_renaming import Completed
+from harness.proof.model._flaws import PropertyViolation
 from harness.proof.model._global_states import AGENTS, ZONE, ModelSwarm, State
 from harness.proof.model._known_states import DEAD
 from harness.proof.questions._attractor import Check
@@ -74,11 +75,11 @@ class SuccessorBatch(NamedTuple):
 
 
 class NeededVotes(NamedTuple):
-    """A worker's answer: the number of further votes that each state needs until all chains are equal. `votes` is None
-    if the worker could not find the numbers.
+    """A worker's answer: the result of `ExtraVotes.needed` for each state. `votes` is None if the worker reached its
+    limit of states.
     """
 
-    votes: list[int | None] | None
+    votes: list[int | PropertyViolation | None] | None
 
 
 class WorkerAnswer(NamedTuple):
@@ -309,9 +310,9 @@ class Workers:
             assert isinstance(answer, SuccessorBatch)
             yield from other.expansions_of(answer, number, add)
 
-    def needed(self, forks: Sequence[State], check: Check) -> Iterator[int | None]:
-        """Yield the number of further votes that each state needs until all chains are equal. Raises UndecidedError if
-        a worker reaches its limit of states.
+    def needed(self, forks: Sequence[State], check: Check) -> Iterator[int | PropertyViolation | None]:
+        """Yield the number of further votes that each state needs until all chains are equal, or the other results of
+        `ExtraVotes.needed`. Raises UndecidedError if a worker reaches its limit of states.
         """
         for _, _, answer in self._answers(_WorkerHandle.give_forks, forks, check):
             assert isinstance(answer, NeededVotes)

@@ -10,6 +10,7 @@ from functools import partial
 from harness.proof.graph._expansion import cycles_left_alone
 from harness.proof.graph._exploration import StateGraph
 from harness.proof.graph._workers import Workers
+from harness.proof.model._flaws import PropertyViolation
 from harness.proof.questions._attractor import BackwardReachableStates, Check
 from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
 from harness.proof.questions._graph_cycles import cycles
@@ -31,6 +32,7 @@ class ConvergenceResult:
       list ends at 0 states, or at one vote for each agent.
     - `lost`: the nearest state without a path to one chain even after one vote for each agent.
     - `reluctant`: the nearest state for which one vote is not enough.
+    - `flaw`: a violation after further votes. It ended a path that might have led to one chain.
     """
 
     forks: int = 0
@@ -39,6 +41,7 @@ class ConvergenceResult:
     astray: list[int] = field(default_factory=list)
     lost: int | None = None
     reluctant: int | None = None
+    flaw: PropertyViolation | None = None
     decided: bool = True
     """True if all states after further votes were explored."""
 
@@ -62,13 +65,14 @@ def look(graph: StateGraph, watch: Watch = lambda asked: None, workers: Workers 
         result.decided = False
         return result
     for votes in range(1, graph.swarm.bounds.agents + 1):
-        safe.add(fork for fork, need in needed.items() if need is not None and need <= votes)
+        safe.add(fork for fork, need in needed.items() if isinstance(need, int) and need <= votes)
         result.astray.append(safe.left)
         if not safe.left:
             return result
         if votes == 1:
             result.reluctant = safe.first_left
     result.lost = safe.first_left
+    result.flaw = next((need for need in needed.values() if isinstance(need, PropertyViolation)), None)
     return result
 
 
@@ -81,11 +85,13 @@ def _idle_states(graph: StateGraph, check: Check) -> Iterator[tuple[int, int]]:
             yield number, len(graph.swarm.chains(state))
 
 
-def _needed(graph: StateGraph, forks: Sequence[int], watch: Watch, workers: Workers | None) -> dict[int, int | None]:
-    """Return the number of further votes that each state needs. The number is None if one vote per agent is
-    not enough.
+def _needed(
+    graph: StateGraph, forks: Sequence[int], watch: Watch, workers: Workers | None
+) -> dict[int, int | PropertyViolation | None]:
+    """Return the number of further votes that each state needs. If one vote per agent is not enough, return a violation
+    after further votes, or None without a violation.
     """
-    needed: dict[int, int | None] = {}
+    needed: dict[int, int | PropertyViolation | None] = {}
 
     def check() -> None:
         watch(f"what votes lead to ({len(needed):,} of {len(forks):,} forks)")

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from harness.proof.graph._expansion import quiet
+from harness.proof.model._flaws import PropertyViolation
 from harness.proof.model._global_states import AGENTS, BLOCKS, ModelSwarm, State
 from harness.proof.model._instant import AgentAction
 from harness.proof.model._known_states import DEAD
@@ -38,17 +39,19 @@ class ExtraVotes:
         """State -> number of votes that is enough. `_too_few` has numbers that are not enough."""
         self._too_few: dict[State, int] = {}
         self._explored = 0
+        self._flaw: PropertyViolation | None = None
+        """The first violation after further votes. It ends its path, because a wrong agent takes no further step."""
 
-    def needed(self, fork: State) -> int | None:
-        """Return the smallest number of votes that makes all chains equal. Return None if one vote per agent is not
-        enough. Raises UndecidedError.
+    def needed(self, fork: State) -> int | PropertyViolation | None:
+        """Return the smallest number of votes that makes all chains equal. If one vote per agent is not enough, return
+        a violation that ended a path after further votes, or None without a violation. Raises UndecidedError.
         """
         if len(self._enough) + len(self._too_few) > MAX_CACHED:
             self._enough.clear()
             self._too_few.clear()
         self._explored = 0
         most = self._swarm.bounds.agents
-        return next((votes for votes in range(1, most + 1) if self._a_vote_leads(fork, votes)), None)
+        return next((votes for votes in range(1, most + 1) if self._a_vote_leads(fork, votes)), self._flaw)
 
     def _a_vote_leads(self, fork: State, votes: int, instants: int = 0) -> bool:
         """Return true if one vote, followed by at most `votes - 1` further votes, leads to equal chains.
@@ -89,7 +92,7 @@ class ExtraVotes:
         if state in tried or instants > MAX_PATH_INSTANTS or self._too_few.get(state, -1) >= votes:
             return False
         tried.add(state)
-        self._count_explored()
+        self._note_explored(state)
         if self._swarm.is_idle(state):
             leads = self._idle_leads(state, votes, instants)
         else:
@@ -142,7 +145,7 @@ class ExtraVotes:
 
         by_timer: list[ByTimer] = []
         for at in states:
-            self._count_explored()
+            self._note_explored(at)
             by_timer.append(quiet(self._swarm, at, number_of).by_timer)
         attractor = BackwardReachableStates(by_timer, self._swarm.bounds.timers_any, self._check)
         attractor.add(
@@ -156,8 +159,9 @@ class ExtraVotes:
             else:
                 self._too_few[at] = max(votes, self._too_few.get(at, votes))
 
-    def _count_explored(self) -> None:
+    def _note_explored(self, state: State) -> None:
         self._check()
+        self._flaw = self._flaw or self._swarm.flaw(state)
         self._explored += 1
         if self._explored > MAX_EXPLORED:
             raise UndecidedError

@@ -53,6 +53,16 @@ def test_bug_is_found_as_without_reductions(name: str, forced: list[str]) -> Non
     assert findings(bug(name)) == {"default": expected, "whole": expected, "forced": forced}
 
 
+def test_violation_after_further_votes_is_a_printed_reason(tmp_path: Path) -> None:
+    """Within the bounds no agent has a chain of two blocks when it votes. A further vote shows the deviation."""
+    right = "approve = message.chain_hash == core.chain.top_chain_hash"
+    core = edited(tmp_path, Bug("commit.py", right, f"{right} and len(core.chain) < 2"))
+    done = with_core(core, "prove", "--agents", 2, "--blocks", 2, "--network", "lossless", "--steps", cwd=tmp_path)
+    assert done.returncode == 1, done.stderr
+    assert "✘ not shown, one chain" in done.stdout
+    assert "after further votes a violation ended a path: Algorithm 3, receive_request_add_block" in done.stdout
+
+
 def test_agent_that_depends_on_a_counter_is_refused(tmp_path: Path) -> None:
     """The number of reconciles grows without limit, so it cannot be part of a state."""
     wrong = NOT_APPROVED.replace(
