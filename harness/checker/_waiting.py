@@ -63,8 +63,9 @@ class _UnfinishedOperation:
 
 
 def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
-    """Yield each vote or reconcile that took longer than the agent's timers allow. Agents that were paused are
-    excluded.
+    """Yield each vote or reconcile that lasted longer than the agent's timers and the measured lag allow.
+
+    Paused agents are excluded.
     """
     for agent_id, trace in evidence.traces.items():
         if evidence.describe_unknown_name("handler", "branch", agent_id=agent_id):
@@ -103,7 +104,8 @@ def _find_in_incarnation(
 def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _UnfinishedOperation) -> Iterator[Finding]:
     for wait in waits:
         if now > wait.since + wait.longest:
-            if not evidence.was_paused(agent_id, wait.since, now):
+            due_s = wait.since + wait.longest
+            if not (evidence.was_paused(agent_id, wait.since, now) or evidence.was_delayed(agent_id, due_s, now)):
                 yield wait.finding(agent_id)
             wait.since = math.inf
 

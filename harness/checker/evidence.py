@@ -304,6 +304,16 @@ class Evidence:
                 since = None
         return since is not None and since <= until_s
 
+    def was_delayed(self, agent_id: int, due_s: float, until_s: float) -> bool:
+        """Return true if the agent could not run from one mission second until the other: it was paused in between, or
+        the measured lag explains this time.
+        """
+        if self.was_paused(agent_id, due_s, until_s):
+            return True
+        lag_s = self.lag.explains(agent_id, due_s, until_s) if self.lag else None
+        speedup = self.traces[agent_id].header.clock.get("speedup")
+        return lag_s is not None and isinstance(speedup, int | float) and until_s - due_s <= lag_s * speedup
+
     @property
     def paused_at_end(self) -> list[int]:
         """The agents that are still paused when the run ends."""

@@ -91,11 +91,11 @@ def _why(unjudged: dict[int, str]) -> str:
 def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: BlockIndex) -> list[StepComparer]:
     """Return a `StepComparer` for each incarnation of the agent (the time between two restarts)."""
 
-    def was_paused(since: float, until: float) -> bool:
-        return evidence.was_paused(header.agent_id, since, until)
+    def was_delayed(since: float, until: float) -> bool:
+        return evidence.was_delayed(header.agent_id, since, until)
 
     parts = OptionalTraceFields.of(trace)
-    return [StepComparer(header, parts, blocks, was_paused) for _ in range(len(trace.starts) + 1)]
+    return [StepComparer(header, parts, blocks, was_delayed) for _ in range(len(trace.starts) + 1)]
 
 
 def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[StepComparer]) -> None:

@@ -48,8 +48,10 @@ TOUCH_A_TIMER = frozenset((PAUSES,))
 changes.
 """
 
-Paused = Callable[[float, float], bool]
-"""A function that returns true if the agent was paused at any time between two mission seconds."""
+Delayed = Callable[[float, float], bool]
+"""A function that returns true if the agent could not run between two mission seconds, because it was paused or the
+machine was busy.
+"""
 
 
 class NotHandledError(Exception):
@@ -102,7 +104,7 @@ class StepComparer:
         header: CheckedHeader,
         parts: OptionalTraceFields,
         blocks: BlockIndex,
-        was_paused: Paused,
+        was_delayed: Delayed,
         implementation: CoreImplementation = REFERENCE,
     ) -> None:
         self.deviations: list[StepDeviation] = []
@@ -116,7 +118,7 @@ class StepComparer:
         self._header = header
         self._parts = parts
         self._blocks = blocks
-        self._was_paused = was_paused
+        self._was_delayed = was_delayed
         self._implementation = implementation
         self._on_message = implementation.on_message
         self._core = implementation.core(header)
@@ -273,8 +275,8 @@ class StepComparer:
         return is_hidden
 
     def copy(self) -> "StepComparer":
-        """Return an independent copy of this object. The copy does not contain the differences found so far."""
-        keep = [self._header, self._parts, self._blocks, self._was_paused, self._state, self._implementation]
+        """Return an independent copy of this object, without the differences found so far."""
+        keep = [self._header, self._parts, self._blocks, self._was_delayed, self._state, self._implementation]
         keep.append(self._on_message)
         keep += (*self._implementation.handlers.values(), *self._core.unchanging())
         memo: dict[int, Any] = {id(kept): kept for kept in keep}
@@ -348,7 +350,7 @@ class StepComparer:
         for timer in self._core.timers:
             if timer.deadline is not None and timer.deadline < late:
                 ended_s = at_s - (now - timer.deadline) / self._header.rate
-                if not self._was_paused(ended_s, at_s):
+                if not self._was_delayed(ended_s, at_s):
                     what = f"it did not run, although the {timer.name} timer expired at t={ended_s:g} s"
                     if timer is self._core.phase_three_timer:
                         what += self._after_a_pause(timer.deadline)

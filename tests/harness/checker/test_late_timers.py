@@ -81,6 +81,15 @@ def test_timer_that_the_lag_explains_is_no_deviation(late: Path, tmp_path: Path,
     assert judged(late, tmp_path, lag=lag).verdict == "as specified"
 
 
+def test_delay_of_seconds_that_the_lag_explains_is_no_deviation(late: Path, tmp_path: Path) -> None:
+    """A delay of 2.5 s of wall time is more than a handler may be late without a measured lag."""
+    found = judged(late, tmp_path, speedup=0.2, lag=measured(0.1))
+    assert found.verdict == "deviates"
+    assert any("it did not run, although the voting timer expired" in each.detail for each in found.evidence)
+    assert judged(late, tmp_path, speedup=0.2, lag=measured(3.0)).verdict == "as specified"
+    assert check(gather(RunArchive(tmp_path / "run"))).characteristics["1"].verdict == "holds"
+
+
 def test_mean_shows_an_error_that_single_timers_do_not_show(late: Path, tmp_path: Path) -> None:
     found = judged(late, tmp_path, speedup=20, lag=measured(0.005))
     assert found.verdict == "deviates"
