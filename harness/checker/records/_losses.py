@@ -13,6 +13,9 @@ Only messages count that a correct agent handles if they arrive:
   the engine counts packets, its counts can also be too low.
 - In virtual time: messages of three types, if the agent runs and does not reconcile. Virtual time does not deliver
   other messages without effect.
+
+A dropped datagram arrived. In a secured mission, for example, a restarted agent drops messages of agents that it has
+not yet confirmed. If an agent handled too few messages, its dropped datagrams therefore count as handled.
 """
 
 from bisect import bisect_right
@@ -53,6 +56,8 @@ class _ExpectedDeliveries:
     least: float = 0.0
     most: float = 0.0
     handled: int = 0
+    dropped: int = 0
+    """Recorded datagrams that arrived and that the agent did not handle. Some of them may be among `messages`."""
 
     def loss_range(self) -> tuple[float, float]:
         """Return the minimum and maximum of the mean loss rate of these messages."""
@@ -127,6 +132,7 @@ def _sum(expected: Iterable[_ExpectedDeliveries]) -> _ExpectedDeliveries:
     for seen in expected:
         total.messages += seen.messages
         total.handled += seen.handled
+        total.dropped += seen.dropped
         total.least += seen.least
         total.most += seen.most
     return total
@@ -134,7 +140,8 @@ def _sum(expected: Iterable[_ExpectedDeliveries]) -> _ExpectedDeliveries:
 
 def _is_impossible_at(seen: _ExpectedDeliveries, sides: tuple[bool, ...]) -> bool:
     return seen.messages > 0 and any(
-        _is_impossible(seen.handled, seen.messages, seen.pass_range(), fewer=fewer) for fewer in sides
+        _is_impossible(seen.handled + fewer * seen.dropped, seen.messages, seen.pass_range(), fewer=fewer)
+        for fewer in sides
     )
 
 
@@ -149,7 +156,7 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
     known = {link for _, losses in evidence.link_losses for link in losses}
     expected: dict[int, _ExpectedDeliveries] = {}
     for receiver, trace in evidence.traces.items():
-        seen = expected[receiver] = _ExpectedDeliveries()
+        seen = expected[receiver] = _ExpectedDeliveries(dropped=trace.dropped().total())
         triggers = [run.trigger for run in trace.runs if isinstance(run.trigger, MessageTrigger)]
         handled = Counter((trigger.sender, trigger.message, trigger.sequence) for trigger in triggers)
         ready = _ReadyTimes(evidence, receiver) if in_virtual_time(trace) else None

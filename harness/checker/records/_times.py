@@ -88,7 +88,13 @@ def _compare_events(evidence: Evidence, agent_id: int, trace: Trace) -> Iterator
 
 
 def _time_of_event(run: HandlerRun, trace: Trace) -> float | None:
+    """Return the mission second of the event's timestamp, or None if it is unknown.
+
+    A clock that shows a time before its epoch gives its events the timestamp 0.
+    """
     try:
-        return mission_s(event_of(run.input).timestamp_us, trace.header)
+        timestamp_us = event_of(run.input).timestamp_us
     except MalformedEventsError:
         return None
+    at_s = mission_s(timestamp_us, trace.header)
+    return at_s if timestamp_us or at_s is None else min(at_s, run.t)

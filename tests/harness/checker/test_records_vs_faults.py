@@ -204,6 +204,25 @@ def test_event_with_another_timestamp_is_found(directory: Path) -> None:
     assert "but the timestamp of the event is" in found(directory)
 
 
+def test_event_before_the_epoch_of_its_clock_agrees(tmp_path: Path) -> None:
+    clocked = scenario(clocks={1: {"offset_s": -100, "drift": 0.01}}, events={"source": "random", "mean_s": 6})
+
+    finished = run(clocked, 1, tmp_path / "run", SilentProgress(), backend="sim")
+
+    assert finished.result.beside["records"].verdict == "agree", finished.result.beside["records"].evidence
+
+
+def test_message_that_a_restarted_agent_cannot_confirm_is_not_lost(tmp_path: Path) -> None:
+    """A restarted agent of a secured mission drops the first messages of each other agent, and asks for a proof."""
+    timeline = [{"at_s": 60, "kill": [3]}, {"at_s": 90, "restart": [3]}]
+    often = {"source": "random", "mean_s": 6}
+    asked = scenario(agents=3, duration_s=150, security={}, events=often, timeline=timeline)
+
+    finished = run(asked, 1, tmp_path / "run", SilentProgress(), backend="sim")
+
+    assert finished.result.beside["records"].verdict == "agree", finished.result.beside["records"].evidence
+
+
 def test_store_that_no_agent_wrote_is_reported(directory: Path) -> None:
     text = json.dumps({"changes": [], "blocks": [], "secured": 5}).encode()
     header = b'{"schema":"ucp-store/1"}'
