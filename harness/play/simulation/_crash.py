@@ -26,9 +26,7 @@ def core_crash(incarnation: SimulatedIncarnation | None, error: Exception) -> Ag
     if incarnation is None or incarnation.state is None or not ours or not ours[-1][0].is_relative_to(CORE):
         return None
     path, line = ours[-1]
-    handler = vars(incarnation.state)["running"]
-    detail = (
-        f"crashed in Algorithm {handler.algorithm}, {handler.name}, at ucp/{path.relative_to(CORE)}:{line}: "
-        f"{type(error).__name__}: {str(error)[:MAX_WORDS]}"
-    )
+    handler = vars(incarnation.state).get("running")
+    where = f"in Algorithm {handler.algorithm}, {handler.name}, " if handler is not None else ""
+    detail = f"crashed {where}at ucp/{path.relative_to(CORE)}:{line}: {type(error).__name__}: {str(error)[:MAX_WORDS]}"
     return AgentFailedError(incarnation.agent.agent_id, "crashed", detail)

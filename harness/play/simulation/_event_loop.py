@@ -268,8 +268,10 @@ class EventLoop:
             _, event_id, data, timestamp_us = what
             if timestamp_us is None:
                 timestamp_us = incarnation.timestamp_us(self._now)
-            self._recorder.logged(self._now, agent.agent_id, len(data))
-            agent.add_event(LoggableEvent(timestamp_us, event_id, data), incarnation.local_s(self._now))
+            event = LoggableEvent(timestamp_us, event_id, data)
+            if event.encoded_bytes <= self.scenario.settings_of(agent.agent_id).max_event_bytes:
+                self._recorder.logged(self._now, agent.agent_id, len(data))
+                agent.add_event(event, incarnation.local_s(self._now))
             self._schedule_event(number, incarnation)
             self._finish_input(number, incarnation)
 

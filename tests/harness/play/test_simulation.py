@@ -259,6 +259,15 @@ def test_added_loss_does_not_change_the_events() -> None:
     assert completed() == completed(loss=0.3) == completed(loss=0.3, duplicate=0.2)
 
 
+def test_random_event_that_is_too_large_is_not_logged() -> None:
+    """Agents that run as processes do not log it either. The data of a random event has 32 to 256 bytes."""
+    sizes = {"max_block_bytes": 150, "max_event_bytes": 100}
+    small = scenario(duration_s=200, settings=sizes, events={"source": "random", "mean_s": 20})
+    done = simulate(small, 1, tracing=True)
+    assert done.result.figures["blocks"]
+    assert not done.result.bad
+
+
 def test_run_directory_equals_the_simulation_in_memory(tmp_path: Path) -> None:
     one = load_scenario(SCENARIOS / "loss_15.yaml")
     finished = run(one, 3, tmp_path / "run", SilentProgress(), "sim")
