@@ -7,6 +7,7 @@ The template escapes every text except Markup.
 import base64
 import hashlib
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +26,31 @@ def render(template: Path, *, styles: Sequence[str], script: str = "", **content
     """Fill in a template and return the page. The Content-Security-Policy of the page permits its styles and its script
     by their digests.
     """
+    return (
+        _environment(template.parent)
+        .get_template(template.name)
+        .render(
+            styles=[Markup(style) for style in styles],  # noqa: S704 - our own text; escaping would change its digest
+            style_digests=[_digest(style) for style in styles],
+            script=Markup(script),  # noqa: S704 - our own text
+            script_digest=_digest(script),
+            **content,
+        )
+    )
+
+
+@cache
+def _environment(directory: Path) -> Environment:
+    """Return the environment of the templates in this directory. It keeps compiled templates."""
     environment = Environment(
-        loader=FileSystemLoader([template.parent, _HERE]),
+        loader=FileSystemLoader([directory, _HERE]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters.update(value=words.value)
-    return environment.get_template(template.name).render(
-        styles=[Markup(style) for style in styles],  # noqa: S704 - our own text; escaping would change its digest
-        style_digests=[_digest(style) for style in styles],
-        script=Markup(script),  # noqa: S704 - our own text
-        script_digest=_digest(script),
-        **content,
-    )
+    return environment
 
 
 def _digest(text: str) -> str:
