@@ -1,24 +1,29 @@
-"""Check thousands of different runs of correct agents. No check may report a finding.
+"""Play and judge thousands of different runs of correct agents. No check may report a finding.
 
-    python -m benchmarks.clean_runs [RUNS] [FIRST]
+    python -m benchmarks.clean_runs [RUNS] [--first NUMBER] [--processes]
 
-The number of a run determines its scenario: 2 to 12 agents, loss, bursts, partitions, kills and restarts, pauses,
-clocks that drift, and readings of the thesis. The benchmark prints each finding with the number of its run. With
-findings, the exit status is 1.
+The number of a run determines its scenario: 2 to 12 agents, loss, bursts, delays, duplicates, partitions, kills and
+restarts, reboots, pauses, clocks that drift, keys, a shared channel, and readings of the thesis. Each run is written to
+a directory, and the checker judges the files of this directory. The benchmark prints each finding with the number of
+its run. With findings, the exit status is 1.
 """
 
+import argparse
 import sys
+import tempfile
 import time
 from collections import Counter
+from functools import partial
+from pathlib import Path
 from random import Random
 from typing import Any
 
-from harness.run.parallel import FailedTask, sweep
-from harness.run.simulate import simulate
+from harness.backend_names import BackendName
+from harness.run.parallel import FailedTask, cores, sweep
+from harness.run.run import run
 from harness.scenario import Scenario
+from netem.channel import PRESETS
 from ucp.settings import ALTERNATIVES, CHOICES
-
-JOBS = 2
 
 
 def scenario(number: int) -> Scenario:
@@ -74,12 +79,62 @@ def _death(draw: Random, agents: int, duration_s: float) -> list[dict[str, Any]]
     )
 
 
-def judge(number: int) -> tuple[list[str], dict[str, str]]:
+def varied(number: int) -> Scenario:
+    """Return the scenario of a run: in half of the runs that of `scenario`, otherwise with other conditions too."""
+    drawn = scenario(number).model_dump(mode="json", exclude_defaults=True, by_alias=True)
+    draw = Random(f"varied {number}")
+    kind = draw.choice(["", "", "", "", "delay", "links", "security", "channel"])
+    if kind == "delay":
+        mean_s = draw.choice([0.05, 0.5, 2.0])
+        distribution = draw.choice(["uniform", "normal", "pareto", "paretonormal"])
+        delay = {"mean_s": mean_s, "jitter_s": mean_s * draw.random(), "distribution": distribution}
+        drawn["network"] = {"loss": 0.1, "delay": delay, "duplicate": 0.05, "reorder": 0.1, "corrupt": 0.02}
+    elif kind == "links":
+        drawn["network"] = {
+            "rate": draw.choice([2000, 20_000]),
+            "limit": 20,
+            "links": [{"from": 1, "to": 2, "loss": 0.8}],
+        }
+        drawn["schedule"] = [{"nemesis": draw.choice(["halves", "isolate", "flapping"]), "every_s": 60, "for_s": 30}]
+    elif kind == "security":
+        drawn["security"] = {"seal": draw.random() < 0.3}
+    elif kind == "channel":
+        preset = draw.choice(list(PRESETS))
+        drawn["network"] = {"channel": {"preset": preset}, "loss": draw.choice([0.0, 0.1])}
+        if preset.startswith("lora"):
+            drawn["settings"] = {"max_block_bytes": 150, "max_event_bytes": 100}
+    return Scenario.model_validate(drawn)
+
+
+def of_processes(number: int) -> Scenario:
+    """Return the scenario of a run whose agents run as processes: 2 to 6 agents, 300 mission seconds."""
+    draw = Random(f"processes {number}")
+    agents, lost = draw.randint(2, 6), draw.choice([0.0, 0.15, 0.3])
+    document: dict[str, Any] = {
+        "name": f"clean run {number} of processes",
+        "agents": agents,
+        "duration_s": 300,
+        "vehicles": {"kind": "none"},
+        "network": {"loss": lost, "duplicate": draw.choice([0.0, 0.1])},
+        "events": {"source": "random", "mean_s": 10},
+        "timeline": [*_partition(draw, agents, 300), *_death(draw, agents, 300)],
+        "final_reconcile": True,
+    }
+    if draw.random() < 0.2:
+        document["security"] = {}
+    elif draw.random() < 0.2:
+        document["network"] = {"channel": {"preset": "wifi_1"}}
+    return Scenario.model_validate(document)
+
+
+def judge(backend: BackendName, number: int) -> tuple[list[str], dict[str, str]]:
     """Return a sentence for each bad verdict, and all verdicts."""
-    result = simulate(scenario(number), number, tracing=True).result
-    bad = [f"{key}: {judgement.verdict}: {judgement.reason}" for key, judgement in result.judgements.items()]
+    with tempfile.TemporaryDirectory(prefix="clean-run-") as directory:
+        asked = varied(number) if backend == "sim" else of_processes(number)
+        result = run(asked, number, Path(directory, "run"), backend=backend).result
     verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}
-    return [sentence for key, sentence in zip(result.judgements, bad, strict=True) if key in result.bad], verdicts
+    bad = [f"{key}: {verdicts[key]}: {result.judgements[key].reason}" for key in verdicts if key in result.bad]
+    return bad, verdicts
 
 
 def say(sentence: str) -> None:
@@ -87,11 +142,19 @@ def say(sentence: str) -> None:
     sys.stdout.flush()
 
 
-def main(arguments: list[str]) -> int:
-    runs, first = (int(argument) for argument in [*arguments, *("10000", "1")[len(arguments) :]])
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=int, nargs="?", default=10_000)
+    parser.add_argument("--first", type=int, default=1, help="number of the first run")
+    parser.add_argument("--jobs", type=int, default=cores(), help="number of processes that play runs in virtual time")
+    parser.add_argument("--processes", action="store_true", help="agents run as processes, one run after the other")
+    asked = parser.parse_args()
+    backend: BackendName = "process" if asked.processes else "sim"
+    jobs = 1 if asked.processes else asked.jobs
     began, findings = time.monotonic(), 0
     counts: Counter[tuple[str, str]] = Counter()
-    with sweep(range(first, first + runs), judge, JOBS, what="runs" if sys.stderr.isatty() else None) as outcomes:
+    numbers = range(asked.first, asked.first + asked.runs)
+    with sweep(numbers, partial(judge, backend), jobs, what="runs" if sys.stderr.isatty() else None) as outcomes:
         for number, outcome in outcomes:
             if isinstance(outcome, FailedTask):
                 findings += 1
@@ -104,9 +167,9 @@ def main(arguments: list[str]) -> int:
                 say(f"run {number}: {sentence[:400]}")
     for (key, verdict), count in sorted(counts.items()):
         say(f"{key:9} {verdict:15} {count}")
-    say(f"{runs} runs in {time.monotonic() - began:.0f} s on {JOBS} processors: {findings} with a finding")
+    say(f"{asked.runs} runs in {time.monotonic() - began:.0f} s on {jobs} processors: {findings} with a finding")
     return 1 if findings else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())
