@@ -1,8 +1,8 @@
 """Read the files of a run or of a real flight. The files may be complete or damaged.
 
 Checker, report and all other commands read runs through this module. It reads each file once, at its first use.
-Unusable data is left out. `problems` has a sentence for each damaged or wrong file. `gaps` has a sentence for each
-missing file that a complete run would have.
+Unusable data is omitted. `problems` contains a sentence for each damaged or wrong file. `gaps` contains a sentence for
+each missing file that a complete run would have.
 """
 
 import os
@@ -49,19 +49,20 @@ if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
 
 LARGE_BYTES = 16 * 1024 * 1024
-"""If the traces together are larger, they are read without handler runs that only received a message, if the caller
-allows it."""
+"""Size of all traces of a run together, in bytes. Above it, handler runs that only received a message are not read, if
+the caller allows this.
+"""
 _AGENT_ID = re.compile("[1-9][0-9]{0,4}")
 
 ReportProgress = Callable[[str], None]
-"""A function that gets the current step of a long job in words, such as "reading trace 3 of 50"."""
+"""The type of a function that receives the current step of a long job as text, such as "reading trace 3 of 50"."""
 
 
 class RecordedRun(NamedTuple):
     """A handler run in a trace, together with its agent and its line.
 
-    `agent_id` is the agent. `life` is its incarnation, 1 until the first restart. `line` is the line in the trace, from
-    1.
+    `agent_id` is the agent. `life` is its incarnation, which is 1 until the first restart. `line` is the line number in
+    the trace, counted from 1.
     """
 
     agent_id: int
@@ -73,7 +74,8 @@ class RecordedRun(NamedTuple):
 class HeldBlock(NamedTuple):
     """A block that the agent `holder` holds in its `chain`, its `deque` or its reconcile `stack`.
 
-    `position` counts from 0, the oldest block of a chain first. The inception block is not counted.
+    `position` is the position of the block, counted from 0. In a chain, the oldest block has position 0, and the
+    inception block is not counted.
     """
 
     holder: int
@@ -85,12 +87,12 @@ class HeldBlock(NamedTuple):
 class RunArchive:
     """The files of a run: those in a run directory, in a directory of exports, or single export files.
 
-    Files are read at first use, and once. `directory` is the first directory with a record, else the first given
-    directory, else None. `exports` and `traces` have the readable files by agent. `problems` has a sentence for each
-    damaged file, and `gaps` one for each missing file. With `skim`, large traces are read without the handler runs that
-    only received a message. `keys` are public keys that the user trusts, in place of those in the directory.
-    `report_progress` receives a text before each long step of reading and judging. Raises RunDirectoryError if a path
-    does not exist, or is a directory with other content.
+    Each file is read once, at its first use. `directory` is the first directory with a run.json. If none has one, it is
+    the first given directory, or None. `exports` and `traces` contain the readable files by agent. `problems` contains
+    a sentence for each damaged file, and `gaps` one for each missing file. If `skim` is true, large traces are read
+    without the handler runs that only received a message. `keys` are public keys that the user trusts. They are used
+    instead of those in the directory. `report_progress` receives a text before each long step of reading and judging.
+    Raises RunDirectoryError if a path does not exist, or is a directory with other content.
     """
 
     def __init__(
@@ -121,7 +123,7 @@ class RunArchive:
 
     @property
     def record(self) -> RunRecord:
-        """The readable content of run.json. Missing or damaged parts of the file give empty fields."""
+        """The readable content of run.json. If a part of the file is missing or damaged, its field is empty."""
         return self._record_file.record if self._record_file else RunRecord()
 
     @property
@@ -131,7 +133,7 @@ class RunArchive:
 
     @property
     def record_error(self) -> RunDirectoryError | None:
-        """The error that prevents any reading of an existing run.json. It is None if there is no such error."""
+        """The error because of which no part of an existing run.json can be read. None without such an error."""
         return self._record_file.error if self._record_file else None
 
     @property
@@ -141,8 +143,8 @@ class RunArchive:
 
     @cached_property
     def origin(self) -> RunRecord:
-        """The content of the run.json that belongs to the exports. It is also found if only single files of the run
-        directory were given.
+        """The content of the run.json that belongs to the exports. It is found even if the user named only single files
+        of the run directory.
         """
         if self.directory is not None:
             return self.record
@@ -174,9 +176,7 @@ class RunArchive:
 
     @cached_property
     def before_final_reconcile(self) -> dict[int, Export]:
-        """The chain exports by agent, from before the final reconcile. They are empty if there was no final
-        reconcile.
-        """
+        """The chain exports from before the final reconcile, by agent. Empty if the run had no final reconcile."""
         return self._before_final_reconcile.by_agent
 
     @cached_property
@@ -197,7 +197,7 @@ class RunArchive:
     def handler_runs(self) -> Iterator[RecordedRun]:
         """Yield every handler run, trace by trace, in order of agent IDs.
 
-        The function reads traces line by line and does not keep them. Memory therefore stays small for traces of any
+        The method reads traces line by line and does not store them, so it needs little memory for traces of any
         length. Raises RunDirectoryError at the first damaged line. `traces` has the lines before it.
         """
         for path in self._trace_files:
@@ -217,7 +217,7 @@ class RunArchive:
 
     @cached_property
     def epoch_us(self) -> int | None:
-        """The timestamp of mission second 0 that most trace headers contain. It is None if no header can be read."""
+        """The timestamp of mission second 0 in most of the trace headers. None if no header can be read."""
         epochs = Counter(
             epoch for path in self._trace_files if type(epoch := read_clock(path).get("epoch_us")) is int
         ).most_common(1)
@@ -236,7 +236,7 @@ class RunArchive:
 
     @property
     def _never_began(self) -> bool:
-        """True if the mission may have ended before its first second."""
+        """True if the mission may have ended before mission second 0."""
         return self.record.outcome in ("not supported", "failed")
 
     @cached_property
@@ -277,7 +277,7 @@ class RunArchive:
 
     @cached_property
     def public_keys(self) -> "PublicKeys | None":
-        """The public keys of a secured mission. They are None if the files contain none or if they cannot be used."""
+        """The public keys of a secured mission. None if the files contain no usable keys."""
         return self._public_keys[0]
 
     @cached_property
@@ -306,7 +306,7 @@ class RunArchive:
     @property
     def anchor(self) -> str | None:
         """The source that confirms the public keys: `--keys` for keys that the user gave, or run.json if it contains
-        their fingerprint. It is None without such a source.
+        their fingerprint. None without such a source.
         """
         if self._trusted_keys is not None:
             return "--keys"
@@ -331,9 +331,7 @@ class RunArchive:
     # Network, vehicles and the rogue node
 
     def network(self, vehicles: Collection[int]) -> Connectivity:
-        """Return which vehicles could reach each other at each time. The result is empty if the network was not
-        recorded.
-        """
+        """Return the connections between vehicles at each time. The result is empty if the network was not recorded."""
         return read_connectivity(self._in_directory(NETWORK_FILE), vehicles)
 
     def link_losses(self, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
@@ -378,7 +376,7 @@ class RunArchive:
 
     @property
     def gaps(self) -> list[str]:
-        """A sentence for each file of a complete run that is missing or cut off."""
+        """A sentence for each file of a complete run that is missing or truncated."""
         return [*self._read_traces[2], *self._missing()]
 
     def _missing(self) -> Iterator[str]:

@@ -1,8 +1,8 @@
 """Read files of unknown origin with a size limit: whole files, or JSON Lines one line at a time.
 
 Records may come from other people and other machines. A file may be damaged, compressed, endless or not a regular file.
-Readers in this package therefore limit the bytes they read, and report a problem as a sentence in place of an
-exception.
+Readers in this package therefore limit the number of bytes that they read, and report a problem as a sentence instead
+of an exception.
 """
 
 import io
@@ -25,7 +25,7 @@ _CHUNK_BYTES = 256 * 1024
 class BoundedFile(io.BufferedReader):
     """The content of a file as a binary stream. If the file is gzip data, it is decompressed.
 
-    `problem` is empty, or says why the content ends early. It is known after the stream was read to its end.
+    `problem` is the reason why the content ends early, or empty. It is known after the stream was read to its end.
     """
 
     def __init__(self, path: Path, most_bytes: int = MAX_BYTES) -> None:
@@ -108,10 +108,12 @@ def _unpacker() -> Any:
 
 MAX_LINES = 50_000
 MAX_LINES_BYTES = 32 * 1024 * 1024
-"""Maximum size of a JSON Lines file. The tracks of 50 vehicles take 1.6 MB for a mission of 20 minutes."""
+"""Maximum size of a JSON Lines file in bytes. The tracks of 50 vehicles take 1.6 MB for a mission of 20 minutes."""
 MAX_LINE_BYTES = 4 * 1024 * 1024
 MAX_LINE_WEIGHT = 200_000
-"""Maximum weight of a line. The conditions of 10,000 links weigh half of it."""
+"""Maximum weight of a line (see `ucp.plain_file`). A line with the conditions of 10,000 links has half of this
+weight.
+"""
 
 Record = TypeVar("Record", bound=BaseModel)
 
@@ -119,7 +121,7 @@ Record = TypeVar("Record", bound=BaseModel)
 class JsonLines(Generic[Record]):
     """The lines of a JSON Lines file that are valid for the type `model`.
 
-    A missing file, or None as the path, has no lines. Lines that are not valid are skipped and counted.
+    If the file is missing or the path is None, there are no lines. Invalid lines are skipped and counted.
     """
 
     def __init__(self, path: Path | None, model: type[Record]) -> None:

@@ -12,8 +12,8 @@ Reason = Annotated[str, Field(max_length=20)]
 
 
 class ChannelLine(BaseModel):
-    """The receivers and losses of one message. The sequence number `sequence` is None for a datagram that is not a
-    message of the vehicle's agent.
+    """A line about one message: its receivers and losses. `sequence` is its sequence number, or None for a datagram
+    that is not a message of the vehicle's agent.
     """
 
     model_config = ConfigDict(strict=True)
@@ -23,4 +23,4 @@ class ChannelLine(BaseModel):
     lost: dict[Reason, list[int]] = {}
     """Reason -> vehicles that lost the message."""
     dropped: Reason | None = None
-    """The reason for which the radio did not send the message, or None."""
+    """The reason why the radio did not send the message. None if it was sent."""

@@ -1,9 +1,9 @@
 """Find out which vehicles were connected at each time, from the network changes in `network.jsonl`.
 
 A link joins two vehicles that receive each other directly. A pair that loses all messages has no link. Two kinds of
-change are recorded. A change in the scenario is recorded as the network conditions that it requests. A change through
-flight is recorded as the radio losses of the pairs that changed. A pair has no link while either of the two causes a
-total loss.
+changes are recorded. For a change in the scenario, the record contains the requested network conditions. For a change
+by the movement of vehicles, the record contains the changed radio losses of pairs. A pair has no link while either of
+these causes a loss of 1.
 """
 
 from bisect import bisect_right
@@ -36,7 +36,7 @@ Components = tuple[frozenset[int], ...]
 class Topology:
     """The groups of connected living vehicles from mission second `at_s` on. The largest group is the first element.
 
-    `what` names the change that caused them.
+    `what` names the change after which the groups exist.
     """
 
     at_s: float
@@ -57,11 +57,11 @@ class LossRates:
 
 
 QUALITY_LIMITS = (0.05, 0.25, 0.6, 1.0)
-"""Limits between the grades of link quality. Grade 0 has a loss below the first limit. Grade 4 is a loss of 1."""
+"""Limits between the grades of link quality. In grade 0, the loss is below the first limit. In grade 4, it is 1."""
 
 
 SAME_LOSS = 0.05
-"""Smaller changes of a pair's loss are not recorded."""
+"""Smallest change of a pair's loss rate that is stored."""
 
 
 def quality(loss: float) -> int:
@@ -77,7 +77,7 @@ def _differs(loss: float, before: float) -> bool:
 class Connectivity:
     """The connections and losses of the network over mission time. All lists are empty if the network was not recorded.
 
-    Consecutive states differ.
+    Two consecutive states in a list are different.
     """
 
     vehicles: tuple[int, ...]
@@ -85,16 +85,17 @@ class Connectivity:
     losses: list[LossRates]
     """The losses over time, rounded to a tenth of a per cent. Consecutive entries differ."""
     reboots: list[tuple[float, int]]
-    """Mission second and agent ID of each stop of an agent whose vehicle flew on."""
+    """Mission second and agent ID of each stop of an agent whose vehicle continued its flight."""
     problems: list[str]
     pair_losses: dict[Pair, list[tuple[float, float]]]
-    """The mission seconds at which the loss of each pair changed, with the new loss, which is the mean of both
-    directions. Changes below SAME_LOSS are left out, unless the grade changes. 1.0 means no link, or a lost vehicle.
+    """Pair -> the mission seconds at which its loss rate changed, with the new loss rate, which is the mean of both
+    directions. Changes below SAME_LOSS are omitted, unless the grade changes. A loss rate of 1.0 means that the pair
+    has no link or that a vehicle is lost.
     """
     _cut: dict[Pair, list[float]]
-    """The times at which each pair lost its link, got it back, lost it again, and so on."""
+    """Pair -> the times at which it lost its link, got it back, lost it again, and so on."""
     _lost: dict[int, list[float]]
-    """The times at which each vehicle was lost, replaced, lost again, and so on."""
+    """Vehicle -> the times at which it was lost, replaced, lost again, and so on."""
 
     def links(self, at_s: float) -> list[Pair]:
         """Return the links between living vehicles at mission second `at_s`."""
@@ -102,18 +103,16 @@ class Connectivity:
         return [pair for pair in combinations(living, 2) if not _is_on(self._cut.get(pair, ()), at_s)]
 
     def loss(self, pair: Pair, at_s: float) -> float:
-        """Return the loss rate between two vehicles at mission second `at_s`, with the meaning that it has in
-        `pair_losses`.
-        """
+        """Return the loss rate between two vehicles at mission second `at_s`, as defined for `pair_losses`."""
         losses = self.pair_losses.get(pair, [])
         at = bisect_right(losses, at_s, key=itemgetter(0))
         return losses[at - 1][1] if at else 1.0
 
     def airborne_intervals(self, vehicle: int, end_s: float) -> list[tuple[float, float, bool]]:
-        """Return the intervals in which the vehicle flew. An interval is (start, end, true if the vehicle was lost at
-        the end).
+        """Return the intervals during which the vehicle was part of the swarm. An interval is (start, end, true if the
+        vehicle was lost at the end).
 
-        They end at `end_s` at the latest.
+        No interval ends after `end_s`.
         """
         times = [at_s for at_s in self._lost.get(vehicle, ()) if at_s <= end_s]
         ends = [0.0, *times, *([end_s] if len(times) % 2 == 0 else [])]
@@ -133,7 +132,7 @@ class NetworkLine(BaseModel):
 
 
 class NetworkReplay:
-    """The state of the network after each line of its record. `apply` must be called with the lines in order."""
+    """The state of the network after each recorded change. The caller must call `apply` with the lines in order."""
 
     def __init__(self, vehicles: Collection[int]) -> None:
         self.vehicles = tuple(sorted(vehicles))
@@ -142,8 +141,9 @@ class NetworkReplay:
         self._out_of_range: set[Pair] = set()
         self._cut_off: set[Pair] = set()
         self._scripted: dict[Pair, tuple[float, float]] = {}
-        """The losses that the scenario requests for each pair, lower to higher ID and back. Radio losses come on
-        top."""
+        """The losses that the scenario requests for each pair: from the lower to the higher ID, and back. Radio losses
+        are added to them.
+        """
         self._radio_losses: dict[Pair, float] = {}
 
     @property
@@ -177,7 +177,7 @@ class NetworkReplay:
         return LossRates(at_s, round(mean, 3), round(max(lost, default=0.0), 3))
 
     def by_link(self) -> dict[Link, float]:
-        """Return the current loss rate of each link in each direction. The rate is 1.0 if no message passes."""
+        """Return the current loss rate of each link in each direction. It is 1.0 if no message arrives."""
         losses: dict[Link, float] = {}
         for low, high in self._scripted:
             there, back = (1.0, 1.0) if self.lost & {low, high} else self._directions((low, high))
@@ -191,7 +191,7 @@ class NetworkReplay:
         return self._directions(pair) if self._is_up(pair) else (1.0, 1.0)
 
     def by_pair(self) -> dict[Pair, float]:
-        """Return the current loss rate between each two vehicles, as the mean of both directions. Without a link, the
+        """Return the current loss rate of each pair of vehicles, as the mean of both directions. Without a link, the
         loss rate is 1.0.
         """
         return {pair: sum(self._directions(pair)) / 2 if self._is_up(pair) else 1.0 for pair in self._scripted}
@@ -233,8 +233,8 @@ def _loss(link: LinkConditions) -> float:
 
 
 def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectivity:
-    """Read which vehicles were connected at each time. Invalid lines, and lines before the first conditions, are left
-    out.
+    """Read the connections between vehicles at each time. Invalid lines, and lines before the first conditions, are
+    omitted.
     """
     lines = JsonLines(path, NetworkLine)
     network = NetworkReplay(vehicles)
@@ -277,7 +277,7 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
     entry the links whose loss rate changed.
 
     The loss is 1 for a link that is partitioned, out of radio range, or belongs to a lost vehicle. Invalid lines are
-    left out.
+    omitted.
     """
     network = NetworkReplay(vehicles)
     before: dict[Link, float] = {}
@@ -297,8 +297,8 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
 
 
 def _append_state(states: list[Topology], state: Topology) -> None:
-    """Append the state of the network if it differs from the last one in the list. A last state of the same mission
-    second is replaced.
+    """Append the state of the network if it differs from the last one in the list. If the last state has the same
+    mission second, replace it.
     """
     if states and states[-1].at_s == state.at_s:
         states.pop()

@@ -99,9 +99,10 @@ class RunDirectory:
             shutil.copyfile(export, self.agents / export.name)
 
     def append_trace(self, agent_id: int, directory: Path, copied_bytes: int = 0) -> int:
-        """Append the new part of a restarted agent's trace to its whole trace. Return the size of this part in bytes.
+        """Append the new part of the current incarnation's trace to the complete trace of the agent. Return the size of
+        this part in bytes.
 
-        `copied_bytes` is the size of the part that was appended before. An incomplete last line is left out: the agent
+        `copied_bytes` is the size of the part that was appended before. An incomplete last line is omitted. The agent
         was killed while it wrote the line, or is still writing it.
         """
         later = directory / f"{agent_id}{TRACE_SUFFIX}"
@@ -183,7 +184,7 @@ def claim(directory: Path, *inner: Path) -> None:
 
 
 def default_path(name: str) -> Path:
-    """Return the path `runs/<name of the scenario>-<local time>`. If it exists, a number is appended."""
+    """Return the path `runs/<name of the scenario>-<local time>`. If this path exists, a number is appended."""
     words = "".join(character if character.isalnum() else " " for character in name).split()
     base = RUNS / f"{'_'.join(words).lower()[:60] or 'run'}-{time.strftime('%Y%m%d-%H%M%S')}"
     candidate, number = base, 2

@@ -1,6 +1,6 @@
 """Decode the event data of blocks, and decrypt them if the key is known.
 
-A secured mission may seal event data: the agents encrypt it for the depot, and only the depot's key opens it.
+In a secured mission, agents may encrypt event data for the depot. Only the depot's key decrypts them.
 """
 
 from collections.abc import Iterable
@@ -40,7 +40,8 @@ class EventData:
     def of(cls, exports: Iterable[Export], depot: "Depot | None" = None) -> "EventData":
         """Return the decoder for the mission of these exports.
 
-        Raises ExportError if `depot` is given, and the mission seals its data for another depot or not at all.
+        Raises ExportError if `depot` is given, but the mission encrypts its data for another depot or does not encrypt
+        them.
         """
         inception = next((export.inception.data for export in exports), b"")
         key = sealed_to(inception)

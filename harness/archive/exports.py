@@ -1,8 +1,8 @@
 """Read chain exports (`ucp-chain-export/1`) of a run or a real flight, and name their blocks.
 
 Exports from the field may be truncated, edited, duplicated or from another mission. Each unusable file gets one
-sentence, and the other files are read. This module validates only the format. Whether the hashes recompute is
-characteristic 4, which the checker decides.
+sentence, and the other files are read. This module validates only the format. The checker verifies the hashes
+(characteristic 4).
 """
 
 import base64
@@ -26,11 +26,11 @@ from ucp.state import AgentState
 RUN_FILE = "run.json"
 SUFFIX = ".chain.json"
 BEFORE_FINAL_RECONCILE = "before_final_reconcile"
-"""Directory in a run directory with the exports from before the final reconcile."""
+"""Name of the directory in a run directory that contains the exports from before the final reconcile."""
 MAX_EXPORT_BYTES = 32 * 1024 * 1024
-"""Maximum size of an export, about 17,000 blocks."""
+"""Maximum size of an export in bytes. It corresponds to about 17,000 blocks."""
 MAX_ERRORS = 20_000
-"""Maximum number of errors in a file that are described. Their description takes a kilobyte each."""
+"""Maximum number of errors in a file that are described. Each description takes a kilobyte."""
 
 MAX_SIGNATURE = 4 * (64 // 3 + 1)
 """Length of 64 bytes in base64, in characters."""
@@ -52,9 +52,9 @@ EncodedEventData = Annotated[Base64, Field(max_length=4 * (MAX_EVENT_DATA_BYTES 
 
 
 class ExportedBlock(BaseModel):
-    """An exported block. `chain_hash` is null outside the chain.
+    """An exported block. `chain_hash` is null if the block is not in the chain.
 
-    `signature` is made by the block's agent, in a secured mission only.
+    `signature` exists only in a secured mission. The agent that completed the block made it.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -105,7 +105,7 @@ class ExportedHead(BaseModel):
     mission: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
     boot: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
     number: Annotated[int, Field(ge=1, lt=2**32, strict=True)]
-    """The number of the export in this incarnation."""
+    """The number of the export in this incarnation, counted from 1."""
     height: Annotated[int, Field(ge=0, lt=2**32, strict=True)]
     top_chain_hash: Hash
     completed: Hash
@@ -113,7 +113,7 @@ class ExportedHead(BaseModel):
     held: Hash
     """Digest of deque, reconcile stack, current block and flags."""
     revoked: Annotated[list[AgentId], Field(max_length=MAX_AGENT_ID)]
-    """The agents whose revocation the agent knew, ascending."""
+    """The agents whose revocation this agent knew, in ascending order."""
     signature: Annotated[Base64, Field(max_length=MAX_SIGNATURE)]
 
 
@@ -134,7 +134,7 @@ class Export(BaseModel):
     idle: bool
     completed: list[Hash]
     head: Annotated[ExportedHead | None, Field(exclude_if=lambda head: head is None)] = None
-    """The signed head, in a secured mission only."""
+    """The signed head of the export. It exists only in a secured mission."""
 
     @property
     def top_chain_hash(self) -> str:
@@ -178,8 +178,8 @@ class ExportMaker:
         signatures: Mapping[bytes, bytes] | None = None,
         head: Mapping[str, Any] | None = None,
     ) -> Export:
-        """Return the export of an agent. It equals the one that `read_export` reads from a file. `head` is the signed
-        head of a secured agent.
+        """Return the export of an agent. It equals the export that `read_export` would read from a file. `head` is the
+        signed head of a secured agent.
         """
         inception, signed = state.chain.inception, signatures or {}
         return Export.model_construct(
@@ -253,8 +253,8 @@ def parse_export(path: Path, document: Any) -> Export:
 def read_exports(paths: Iterable[Path]) -> Exports:
     """Read the exports of one mission. In the result, `errors` contains a sentence for each unusable file.
 
-    If the exports belong to several missions, the mission with the most exports is used, or that of the first file if
-    several have the most. Of two different exports of one agent, the later one is used.
+    If the exports belong to several missions, the mission with the most exports is used. If several missions have the
+    most, the mission of the first file is used. If an agent has two different exports, the later one is used.
     """
     exports = Exports()
     read: list[tuple[Path, Export]] = []
@@ -307,10 +307,11 @@ def agents_directory(directory: Path) -> Path:
 
 
 def export_files(paths: Iterable[Path]) -> list[Path]:
-    """Return the exports in run directories and directories of exports, and the files among `paths`.
+    """Return the export files at `paths`: the paths that are files, and the exports in run directories and directories
+    of exports.
 
-    A run directory or a directory of traces may have no exports. Raises RunDirectoryError if a path does not exist, or
-    is a directory of other files.
+    A run directory or a directory of traces may contain no exports. Raises RunDirectoryError if a path does not exist,
+    or is a directory with other files.
     """
     files: list[Path] = []
     for path in paths:
@@ -342,8 +343,8 @@ def _first_problem(error: ValidationError) -> str:
 def name_blocks(exports: Mapping[int, Export]) -> dict[str, str]:
     """Return the name of every block, by block hash. For example, `4.11` is the 11th block that agent 4 completed.
 
-    If the export of an agent is missing, because the agent was killed, the order of its blocks follows from their
-    timestamps in the exports of other agents.
+    If an agent was killed and left no export, its blocks are ordered by their timestamps in the exports of other
+    agents.
     """
     completed: dict[int, dict[str, int]] = {
         agent_id: dict.fromkeys(export.completed, 0) for agent_id, export in exports.items()

@@ -18,7 +18,7 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 LATEST_S = 1e7
-"""Handler runs with a later mission second are left out, because no mission is that long."""
+"""Latest possible mission second. Handler runs with a later time are omitted, because no mission is that long."""
 
 PhaseName = Literal["phase 1", "phase 2", "phase 3", "finalize"]
 PHASES: dict[str, PhaseName] = {
@@ -27,7 +27,7 @@ PHASES: dict[str, PhaseName] = {
     "reconcile_phase_3": "phase 3",
     "reconcile_finalize": "finalize",
 }
-"""The phase that each handler begins."""
+"""Handler -> the phase of a reconcile that it begins."""
 
 CUT_SHORT = "cut short"
 COMMITTED_BY = {
@@ -37,12 +37,12 @@ COMMITTED_BY = {
     "receive_response_block_for_hash": "fetched",
     "reconcile_finalize": "put back",
 }
-"""The source of the block that each handler committed, as shown in reports."""
+"""Handler -> the origin of the block that it commits, as reports show it."""
 REASONS = {
     "vote_timer_expiration": "vote not approved",
     "receive_request_next_in_sequence": "chain diverged",
 }
-"""The reason why each handler began a reconcile."""
+"""Handler -> the reason why it begins a reconcile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class AgentVote:
 
 @dataclass(frozen=True, slots=True)
 class ReconcilePhase:
-    """A phase of a reconcile, with the number of its rounds."""
+    """A phase of a reconcile, with the number of rounds in it."""
 
     name: PhaseName
     start_s: float
@@ -73,7 +73,7 @@ class ReconcilePhase:
 class AgentReconcile:
     """A reconcile of an agent, with times in mission seconds.
 
-    `phases` follow each other without a gap. `done` is false if the reconcile was cut short.
+    The `phases` follow each other without a gap. `done` is false if the reconcile was interrupted.
     """
 
     agent: int
@@ -86,7 +86,7 @@ class AgentReconcile:
 
 @dataclass(frozen=True, slots=True)
 class BlockCommit:
-    """The appending of a block to a chain. `how` is one of the values of COMMITTED_BY."""
+    """A block was appended to a chain. `how` is one of the values of COMMITTED_BY."""
 
     agent: int
     at_s: float
@@ -97,7 +97,7 @@ class BlockCommit:
 @dataclass(frozen=True, slots=True)
 class Phase2Tie:
     """A tie at the end of reconcile phase 2, in which several answers have the same highest number of votes. `branch`
-    is the branch that the handler took.
+    is the branch that the handler of Algorithm 15 took.
     """
 
     agent: int
@@ -124,8 +124,8 @@ HistoryEvent = ActivityStart | AgentVote | AgentReconcile | Phase2Tie | BlockCom
 class BroadcastMessage:
     """A broadcast message with its receivers.
 
-    `seq` is the sequence number of its sender. `receipts` has the agent and the mission second of each handler run that
-    the broadcast triggered.
+    `seq` is its sequence number. `receipts` contains the agent and the mission second of each handler run that the
+    message triggered.
     """
 
     sender: int
@@ -138,7 +138,9 @@ class BroadcastMessage:
 
 @dataclass(frozen=True, slots=True)
 class MissionHistory:
-    """The history of all agents, by agent and in order of time. `messages` is None if they were not requested."""
+    """The history of all agents, by agent and in order of time. `messages` is None if the caller did not request
+    messages.
+    """
 
     votes: list[AgentVote]
     reconciles: list[AgentReconcile]
@@ -154,7 +156,7 @@ def has_possible_time(run: HandlerRun) -> bool:
 
 def incarnations(trace: Trace) -> list[list[HandlerRun]]:
     """Return the handler runs of each incarnation of an agent (the time between two restarts). Runs with an impossible
-    time are left out.
+    time are omitted.
     """
     return [[run for _, run in runs if has_possible_time(run)] for runs in trace.incarnations()]
 
@@ -162,7 +164,7 @@ def incarnations(trace: Trace) -> list[list[HandlerRun]]:
 def history_of(
     traces: Mapping[int, Trace], faults: Iterable[FaultRecord], end_s: float, *, whole: bool = True
 ) -> MissionHistory:
-    """Return the history of a run that ended at mission second `end_s`. If `whole` is false, messages are left out."""
+    """Return the history of a run that ended at mission second `end_s`. If `whole` is false, messages are omitted."""
     ends: dict[int, list[float]] = defaultdict(list)
     for fault in faults:
         if fault.kind.ends_incarnation:
@@ -270,8 +272,8 @@ class HistoryReader:
 def _messages(traces: Mapping[int, Trace]) -> list[BroadcastMessage]:
     """Return all messages with their receivers.
 
-    Sequence numbers begin again with each incarnation. A receipt therefore belongs to the latest message with its
-    number that was sent before it.
+    Sequence numbers begin again with each incarnation. A receipt therefore belongs to the latest earlier message with
+    its sequence number.
     """
     sent: dict[tuple[object, object], list[BroadcastMessage]] = defaultdict(list)
     for agent, trace in sorted(traces.items()):

@@ -1,5 +1,5 @@
-"""Read `lag.jsonl`, which contains how late the machine woke up programs during a run, and how busy the processes of
-each agent were.
+"""Read `lag.jsonl`. It contains the measured delays with which the machine woke programs during a run, and the load of
+each agent's processes.
 
 `harness/play/process/_lag_probe.py` writes this file.
 """
@@ -20,9 +20,9 @@ class LagLine(BaseModel):
     """A line of `lag.jsonl` about the mission seconds `from_s` to `until_s`. The measured times are in seconds of wall
     time.
 
-    `machine_s` is how late the machine woke a program, at most, and how long programs waited for a disk or the
-    hypervisor. `busy_s` is how long the processes of an agent ran, or waited for a processor. An agent without
-    processes is missing.
+    `machine_s` is the greatest delay with which the machine woke a program, plus the time that programs waited for a
+    disk or the hypervisor. `busy_s` is, for each agent, the time during which its processes ran or waited for a
+    processor. Agents without processes are not included.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -41,8 +41,8 @@ class MeasuredLag:
         self._ends = [line.until_s for line in self._lines]
 
     def explains(self, agent_id: int, from_s: float, until_s: float) -> float | None:
-        """Return the measured delay of a timer, in seconds of wall time. The timer expired at `from_s`, and its handler
-        ran at `until_s`.
+        """Return the measured delay of a timer that expired at `from_s` and whose handler ran at `until_s`, in seconds
+        of wall time.
 
         Return None if the delays of the agent were not measured all the time.
         """

@@ -1,8 +1,8 @@
 """Read run.json in any condition: complete, truncated, modified, or of another version.
 
-Invalid parts are removed, each as small as possible, until the rest is valid. A list loses only its invalid entries. An
-entry without a required key is removed as a whole. Rejecting the whole file instead would lose the record of every
-killed run.
+The module removes the smallest invalid parts until the rest is valid. It removes only the invalid entries of a list. It
+removes an entry completely if a required key is missing. If it rejected the whole file instead, the record of every
+killed run would be lost.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,21 +24,23 @@ Place = tuple[dict[Any, Any] | list[Any], Any]
 """A part of a document: the object or list that contains it, and its key or index there."""
 
 MAX_ROUNDS = 100
-"""Maximum number of validations. Each one removes the invalid parts that it finds. Documents are not nested deeper."""
+"""Maximum number of validations. Each validation removes the invalid parts that it finds, and the depth of a document
+limits their number.
+"""
 MAX_NAME = 80
 UNKNOWN_KEY = "extra_forbidden"
 LONE_SURROGATE = "string_unicode"
 MISSING = "missing"
 MODEL_TYPE = "model_type"
-"""Error types of pydantic."""
+"""The error type with which pydantic reports a value that is no object."""
 NOT_AN_OBJECT = "input should be an object"
 
 
 @dataclass(frozen=True)
 class InvalidPart:
-    """An invalid part of run.json, with the number of further invalid parts below the same top-level key.
+    """The invalid parts of run.json below one top-level key.
 
-    `where` and `what` describe the first one, and `more` counts the others.
+    `where` and `what` describe the first of them. `more` is the number of the others.
     """
 
     key: str
@@ -56,7 +58,7 @@ def validate_leniently(model: type[Model], document: dict[str, Any]) -> tuple[Mo
     removed.
 
     All keys of the model must have defaults. Unknown keys are ignored. A lone surrogate in a text becomes a question
-    mark. `document` is changed. Raises ValueError if it has more than MAX_ERRORS errors.
+    mark. The function changes `document`. Raises ValueError if the document has more than MAX_ERRORS errors.
     """
     invalid_parts: dict[str, InvalidPart] = {}
     for _ in range(MAX_ROUNDS):
@@ -90,7 +92,7 @@ def _by_key(document: dict[str, Any], errors: Sequence[ErrorDetails]) -> Iterato
 def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, list[int | str]]:
     """Return the innermost part of the document that contains an error, and the path to this part.
 
-    `loc` may have further steps, which name the types that pydantic tried. They are left out of the path.
+    `loc` may contain additional elements, which name the types that pydantic tried. The path omits them.
     """
     place: Place = document, loc[0]
     value: Any = document
@@ -113,9 +115,7 @@ def _repair(place: Place, problem: ErrorDetails) -> bool:
 
 
 def _remove(places: Sequence[Place]) -> None:
-    """Remove parts of a document. Elements of the same list are removed in one step, so that their indices
-    stay valid.
-    """
+    """Remove parts of a document. Elements of the same list are removed together, so that their indices stay valid."""
     lists: dict[int, tuple[list[Any], set[int]]] = {}
     for holder, key in places:
         if isinstance(holder, dict):
@@ -128,29 +128,31 @@ def _remove(places: Sequence[Place]) -> None:
 
 MAX_BYTES = 40 * 1024 * 1024
 MAX_WEIGHT = 2_000_000
-"""Maximum weight of a record, with up to 100,000 scripted fates of a scenario."""
+"""Maximum weight of a run record (see `ucp.plain_file`). A record with 100,000 scripted fates stays below it."""
 
 
 class DamagedRecordError(RunDirectoryError):
-    """An error: the file run.json is missing, truncated or modified."""
+    """An error: the file run.json is missing, truncated or was modified."""
 
 
 @dataclass(frozen=True)
 class RecordFile:
-    """The content of a file run.json. `record` is its valid part, and `problems` describes its invalid parts."""
+    """The content of a run.json. `record` is its valid part, and `problems` describes its invalid parts."""
 
     record: RunRecord = field(default_factory=RunRecord)
     judged: JudgedRecord | None = None
-    """The record if all keys that the checker needs are valid, else None. Half of them would give wrong verdicts."""
+    """The part that the checker needs. It is None if one of its keys is invalid, because verdicts on incomplete data
+    would be wrong.
+    """
     problems: list[str] = field(default_factory=list)
     error: RunDirectoryError | None = None
-    """The reason why no part of the file can be used, else None."""
+    """The reason why no part of the file can be used. None if a part can be used."""
 
 
 def read_record(path: Path) -> RecordFile:
     """Read the file run.json at `path`. If no part of it can be used, the result has an `error`.
 
-    The error is a DamagedRecordError, unless the file is intact and has another schema.
+    The error is a DamagedRecordError, unless the file is intact but has a different schema.
     """
     try:
         return _read(path)
@@ -193,7 +195,7 @@ _SCRIPTS = ("fates", "datagrams")
 
 
 def _exceeds(document: Any, most: int) -> bool:
-    """Return true if a document has more than `most` values, without the scripted messages of its scenario.
+    """Return true if a document has more than `most` values, not counting the scripted messages of its scenario.
 
     The scripts are not counted, because their validation ends at the first error.
     """

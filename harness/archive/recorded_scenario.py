@@ -1,4 +1,4 @@
-"""Find the scenario to play: in a scenario file, or in the records of a run directory."""
+"""Find the scenario to play, in a scenario file or in the record of a run directory."""
 
 from pathlib import Path
 

@@ -1,8 +1,8 @@
-"""Compute from traces how the mission data spread over the agents. The result contains the agents' chains at each
+"""Compute from traces how the mission data spread over the agents. The result describes the agents' chains at each
 mission second.
 
-The checker computes the same figures (`harness.checker._figures`) for the end of a run. Only chains of living agents
-count. Copies are counted in these chains, for each completed block.
+The checker computes the same numeric results (`harness.checker._figures`) for the end of a run. Only the chains of
+living agents count. The copies of each completed block are counted in these chains.
 """
 
 from collections import Counter
@@ -17,10 +17,10 @@ from ucp.trace import HandlerRun
 
 @dataclass(frozen=True, slots=True)
 class ReplicationFigures:
-    """The numbers that hold from mission second `at_s` on: chain lengths in blocks, the number of different chains, and
-    the number of copies of blocks.
+    """The numbers from mission second `at_s` until the next change: chain lengths in blocks, the number of different
+    chains, and the number of copies of blocks.
 
-    Copies are None until an agent completes a block.
+    The numbers of copies are None until an agent completes a block.
     """
 
     at_s: float
@@ -32,7 +32,7 @@ class ReplicationFigures:
 
 
 def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -> list[ReplicationFigures]:
-    """Return the replication of the blocks at mission second 0 and after each change."""
+    """Return the numbers of copies and chains at mission second 0 and after each change."""
     steps: list[tuple[float, int, int, FaultRecord | HandlerRun]] = []
     for fault in faults:
         steps += [(fault.at_s, 0, agent, fault) for agent in fault.agents or () if agent in traces]
@@ -59,8 +59,8 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -
 class _LivingChains:
     """The chains of the living agents, with counts of the blocks in them.
 
-    Each chain is a path of prefix numbers. Equal prefixes of different chains have the same number, so a common prefix
-    is found by comparing one number.
+    Each beginning of a chain (prefix) has a number, and equal prefixes of different chains have the same number. A
+    common prefix is therefore found by comparing numbers.
     """
 
     def __init__(self, agents: Iterable[int]) -> None:

@@ -1,4 +1,4 @@
-"""List the run directories in a folder. The newest is first."""
+"""List the run directories in a folder. The newest run is first."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from harness.archive.run_record import RunRecord
 from harness.errors import RunDirectoryError
 
 RUNS = Path("runs")
-"""Folder of runs that were started without --out."""
+"""Name of the folder for runs that were started without --out."""
 
 
 @dataclass(frozen=True)
 class PastRun:
-    """A run directory with its record. `problem` is the reason why the record cannot be read. It is None if the record
-    can be read.
+    """A run directory with its record. `problem` is the reason why the record cannot be read. It is None for a readable
+    record.
     """
 
     path: Path
@@ -30,10 +30,9 @@ class PastRun:
 
 
 def past_runs(folder: Path, most: int) -> Iterator[PastRun]:
-    """Yield the runs in `folder` whose run.json was written last. The newest run is first, and there are at most `most`
-    runs.
+    """Yield the runs in `folder` whose run.json was written last, at most `most` of them. The newest run is first.
 
-    Raises RunDirectoryError if it is no folder.
+    Raises RunDirectoryError if `folder` is not a folder.
     """
     try:
         written = [(path.stat().st_mtime_ns, path) for path in folder.glob(f"*/{RUN_FILE}")]

@@ -1,7 +1,7 @@
 """Define run.json, the record of one run (`ucp-run/1`). Later versions may add keys, but never remove or rename one.
 
-The harness writes the whole record. A record that it reads may come from a killed run or another version, or may be
-edited. Therefore each key of a `RunRecord` has a default that means unknown.
+The harness writes complete records. A record that it reads may come from a killed run or another version, or may be
+edited. Each key of a `RunRecord` therefore has a default that stands for an unknown value.
 """
 
 from collections import Counter
@@ -20,9 +20,11 @@ from harness.scenario.verdict_names import FURTHER_CHECKS, CharacteristicVerdict
 SCHEMA = "ucp-run/1"
 
 ENOUGH_ANSWERS = 20
-"""Minimum number of answers for a statement about their times."""
+"""Minimum number of answers from which statements about their times are made."""
 TOLERATED_LATENESS_S = 0.05
-"""Mission seconds. Without a channel, virtual time delivers messages after 2 to 50 ms."""
+"""Mission seconds by which deliveries on a shared channel may be late. Without a channel, virtual time delivers
+messages after 2 to 50 ms.
+"""
 
 
 AgentKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,4}$")]
@@ -41,7 +43,7 @@ class FindingRecord(_RecordModel):
     block: str | None
     block_hash: str | None
     handler: str | None = None
-    """The event handler that the evidence concerns. null if it concerns none."""
+    """The event handler that the evidence concerns. null if it concerns no handler."""
 
 
 class CharacteristicRecord(_RecordModel):
@@ -54,7 +56,7 @@ class CharacteristicRecord(_RecordModel):
 
 
 class JudgementRecord(_RecordModel):
-    """The judgement of a check that is not about a characteristic: `steps`, `records` or `liveness`."""
+    """The judgement of one of the further checks: `steps`, `records` or `liveness`."""
 
     name: str
     verdict: Verdict
@@ -65,8 +67,8 @@ class JudgementRecord(_RecordModel):
 class NetworkState(_RecordModel):
     """A description of the network from mission second `at_s` on.
 
-    `what` names the change, and `detail` describes the state in words. `fully_connected` is true without any loss or
-    partition.
+    `what` names the change, and `detail` describes the state in words. `fully_connected` is true if the network has
+    neither loss nor a partition.
     """
 
     at_s: float
@@ -74,7 +76,7 @@ class NetworkState(_RecordModel):
     detail: str
     fully_connected: bool
     planned_s: float | None = None
-    """Mission second of the change in the scenario, if the change was made later."""
+    """The mission second of the change in the scenario. null if the change was punctual."""
 
 
 class FaultRecord(_RecordModel):
@@ -86,11 +88,13 @@ class FaultRecord(_RecordModel):
     fully_connected: bool | None = None
     agents: list[int] | None = None
     disk: DiskState | None = None
-    """State of the disk after a reboot."""
+    """The state of the disk after a reboot."""
     by_hand: bool = False
-    """True if a user requested it during the run. The timeline of the recorded scenario contains it."""
+    """True if a user requested the change or fault during the run. The timeline of the recorded scenario contains
+    it.
+    """
     planned_s: float | None = None
-    """Mission second of the change in the scenario, if the change was made later."""
+    """The mission second of the change in the scenario. null if the change was punctual."""
 
     @property
     def kind(self) -> type[faults.Fault]:
@@ -99,7 +103,7 @@ class FaultRecord(_RecordModel):
 
     @property
     def loses_data(self) -> bool:
-        """True if the agents lost all their data."""
+        """True if the agents lost all their data in this fault."""
         return self.kind.loses_data(self.disk)
 
 
@@ -112,8 +116,8 @@ class FinalReconcile(_RecordModel):
 
 
 class CycleStep(_RecordModel):
-    """A handler run in a cycle, `after_s` mission seconds after the start of a period. `branch` is null if no trace
-    contains the handler run.
+    """A handler run in a cycle, `after_s` mission seconds after the start of a period. `branch` is null if the traces
+    do not contain the handler run.
     """
 
     agent_id: int
@@ -123,23 +127,23 @@ class CycleStep(_RecordModel):
 
 
 class CycleWait(_RecordModel):
-    """An agent that cannot finish. The agents in `for_agents` never answer its questions. The agents in `refused_by`
-    refuse its blocks.
+    """An agent that cannot finish. The agents in `for_agents` never answer its queries. The agents in `refused_by`
+    disapprove its blocks.
     """
 
     agent_id: int
     for_agents: list[int] = []
     refused_by: list[int] = []
-    """Also empty if no trace has the votes."""
+    """The agents that disapprove its blocks. Also empty if no trace contains the votes."""
 
 
 class Cycle(_RecordModel):
     """A sequence of handler runs that agents repeat forever. The repetition begins at mission second `since_s` or
     earlier.
 
-    `period_s` is null for a standstill: no message is under way, no timer runs, and `agents` are not idle. `proven` is
-    true if the global state recurs and no random draw can change it. Otherwise the same handler runs occurred `periods`
-    times in a row.
+    `period_s` is null for a standstill: no message is in transit, no timer runs, and `agents` are not idle. `proven` is
+    true if the state of the whole swarm recurs and no random draw can change this. Otherwise the same handler runs
+    occurred `periods` times in a row.
     """
 
     since_s: float
@@ -147,17 +151,19 @@ class Cycle(_RecordModel):
     periods: int | None = None
     proven: bool = False
     agents: Annotated[list[int], Field(min_length=1)]
-    """The agents in the cycle. Some may be idle for a time. For a standstill: the agents that are not idle."""
+    """The agents in the cycle. Some of them may be idle for a time. In a standstill, these are the agents that are not
+    idle.
+    """
     steps: list[CycleStep] = []
     """The handler runs of one period, in order."""
     waits: list[CycleWait] = []
 
 
 class HandlerRuns(_RecordModel):
-    """The number of handler runs in one incarnation, as the agent counted them. The count ends at a time between
-    `from_s` and `until_s`.
+    """The number of handler runs in one incarnation, as the agent counted them. The agent counted them at some time
+    between `from_s` and `until_s`.
 
-    `from_s` and `until_s` are equal if the agent reported its own mission time with the number.
+    `from_s` and `until_s` are equal if the agent reported its mission time together with the number.
     """
 
     counted: int
@@ -169,23 +175,25 @@ class AgentRecord(_RecordModel):
     """The outcome of one agent. It is exported, not exported, killed, rebooting, crashed, hung, broken, not supported,
     paused, running or not started.
 
-    Counters are sums over all incarnations of the agent. null means unknown.
+    Counters are sums over all incarnations of the agent. An unknown counter is null.
     """
 
     outcome: str
     detail: str | None = None
     command: list[str] | None = None
-    """Command without the mission file. null for an agent inside the harness."""
+    """The command of the agent without the mission file. null for an agent that runs inside the harness."""
     version: str | None = None
-    """Name and version from its status."""
+    """The name and version that the agent reported in its status."""
     restarts: int = 0
-    """Number of starts with the inception block only, after the first."""
+    """Number of restarts with the inception block only."""
     reboots: int = 0
-    """Number of starts with the data on its disk."""
+    """Number of restarts with the data on its disk."""
     completed_before: list[str] = []
-    """Hashes of the blocks that it completed in incarnations without an export, because it was killed."""
+    """Hashes of the blocks that the agent completed in incarnations without an export. Such an incarnation was
+    killed.
+    """
     left_behind: list[str] = []
-    """Names of the processes that ran on after the end of the agent, and that the harness ended."""
+    """Names of the processes that were still running after the end of the agent. The harness ended them."""
     idle: bool | None = None
     reconciles: int | None = None
     chain_changed_at_s: float | None = None
@@ -195,7 +203,7 @@ class AgentRecord(_RecordModel):
     send_failures: int | None = None
     trace_problem: str | None = None
     handler_runs: list[HandlerRuns | None] = []
-    """Its last report in each incarnation. null for an incarnation without a report."""
+    """The agent's last report in each incarnation. null for an incarnation without a report."""
 
 
 class CapturedFrames(_RecordModel):
@@ -213,12 +221,12 @@ class ChannelLateness(_RecordModel):
     deliveries: int
     median_s: float
     p95_s: float
-    """One in twenty deliveries was later than this."""
+    """Lateness that one in twenty deliveries exceeded."""
     most_s: float
     by_interval_s: list[float]
-    """The latest delivery in each interval of the load."""
+    """The greatest lateness of a delivery in each interval of the load."""
     missed: int
-    """Number of broadcasts that the process did not hear, because its buffer was full."""
+    """Number of broadcasts that the process did not receive, because its buffer was full."""
     unsent: int
     """Number of deliveries that the kernel did not accept."""
     processor_s: float
@@ -241,12 +249,12 @@ class ChannelLateness(_RecordModel):
 
 
 class AnswerTimes(_RecordModel):
-    """How long agents took from the arrival of a question to their answer, in mission seconds."""
+    """The times that agents took from the arrival of a query to their answer, in mission seconds."""
 
     count: int
     median_s: float
     p95_s: float
-    """One in twenty answers took longer."""
+    """Time that one in twenty answers exceeded."""
 
 
 class ChannelRecord(_RecordModel):
@@ -260,22 +268,26 @@ class ChannelRecord(_RecordModel):
     airtime_s: float
     """Sum of the durations of all frames."""
     lost: dict[str, dict[AgentKey, int]]
-    """Reason -> receiver -> number of frames that it lost. Reasons: collision, half_duplex, fade, range, partition."""
+    """Reason -> receiver -> number of frames that the receiver lost. Reasons: collision, half_duplex, fade, range,
+    partition.
+    """
     dropped: dict[str, dict[AgentKey, int]]
-    """Reason -> sender -> number of messages that its radio did not send. Reasons: queue, too_long."""
+    """Reason -> sender -> number of messages that the sender's radio did not send. Reasons: queue, too_long."""
     load_interval_s: Annotated[float, Field(gt=0)]
     load: list[float]
-    """Share of each interval in which at least one frame was on the channel, from mission second 0 on."""
+    """The load of the channel: for each interval from mission second 0 on, the share of the time in which at least one
+    frame was on the air.
+    """
     lateness: ChannelLateness | None = None
-    """null in virtual time, where each message arrives at its exact time."""
+    """Lateness of deliveries. null in virtual time, where each message arrives at its exact time."""
     answers: AnswerTimes | None = None
-    """null in virtual time, where agents answer at once."""
+    """Times of answers. null in virtual time, where agents answer at once."""
 
     FRAMES: ClassVar[str] = "frames"
 
     def counts(self) -> Counter[tuple[str, int]]:
-        """Return the number of sent frames under the key (FRAMES, 0), and each number of losses under its key (reason,
-        vehicle).
+        """Return all counts: the number of sent frames under the key (FRAMES, 0), and each number of losses under its
+        key (reason, vehicle).
         """
         counts = Counter({(self.FRAMES, 0): self.frames})
         for reason, by_vehicle in (*self.lost.items(), *self.dropped.items()):
@@ -283,13 +295,13 @@ class ChannelRecord(_RecordModel):
         return counts
 
     def total(self, reason: str) -> int:
-        """Return the number of frames or messages that were lost for the reason `reason`."""
+        """Return the number of frames or messages that were lost for this reason."""
         return sum((self.lost.get(reason) or self.dropped.get(reason, {})).values())
 
 
 class ReceiverCounters(_RecordModel):
     """Numbers of packets to one vehicle: packets that the kernel passed, packets that it lost, and packets cut off by a
-    partition. Further keys are the applied network conditions.
+    partition. The further keys are the network conditions that were applied.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -300,7 +312,7 @@ class ReceiverCounters(_RecordModel):
 
 
 class Counters(_RecordModel):
-    """Counters of the kernel, by receiver."""
+    """The packet counters of the kernel for each receiver."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -310,9 +322,10 @@ class Counters(_RecordModel):
 class DatagramsRead(_RecordModel):
     """The UDP datagrams in the network of a vehicle, as the kernel counted them over the whole run.
 
-    `broadcasts` datagrams arrived, also the agent's own ones. `read` datagrams were read, `before_start` of them before
-    the mission began. The kernel discarded `overflowed` datagrams, because the buffer of their socket was full, and
-    `unreachable` datagrams, because no socket was open. `others` datagrams were no broadcasts.
+    `broadcasts` is the number of broadcasts that arrived, including the agent's own broadcasts. `read` is the number of
+    datagrams that programs read, and `before_start` the number of them that were read before the mission began. The
+    kernel discarded `overflowed` datagrams because the buffer of their socket was full, and `unreachable` datagrams
+    because no socket was open. `others` is the number of datagrams that were not broadcasts.
     """
 
     read: int
@@ -324,8 +337,8 @@ class DatagramsRead(_RecordModel):
 
 
 class BlockHolders(_RecordModel):
-    """The vehicles that held a block directly after a loss of vehicles (`holders`), and those that held it at the end.
-    The agent `agent_id` completed the block.
+    """The vehicles that held a block directly after a loss of vehicles (`holders`), and those that held it at the end
+    of the run. Agent `agent_id` completed the block.
     """
 
     block: str
@@ -339,9 +352,9 @@ class Loss(_RecordModel):
     """The loss of vehicles with all their data at mission second `at_s`. Numbers of blocks are null if traces are
     missing.
 
-    `completed` counts the blocks of all agents until then. Of these, `survived` counts blocks that another vehicle
-    held, and `gone` those that only the lost vehicles held. `gone_at_end` counts blocks that no vehicle holds at the
-    end, for any reason.
+    `completed` is the number of blocks that all agents had completed. Of these, `survived` is the number of blocks that
+    another vehicle held, and `gone` is the number that only the lost vehicles held. `gone_at_end` is the number of
+    blocks that no vehicle holds at the end of the run, for any reason.
     """
 
     at_s: float
@@ -356,24 +369,22 @@ class Loss(_RecordModel):
 
 
 class LeastHeld(_RecordModel):
-    """The smallest set of vehicles whose loss would destroy a block. They are the holders of the block that has the
-    fewest holders.
-    """
+    """The holders of the block with the fewest holders. The loss of these vehicles would destroy the block."""
 
     vehicles: int
-    """Number of vehicles that could hold it."""
+    """Number of vehicles that could hold the block."""
     holders: list[int]
     block: str
     block_hash: str
     blocks: int
-    """Number of blocks with this number of holders."""
+    """Number of blocks with this smallest number of holders."""
     of: int
     """Number of all blocks."""
 
 
 class Survival(_RecordModel):
-    """The survival of blocks when vehicles are lost. `completed` counts all blocks, and `gone` counts the blocks that
-    no vehicle holds at the end.
+    """The survival of blocks when vehicles are lost. `completed` is the number of all blocks, and `gone` is the number
+    of blocks that no vehicle holds at the end.
 
     Both are null if the completed blocks of some agents are unknown.
     """
@@ -388,9 +399,9 @@ class Survival(_RecordModel):
 class InjectedMessages(_RecordModel):
     """The messages of one type in an injection: their number, and the handler runs that they caused.
 
-    `handled` maps each branch of the handler to its number of runs. `changed` counts the runs that changed the data of
-    an agent. `unhandled` counts the messages without a handler run. It is null if the names of messages in traces are
-    unknown.
+    `handled` maps each branch of the handler to its number of runs. `changed` is the number of runs that changed the
+    data of an agent. `unhandled` is the number of messages without a handler run. It is null if traces contain unknown
+    names of messages.
     """
 
     message: str
@@ -401,10 +412,10 @@ class InjectedMessages(_RecordModel):
 
 
 class RogueInjection(_RecordModel):
-    """The effect of one injection. `refused` counts by reason the datagrams that are not valid messages. Agents drop
-    such datagrams and count them.
+    """The effect of one injection. `refused` contains the numbers of datagrams that are not valid messages, by reason.
+    Agents drop such datagrams and count them.
 
-    `untraced` counts copies that traces do not distinguish from the originals.
+    `untraced` is the number of copies that traces do not distinguish from the originals.
     """
 
     at_s: float
@@ -426,23 +437,25 @@ class JudgedRecord(_RecordModel):
     schema_: Literal["ucp-run/1"] = Field(default="ucp-run/1", alias="schema")
     roster: list[int]
     outcome: Literal["running", "completed", "interrupted", "failed", "not supported"] = "running"
-    """`not supported`: an agent does not support a feature that the run needs. The run is not judged."""
+    """The outcome of the run. With `not supported`, an agent does not support a feature that the run needs, and the run
+    is not judged.
+    """
     outcome_detail: str | None = None
     network: list[NetworkState] = []
     faults: list[FaultRecord] = []
     final_reconcile: FinalReconcile | None = None
     cycle: Cycle | None = None
-    """A cycle that shows that agents never finish. If it is `proven`, the run stopped there."""
+    """A cycle that shows that agents never finish. If it is `proven`, the run was ended when it was found."""
     mission_s: float | None = None
     stagger: Annotated[Stagger, Field(exclude=True)] = {}
-    """`stagger` of the scenario: the differences between the timers of agents."""
+    """The key `stagger` of the scenario: the differences between the timers of agents."""
     agents: dict[AgentKey, AgentRecord] = {}
     engine: str | None = None
     counters: Counters | None = None
     datagrams: dict[AgentKey, DatagramsRead] = {}
     """Datagrams that each agent read. An agent is missing if another program on its vehicle uses UDP."""
     channel: ChannelRecord | None = None
-    """Frames on the shared channel. null without one."""
+    """The frames on the shared channel. null without a shared channel."""
 
     @property
     def switched_off(self) -> dict[int, float]:
@@ -458,8 +471,8 @@ class JudgedRecord(_RecordModel):
 
 
 class OperatorCommand(_RecordModel):
-    """An operator's command, sent first at mission second `at_s`. It is repeated until `until_s`, and sent `times`
-    times in total. `values` are the fields of the message.
+    """A command of an operator. It was first sent at mission second `at_s` and last at `until_s`, in total `times`
+    times. `values` contains the fields of the message.
     """
 
     at_s: float
@@ -468,13 +481,13 @@ class OperatorCommand(_RecordModel):
     vehicles: list[int]
     message: str
     command: str | None = None
-    """The MAV_CMD of a COMMAND_LONG or COMMAND_INT."""
+    """Name of the MAV_CMD in a COMMAND_LONG or COMMAND_INT. None for other messages."""
     values: dict[str, Any] = {}
 
 
 class GroundStationRecord(_RecordModel):
-    """Numbers of datagrams between the vehicles and a ground station. `dropped` counts datagrams that were damaged or
-    exceeded the limit.
+    """Numbers of datagrams between the vehicles and a ground station. `dropped` is the number of datagrams that were
+    damaged or exceeded the limit.
     """
 
     address: str
@@ -483,7 +496,7 @@ class GroundStationRecord(_RecordModel):
     dropped: int = 0
     commands: list[OperatorCommand] = []
     commands_left_out: int = 0
-    """Number of further commands, beyond the maximum that the record keeps."""
+    """Number of commands that the record omits, because it has a maximum number of commands."""
 
 
 class RunRecord(JudgedRecord):
@@ -498,7 +511,9 @@ class RunRecord(JudgedRecord):
     backend: BackendName | None = None
     versions: dict[str, str] = {}
     all_delivered: bool = False
-    """True if virtual time also delivered messages without effect, as for `--watch`. Traces then have them too."""
+    """True if virtual time also delivered messages without effect, for example because of `--watch`. Traces then
+    contain them.
+    """
     started_at: str | None = None
     wall_s: float | None = None
     settled: bool = False
@@ -509,22 +524,22 @@ class RunRecord(JudgedRecord):
     keys_fingerprint: str | None = None
     """Fingerprint of the public keys of a secured mission. null if the mission was not secured."""
     capture: dict[AgentKey, CapturedFrames] | None = None
-    """Frames of each vehicle, if captures were requested and completed."""
+    """The frames of each vehicle. null if no captures were requested or they were not completed."""
     ground_station: GroundStationRecord | None = None
-    """Traffic with the ground station. null without one."""
+    """The traffic with the ground station. null without a ground station."""
     characteristics: dict[str, CharacteristicRecord] = {}
     steps: JudgementRecord | None = None
-    """Judgement on each handler run, compared with the reference core."""
+    """The judgement on the comparison of each handler run with the reference."""
     records: JudgementRecord | None = None
-    """Judgement on the agreement of records of the same facts."""
+    """The judgement on the comparison of records that describe the same facts."""
     liveness: JudgementRecord | None = None
-    """Judgement on whether the swarm became idle after the last event."""
+    """The judgement on liveness: whether the swarm became idle after the last event."""
     figures: dict[str, float | int | None] = {}
     survival: Survival | None = None
     rogue: list[RogueInjection] = []
     """The effect of each injection of the timeline, in order."""
     errors: list[str] = []
-    """A sentence for each file that the checker could not read, or only in part."""
+    """A sentence for each file that the checker could not read completely."""
 
     @model_validator(mode="after")
     def _copy_stagger_of_scenario(self) -> "RunRecord":
@@ -539,7 +554,7 @@ class RunRecord(JudgedRecord):
         return sorted({*self.roster, *requested, *map(int, self.agents), *map(int, self.vehicles)})
 
     def late_answers(self) -> str | None:
-        """Return a sentence if agents took longer to answer than the shared channel assumes. Return None otherwise."""
+        """Return a sentence if agents took longer to answer than the shared channel assumes. Otherwise return None."""
         answers = self.channel.answers if self.channel else None
         model = self.scenario.network.channel if self.scenario else None
         if self.scenario is None or model is None or answers is None or answers.count < ENOUGH_ANSWERS:

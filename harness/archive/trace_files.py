@@ -1,8 +1,9 @@
 """Find the traces of a run, read them, and compress large traces with gzip.
 
 A trace of a process contains every received datagram, so the traces of a large swarm take gigabytes. After the run, the
-harness packs them to about a sixth. It packs them only then, because any agent must be able to append lines, and a
-killed agent must leave all of its lines. All readers take `7.trace.jsonl` as well as `7.trace.jsonl.gz`.
+harness compresses them to about a sixth of this size. It does not compress them earlier, because agents must be able to
+append lines, and a killed agent must leave all of its lines. All readers accept both `7.trace.jsonl` and
+`7.trace.jsonl.gz`.
 """
 
 import contextlib
@@ -16,13 +17,15 @@ from ucp.plain_file import open_plain_file
 SUFFIX = ".trace.jsonl"
 PACKED_SUFFIX = f"{SUFFIX}.gz"
 MAX_TRACE_BYTES = 256 * 1024 * 1024
-"""Maximum size of a trace. In a swarm of 50 agents without loss, a trace grows to a tenth of it in 20 minutes."""
+"""Maximum size of a trace in bytes. In a swarm of 50 agents without loss, a trace reaches a tenth of it in 20
+minutes.
+"""
 PACKED_FROM_BYTES = 64 * 1024 * 1024
-"""Size of all traces of a run together from which they are packed."""
+"""Size of all traces of a run together, in bytes, from which they are compressed."""
 PACKED_SHARE = 1 / 6
-"""Size of a packed trace, as a share of its content."""
+"""Size of a compressed trace, as a share of its original size."""
 _LEVEL = 1
-"""Level of compression. Higher levels take three times as long for a tenth of the size."""
+"""The compression level of gzip. Higher levels take three times as long and reduce the size by only a tenth."""
 _CHUNK_BYTES = 1024 * 1024
 
 
@@ -53,7 +56,8 @@ def open_trace(path: Path) -> BoundedFile:
 def pack_traces(agents: Path, report_progress: Callable[[str], None]) -> None:
     """Compress the traces of an ended run with gzip if their total size is large.
 
-    Ctrl-C ends the packing, and the other traces stay plain. A trace also stays plain if the disk is full.
+    Ctrl-C ends the compression, and the remaining traces stay uncompressed. A trace also stays uncompressed if the disk
+    is full.
     """
     plain = sorted(agents.rglob(f"*{SUFFIX}"))
     if sum(path.stat().st_size for path in plain) < PACKED_FROM_BYTES:

@@ -1,8 +1,8 @@
 """Read traces (`ucp-trace/2` and `/1`). A trace contains the handler runs of one agent, and the changes of the blocks
 that it held.
 
-A trace that ends within a line belongs to a killed agent. It is read up to that line. Other damage is reported in
-`problem`, and the lines before it are used.
+If a trace ends in the middle of a line, its agent was killed. The lines before it are used. Other damage is reported in
+`problem`, and the lines before the damage are used.
 """
 
 import json
@@ -25,7 +25,7 @@ from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
 MAX_LINE_BYTES = 2 * 1024 * 1024
 MAX_LINE_WEIGHT = 100_000
 LARGEST = 2**64
-"""Limit of integers in a header. A larger one cannot be a setting, because it does not fit into 64 bits."""
+"""Limit of integers in a header. A larger integer cannot be a setting, because it does not fit into 64 bits."""
 PLACES = ("chain", "deque", "stack")
 _HEADER_KEYS = ("schema", "agent_id", "roster", "initial_data", "settings", "clock", "secured")
 
@@ -40,8 +40,8 @@ class TraceHeader(BaseModel):
     """The header of a trace. `initial_data` is in base64. It is None in version 1 of the format, which does not record
     complete inputs.
 
-    In a `secured` mission the recorded datagrams are plain. The sent ones were longer, and a datagram that looks valid
-    here may have been dropped.
+    In a `secured` mission the recorded datagrams are not encrypted. The datagrams that were sent were longer, and a
+    datagram that seems valid in the trace may have been dropped.
     """
 
     model_config = ConfigDict(extra="ignore", populate_by_name=True)
@@ -92,8 +92,9 @@ _ONLY_RECEIVES = re.compile(
     "reconciling":(?:true|false),"idle":(?:true|false),"top":"[0-9a-f]*"\}\}\n""",
     re.VERBOSE,
 )
-"""A line, as agents of this project write it, of a handler run that received a message and changed nothing. A line
-that matches needs no further validation."""
+"""A pattern for a line of a handler run that received a message and changed nothing, in the form in which this
+project's agents write it. A line that matches needs no further validation.
+"""
 
 _LOST = re.compile(rb'\{"lost_lines":(\d{1,9}),"lost_bytes":(\d{1,12})\}')
 
@@ -128,9 +129,10 @@ class TraceGap(NamedTuple):
 class Trace:
     """The trace of one agent, including all its restarts.
 
-    `starts` has the index in `runs` at which each incarnation after the first begins. `asides` are the entries that are
-    no handler runs, each with the number of runs before it. A trace from the field (`harness.field.ingest`) may have
-    `gaps`. The trace of a run has none, because its reading ends at the first damaged line.
+    `starts` contains the index in `runs` at which each incarnation after the first begins. `asides` contains the
+    entries that are no handler runs, each with the number of runs before it. A trace from the field
+    (`harness.field.ingest`) may have `gaps`. The trace of a run has no gaps, because reading ends at the first damaged
+    line.
     """
 
     header: TraceHeader
@@ -139,18 +141,20 @@ class Trace:
     asides: list[tuple[int, DroppedDatagram | CommandEntry]] = field(default_factory=list)
     problem: str | None = None
     cut_off: bool = False
-    """True if the file ends within a line. That line is not read."""
+    """True if the file ends in the middle of a line. This line is not read."""
     gaps: list[TraceGap] = field(default_factory=list)
     jumps: list[int] = field(default_factory=list)
-    """Positions of runs before which the time goes back, or far ahead. The agent's clock was probably set there."""
+    """Positions of handler runs before which the time decreases or increases by a large amount. The agent's clock was
+    probably set there.
+    """
     lines: tuple[Sequence[int], Sequence[int]] | None = None
-    """Line numbers of `runs` and of `asides` in the file. None if the file has no other lines."""
+    """The line numbers of `runs` and of `asides` in the file. None if the file has no other lines."""
 
     def incarnations(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
-        """Yield the handler runs of each incarnation (the time between two restarts), together with their line numbers
-        from 1.
+        """Yield the handler runs of each incarnation (the time between two restarts), together with their line numbers,
+        counted from 1.
 
-        A header line begins each incarnation.
+        Each incarnation begins with a header line.
         """
         bounds = [0, *self.starts, len(self.runs)]
         for incarnation, (start, end) in enumerate(pairwise(bounds), 1):
@@ -176,8 +180,8 @@ class Trace:
             yield position + 1 + bisect_right(self.starts, position) + count, aside
 
     def dropped(self) -> Counter[str]:
-        """Return the number of dropped datagrams by reason. It includes the datagrams that the agent counted without a
-        line for each.
+        """Return the number of dropped datagrams by reason. The numbers include datagrams that the agent only counted
+        and did not write to the trace.
         """
         counts: Counter[str] = Counter()
         for _, aside in self.asides:
@@ -196,7 +200,7 @@ class Trace:
     def entries(self) -> Iterator[TraceHeader | TraceGap | Entry]:
         """Yield all entries of the trace in order.
 
-        The header is repeated for each incarnation, and a gap stands for missing lines.
+        The header is repeated for each incarnation. A gap stands for missing lines.
         """
         starts = Counter([0, *self.starts])
         gaps = {gap.position: gap for gap in self.gaps}
@@ -215,7 +219,7 @@ class Trace:
     def skimmed(self) -> "Trace":
         """Return the trace without the handler runs that only received a message.
 
-        Line numbers of `incarnations` are then wrong.
+        The line numbers that `incarnations` yields are wrong in the result.
         """
         kept = [not only_receives(run) for run in self.runs]
         before = [0, *accumulate(kept)]
@@ -241,26 +245,25 @@ class Trace:
 
 
 class HeldBlocks:
-    """The blocks that an agent holds. For each block, they show where the agent holds it, how often, and whether the
-    agent completed it.
+    """The blocks that an agent holds: for each block, its places, the number of copies, and whether the agent completed
+    it.
     """
 
     def __init__(self) -> None:
         self.places: dict[str, Counter[str]] = {place: Counter() for place in PLACES}
         self.size = dict.fromkeys(PLACES, 0)
-        """Number of blocks in each place."""
+        """Place -> number of blocks there."""
         self.copies: Counter[str] = Counter()
         self.completed: dict[str, None] = {}
         self.not_in_chain: set[str] = set()
         """Completed blocks that are not in the chain."""
         self.impossible: str | None = None
-        """A description of a change of the last run that is impossible, for example the removal of a block that the
-        agent did not hold."""
+        """A description of an impossible change in the last handler run, for example the removal of a block that the
+        agent did not hold. None without one.
+        """
 
     def replay(self, run: HandlerRun) -> None:
-        """Apply the changes of the next handler run to the blocks. One object is valid between two restarts of the
-        agent.
-        """
+        """Apply the changes of the next handler run to the blocks. Use a separate object for each incarnation."""
         self.impossible = None
         for operation, block in run.changes:
             if operation == "complete":
@@ -301,9 +304,9 @@ def _validate(kind: TypeAdapter[Record], line: bytes) -> Record:
 
 
 def gap_line(gap: TraceGap) -> str:
-    """Return the line that an imported trace contains in place of lost lines.
+    """Return the line that replaces lost lines in an imported trace.
 
-    Programs that read only handler runs stop there.
+    Programs that read only handler runs stop at this line.
     """
     return f'{{"lost_lines":{gap.lines},"lost_bytes":{gap.lost_bytes}}}\n'
 
@@ -322,7 +325,7 @@ def only_receives(run: HandlerRun) -> bool:
 
 
 def why_not_a_trace(path: Path) -> str:
-    """Return the reason why the file does not begin as a readable trace must begin."""
+    """Return the reason why the beginning of a file is not that of a readable trace."""
     try:
         with open_trace(path) as file:
             header = parse_json(file.readline(MAX_LINE_BYTES))
@@ -339,8 +342,8 @@ def why_not_a_trace(path: Path) -> str:
 def read_trace(path: Path, *, skim: bool = False) -> Trace | None:
     """Read the trace at `path`. Return None if the file does not exist, or does not begin like a trace.
 
-    With `skim`, handler runs that only received a message are skipped without validation. Line numbers of
-    `incarnations` are then wrong.
+    If `skim` is true, handler runs that only received a message are skipped without validation. The line numbers that
+    `incarnations` yields are then wrong.
     """
     trace: Trace | None = None
     try:
@@ -395,7 +398,8 @@ class HandlerRunLine(NamedTuple):
 
 
 def read_trace_lines(path: Path) -> Iterator[HandlerRunLine]:
-    """Yield the lines with handler runs. The last line is skipped if it is incomplete, because its agent was killed.
+    """Yield the lines with handler runs. An incomplete last line is skipped, because the agent was killed while it
+    wrote the line.
 
     Raises RunDirectoryError at an invalid line, or if the file cannot be read or is empty.
     """

@@ -15,7 +15,7 @@ TRACKS_FILE = "tracks.jsonl"
 
 MissionSeconds = Annotated[float, Field(ge=0, le=1e9)]
 Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
-"""Coordinates of more than 1000 km are invalid."""
+"""A coordinate in metres. Coordinates of more than 1000 km are invalid."""
 
 
 class PositionFix(NamedTuple):
@@ -46,7 +46,7 @@ class VehicleTracks:
 
 
 def between(before: PositionFix, after: PositionFix, at_s: float) -> PositionFix:
-    """Return the position of a vehicle that flies straight and at constant speed between two known positions."""
+    """Return the position of a vehicle between two known positions, if it flies straight at constant speed."""
     share = (at_s - before.at_s) / (after.at_s - before.at_s)
     return PositionFix(
         at_s,
@@ -66,7 +66,7 @@ class TrackLine(BaseModel):
 
 
 def read_tracks(path: Path | None, vehicles: Collection[int]) -> VehicleTracks:
-    """Read the positions of `vehicles`. Lines about other vehicles are left out."""
+    """Read the positions of `vehicles`. Lines about other vehicles are omitted."""
     lines = JsonLines(path, TrackLine)
     fixes: dict[int, list[PositionFix]] = {}
     known = set(vehicles)

@@ -1,7 +1,7 @@
 """List the known names in traces: names of handlers, timers, branches, messages and operations.
 
-An agent may use names that are not in CONTRACT.md and still behave correctly. A check that depends on an unknown name
-gives "not applicable" or "unknown", never a violation.
+An agent may use names that CONTRACT.md does not define and still behave correctly. The verdict of a check that depends
+on an unknown name is "not applicable" or "unknown", never a violation.
 """
 
 from collections.abc import Collection, Iterable
@@ -44,8 +44,9 @@ TALLIES = {
 """Handler -> the keys of its tally. None if the keys are block hashes."""
 
 IGNORED_KINDS: frozenset[Kind] = frozenset(("branch", "tally", "timer"))
-"""Kinds of unknown names that are ignored while the rest of the step is compared. A step with an unknown name of
-another kind cannot be compared. An unknown timer does no harm, because the handler determines the timer."""
+"""Kinds of unknown names that do not prevent the comparison of a step. A step with an unknown name of another kind
+cannot be compared. Names of timers are among them, because the handler determines the timer.
+"""
 
 _TIMER_OF = {handler.name: timer for timer, handler in ON_TIMER.items()}
 
@@ -54,8 +55,8 @@ MAX_SHOWN = 40
 
 
 def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
-    """Return the first undefined name of each kind. The name of a branch also counts as undefined if the handler does
-    not have this branch.
+    """Return the first undefined name of each kind. A branch also counts as undefined if it belongs to a different
+    handler.
     """
     unknown: UnknownNames = {}
     for handler, branch in dict.fromkeys((run.handler, run.branch) for run in runs):
@@ -108,7 +109,7 @@ def has_unknown_kind(trigger: UnknownTrigger) -> bool:
 def timer_that_ended(run: HandlerRun, trigger: TimerTrigger) -> str:
     """Return the name of the timer that triggered the handler run.
 
-    For an unknown name, this is the timer that starts the run's handler, if any.
+    If the name is unknown, return the timer whose expiry triggers the handler of this run, or None.
     """
     name = trigger.timer
     return name if name in TIMERS else _TIMER_OF.get(run.handler, name)

@@ -1,4 +1,4 @@
-"""The progress of a state space exploration, its final numeric results, and its limits of memory and time."""
+"""Report the progress of an exploration and its final numbers, and limit its memory and time."""
 
 import resource
 import sys
@@ -20,7 +20,7 @@ class ExplorationProgress:
     """The progress of an exploration: the numbers of known states, explored states and transitions, and the search
     depth.
 
-    After all states are explored, `asked` is the question about the whole graph that is examined now.
+    After all states are explored, `asked` is the question about the whole graph that is now being answered.
     """
 
     states: int
@@ -97,8 +97,8 @@ class ExplorationBudget:
 
 
 def memory_bytes() -> int:
-    """Return the memory that this process uses, in bytes (proc_pid_statm(5)). Without Linux, return the peak of its
-    memory.
+    """Return the memory that this process uses, in bytes (proc_pid_statm(5)). On systems other than Linux, return its
+    maximum memory so far.
     """
     try:
         return int(_STATM.read_text().split()[1]) * resource.getpagesize()

@@ -1,6 +1,4 @@
-"""Prove properties within bounds: explore all states, examine the graph of these states, and write violations as
-scenarios.
-"""
+"""Prove properties within bounds: explore all states, examine their graph, and write each violation as a scenario."""
 
 import time
 from collections.abc import Callable
@@ -42,7 +40,7 @@ CLAIMS = {
     "crash": "no handler ends by an error",
     "steps": "every step is that of the reference",
 }
-"""Properties that the proof checks in every state. "steps" is optional."""
+"""Properties that the proof checks in every state: key -> sentence. "steps" is optional."""
 OF_CAPTORS = {
     "1": "every accepted message was sent by the vehicle that it names",
     "4": "every block is genuine",
@@ -59,7 +57,7 @@ OF_OTHERS = {
 }
 """Properties that an attacker with captured keys must not be able to violate."""
 RUN_LOOKED_FOR_S = 60.0
-"""Maximum time in seconds of the search for a run that shows the flaw of a single agent."""
+"""Maximum number of seconds to search for a run of the whole swarm that shows the violation found in a single agent."""
 PLAYED = {
     "honest": "4",
     "name": "1",
@@ -71,12 +69,12 @@ PLAYED = {
     "crash": "steps",
     "steps": "steps",
 }
-"""Kind of flaw -> the check that shows it in a simulated run."""
+"""Kind of violation -> the check that detects it in a simulated run."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of a proof: `most_bytes` of memory for all processes, `most_s` seconds, and `cores` worker
+    """The limits of a proof: `most_bytes` of memory for all processes together, `most_s` seconds, and `cores` worker
     processes.
     """
 
@@ -98,10 +96,10 @@ class Proof:
     """The result of a proof within bounds, with a violation if the prover found one.
 
     `complete` is true if all states within the bounds were explored. `flaw` is a violation, and `example` is a scenario
-    that shows it. `exit_status` is 0 if every claim holds, 1 if a claim does not hold, and 4 if a limit was reached
-    first. `liveness` is None if it was not examined, because some states are unknown or the network is `any`.
-    `whole_ended` states how the examination of the whole graph ended. `way` lists the steps of an agent that lead to a
-    violation in the network `any`, where no run is known to show it.
+    that shows it. `exit_status` is 0 if every property holds, 1 if a property does not hold, and 4 if a limit was
+    reached first. `liveness` is None if it was not examined, because some states are unknown or the network is `any`.
+    `whole_ended` states how the examination of the whole graph ended. With the network `any`, `way` lists the steps of
+    a single agent that lead to the violation. No run of the whole swarm may be known to show it.
     """
 
     bounds: Bounds
@@ -112,20 +110,26 @@ class Proof:
     whole_ended: Ended = "complete"
     example: ViolationExample | None = None
     fork: ViolationExample | None = None
-    """The nearest idle state with several chains. It violates no property, and stays as it is until an agent votes."""
+    """The nearest idle state with several chains. It violates no property, and does not change until an agent votes."""
     reluctant: ViolationExample | None = None
-    """The nearest state that needs more than one further vote to reach one chain. None if none is known."""
+    """The nearest state that needs more than one further vote until all chains are equal. None if no such state is
+    known.
+    """
     forms: list[str] = field(default_factory=list)
-    """The forms of all livelocks, each as the timers of its states."""
+    """The forms of all livelocks. Each is described by the timers of its states."""
     livelocks: list[Livelock] = field(default_factory=list)
-    """One livelock of each form, replayed as a run. They may come from an exploration that is not complete."""
+    """One livelock of each form, played as a run. The exploration that found them may be incomplete."""
     way: list[str] = field(default_factory=list)
     shown: dict[str, ViolationExample | None] = field(default_factory=dict)
-    """Characteristic of `OF_CAPTORS` -> the nearest violation that an attacker can cause. None in the network `any`."""
+    """Characteristic in `OF_CAPTORS` -> the nearest violation that an attacker can cause. None with the network
+    `any`.
+    """
 
     @property
     def claims(self) -> dict[str, str]:
-        """The properties that the proof checks in every state. Each key has a sentence that states the property."""
+        """The properties that the proof checks in every state. The value of each key is a sentence that states the
+        property.
+        """
         claims = CLAIMS if self.bounds.steps else {kind: claim for kind, claim in CLAIMS.items() if kind != "steps"}
         if self.bounds.captured is None:
             return claims
@@ -143,10 +147,11 @@ class Proof:
 
     @property
     def findings(self) -> dict[str, str]:
-        """The violations by key, each as a sentence. Proofs of different agent cores use the same key for the same
-        violation.
+        """The violations by key, each as a sentence. The same violation has the same key in proofs of different agent
+        cores.
 
-        A crash is identified by its exception, a wrong step by its handler, and a livelock by its form.
+        The key of a crash contains its exception, the key of a wrong step contains the handler, and the key of a
+        livelock contains its form.
         """
         found = {f"shown {key}": sentence for key, sentence in SHOWN.items() if key in self.shown}
         if self.flaw is not None:
@@ -222,8 +227,8 @@ def prove(
     - `out`: the new file of the scenario that shows a violation. Without it, a new file under `runs/`.
     - `watch`: a function that is called repeatedly with the progress.
 
-    Raises HarnessError if the file cannot be written, if an agent does something that state reduction does not allow,
-    or if an agent's steps depend on something that is not part of a state.
+    Raises HarnessError if the file cannot be written, if an agent violates an assumption of the state reduction, or if
+    its steps depend on data that are not part of a state.
     """
     if bounds.reduced and bounds.why_not_reduced() is not None:
         bounds = replace(bounds, reduced=False)
@@ -262,9 +267,9 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Ex
 
 
 def _with_instants(bounds: Bounds) -> Bounds:
-    """Return the same bounds with a network that can lose and duplicate messages.
+    """Return bounds that differ only in the network, which loses and duplicates messages instead of being `any`.
 
-    Each path within the new bounds is a possible run, in contrast to the network `any`.
+    With these bounds, each path is a possible run. With the network `any`, this is not certain.
     """
     return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
 

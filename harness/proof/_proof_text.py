@@ -1,4 +1,4 @@
-"""Print the result of a proof. The text states that a property "holds" only if all states were explored."""
+"""Print the result of a proof. The text says "holds" about a property only if all states were explored."""
 
 from collections.abc import Iterator
 

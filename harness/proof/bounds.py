@@ -22,7 +22,7 @@ MAX_LIES = 9
 MAX_COINCIDENCES = 9
 MAX_LOSSES = 9
 EVENT_FILLS_BLOCK = {"max_block_bytes": 267}
-"""Settings with which each event completes a block."""
+"""Settings with which a single event completes a block."""
 
 
 class BoundsError(HarnessError):
@@ -36,17 +36,19 @@ class Bounds:
     - `network`: `lossless`; `lossy`, where any agent may lose any message; `any`, where messages may also be late,
       repeated and out of order.
     - `faults`: some of `reboot` and `death`, each at most once, and `duplicate`.
-    - `timers_any`: timers may expire in any order, whatever their durations.
-    - `coincidences`: the maximum number of moments that are equal by chance. None means any number.
+    - `timers_any`: timers may expire in any order, regardless of their durations.
+    - `coincidences`: the maximum number of pairs of moments that are equal by chance. None means any number.
     - `settings`: protocol settings of all agents, by name.
     - `quirks`: deliberate mistakes of all agents, by name (see `ucp.quirks`).
     - `reduced`: treat states that behave alike as one state. `prove` does so only if `why_not_reduced` gives no reason.
     - `steps`: compare each step of the agents with the step of the reference implementation.
-    - `stagger`: by timer, the seconds by which each agent's timer is longer than the timer of the agent before it.
-    - `captured`: the ID of an agent whose keys an attacker has. From some moment on, the attacker sends in its name.
+    - `stagger`: for each timer, the seconds by which it is longer than the same timer of the agent with the next lower
+      ID.
+    - `captured`: the ID of an agent whose keys an attacker has. From an arbitrary moment on, the attacker sends in its
+      name.
     - `lies`: the maximum number of messages that the attacker sends, unless the network is `any`. Any of the agents can
       receive each message.
-    - `clocks_any`: either of two blocks may be the older one, with a free choice at each comparison.
+    - `clocks_any`: at each comparison of two blocks, either of them may be the older one.
     - `losses`: the maximum number of lost messages that would have had an effect. None means any number.
     - `crossing`: messages of several agents may cross. If false, all consequences of an action end before the next
       action.
@@ -147,25 +149,25 @@ class Bounds:
 
     @property
     def nameless(self) -> bool:
-        """True if states are stored without agent IDs, so that each agent counts itself as agent 1.
+        """True if states are stored without agent IDs. Each agent then counts itself as agent 1.
 
-        False with a captured agent and in the network `any`, because messages then depend on the sender's ID.
+        It is false with a captured agent and with the network `any`, because messages then depend on the sender's ID.
         """
         return self.reduced and self.captured is None and self.network != "any"
 
     @property
     def alike(self) -> bool:
-        """True if two states count as one state when they differ only by an exchange of agents."""
+        """True if states that differ only by an exchange of agents count as one state."""
         return self.nameless and not self.stagger
 
     @property
     def blocks_alike(self) -> bool:
-        """True if two states count as one state when they differ only by an exchange of blocks."""
+        """True if states that differ only by an exchange of blocks count as one state."""
         return self.nameless and self.clocks_any
 
     @property
     def settles(self) -> bool:
-        """True if all answers to a query arrive, or are lost, in the same moment in which the query is sent."""
+        """True if each answer to a query arrives or is lost at the same moment at which the query is sent."""
         return self.reduced and self.captured is None
 
     def agent_settings(self, agent_id: int = 1) -> Settings:

@@ -1,9 +1,9 @@
-"""Run the same proof for the unmodified agent core, to find which violations a modified core adds.
+"""Run the same proof for the original agent core, to find the violations that a modified core adds.
 
-`prove` reports each violation, and the published protocol has some violations of its own. After a change of the core,
-only the new violations matter. The original is the `ucp` of a commit or of a second checkout. A separate process
-explores it with the present prover, so both proofs ask the same questions. The process receives its bounds on standard
-input and prints the result as JSON:
+`prove` reports all violations, and the published protocol itself has some. After a change of the core, only the new
+violations are relevant. The original is the `ucp` of a commit or of a second checkout. A separate process explores it
+with the installed prover, so both proofs check the same properties. The process receives its bounds on standard input
+and prints the result as JSON:
 
     python -m harness.proof.original
 """
@@ -27,9 +27,9 @@ from harness.run.code_state import ROOT, GitBisection, run_python
 
 MODULE = "harness.proof.original"
 INSTALLED = "installed"
-"""The name of the core of this installation, without a variant."""
+"""The name that stands for the core of this installation without a variant."""
 EXIT_S = 60.0
-"""Seconds that the process may take beyond the limit of time, to start and to write its result."""
+"""Seconds that the process may take in addition to the time limit, to start and to write its result."""
 
 
 class OriginalError(HarnessError):
@@ -38,7 +38,7 @@ class OriginalError(HarnessError):
 
 @dataclass(frozen=True)
 class OriginalProof:
-    """The proof of the original agent core. `findings` contains a sentence for each violation by key, and `lines` the
+    """The proof of the original agent core. `findings` contains a sentence for each violation by key. `lines` is the
     printed result.
     """
 
@@ -50,19 +50,19 @@ class OriginalProof:
 
 @dataclass(frozen=True)
 class ProofComparison:
-    """A proof of the agent core in use, compared with a proof of the original core."""
+    """A proof of the installed agent core, compared with a proof of the original core."""
 
     proof: Proof
     original: OriginalProof
 
     @property
     def new(self) -> dict[str, str]:
-        """The violations of the agent core in use that the original core does not have."""
+        """The violations of the installed agent core that the original core does not have."""
         return {key: text for key, text in self.proof.findings.items() if key not in self.original.findings}
 
     @property
     def shared(self) -> dict[str, str]:
-        """The violations that the agent core in use and the original core have in common."""
+        """The violations that both the installed core and the original core have."""
         return {key: text for key, text in self.proof.findings.items() if key in self.original.findings}
 
     @property
@@ -97,7 +97,7 @@ class ProofComparison:
 
 @contextmanager
 def code_of(original: str) -> Iterator[Path]:
-    """Yield a directory with the code of the agent core to which `original` refers.
+    """Yield a directory with the code of the agent core that `original` names.
 
     `original` is "installed" (the core of this installation, for a proof with a variant), a directory that contains
     `ucp/`, or a commit of this clone.
@@ -153,7 +153,7 @@ def is_edited(code: Path) -> bool:
 
 
 def main() -> None:
-    """Explore the agent core that this process imports, and print the violations."""
+    """Explore the agent core that this process imports, and print the result."""
     asked = json.load(sys.stdin)
     most_bytes, most_s, cores = asked["limits"]
     bounds = Bounds(**{**asked["bounds"], "faults": tuple(asked["bounds"]["faults"])})

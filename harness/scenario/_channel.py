@@ -1,7 +1,8 @@
 """Describe the radio channel of a scenario, which all vehicles share.
 
-A preset sets all figures, and the other keys replace single ones. `netem.channel` has the model, the presets with their
-sources, and the limits of each figure. A key that the preset's kind of radio lacks is an error.
+A preset sets all numeric values of the radio, and the other keys replace single values. `netem.channel` defines the
+model, the presets with their sources, and the limits of each value. A key that the preset's kind of radio does not have
+is an error.
 """
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -27,18 +28,20 @@ Preset = Literal[
 ]
 
 OWN_KEYS = ("preset", "processing_s")
-"""Keys that are no figures of the radio."""
+"""Keys of the channel that are not numeric values of the radio."""
 
 
 class ChannelModel(StrictModel):
-    """A radio channel that all vehicles share. The other keys replace numeric values of the preset."""
+    """A radio channel that all vehicles share. The keys other than `preset` replace numeric values of the preset."""
 
     preset: Preset
-    """Radio whose figures apply: 802.11 ad hoc at 1, 6 or 11 Mbit/s, a telemetry radio with time slots (RFD900 class),
-    or LoRa with spreading factor 7 to 12."""
+    """The kind of radio: 802.11 ad hoc at 1, 6 or 11 Mbit/s, a telemetry radio with time slots (RFD900 class), or LoRa
+    with spreading factor 7 to 12.
+    """
     processing_s: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)] = 0.005
-    """Greatest time in seconds from the decision to send a message until the radio gets it. Each message draws a
-    uniform time from 0 to this value."""
+    """Maximum time in seconds from the decision to send a message until the radio gets the message. The time of each
+    message is random, uniform from 0 to this value.
+    """
     power_dbm: float | None = None
     """Transmit power in dBm."""
     sensitivity_dbm: float | None = None
@@ -46,11 +49,15 @@ class ChannelModel(StrictModel):
     noise_dbm: float | None = None
     """Noise of the receiver in dBm."""
     preamble_db: float | None = None
-    """Minimum ratio in decibels of a frame's power to noise and other frames for a receiver to begin to receive it."""
+    """Minimum ratio in decibels between the power of a frame and the power of noise and other frames, at which a
+    receiver begins to receive the frame.
+    """
     sinr_db: float | None = None
-    """Minimum ratio in decibels of a frame's power to noise and other frames while a receiver receives it."""
+    """Minimum ratio in decibels between the power of a frame and the power of noise and other frames, while a receiver
+    receives the frame.
+    """
     capture_window_s: float | None = None
-    """Seconds from the beginning of a frame in which a receiver changes to a stronger frame."""
+    """Seconds after the beginning of a frame during which its receiver changes to a stronger frame."""
     frequency_hz: float | None = None
     """Carrier frequency in hertz."""
     exponent: float | None = None
@@ -58,16 +65,19 @@ class ChannelModel(StrictModel):
     shadowing_db: float | None = None
     """Standard deviation of the shadowing in decibels."""
     shadowing_m: float | None = None
-    """Metres that a vehicle moves until the correlation of the shadowing has fallen to 37 %. 0: each frame draws its
-    own shadowing."""
+    """Metres that a vehicle moves until the correlation of the shadowing has fallen to 37 %. With 0, each frame has its
+    own random shadowing.
+    """
     shadowing_s: float | None = None
-    """Seconds until the correlation of the shadowing has fallen to 37 %. 0: each frame draws its own shadowing."""
+    """Seconds until the correlation of the shadowing has fallen to 37 %. With 0, each frame has its own random
+    shadowing.
+    """
     ground: Literal["none", "two_ray"] | None = None
     """`two_ray`: the ground reflects the signal, which limits the range of low antennas. `none`: no ground."""
     antenna_m: float | None = None
     """Height of the antenna above the vehicle in metres, for `ground: two_ray`."""
     header_bytes: int | None = None
-    """Bytes of a frame besides the data of the message."""
+    """Bytes of a frame in addition to the data of the message."""
     largest_bytes: int | None = None
     """Largest message in bytes. A longer message is not sent."""
     queue_frames: int | None = None
@@ -75,39 +85,39 @@ class ChannelModel(StrictModel):
     rate_bps: float | None = None
     """802.11 and telemetry radio: bits per second on the air."""
     preamble_s: float | None = None
-    """802.11 and telemetry radio: seconds of a frame before its first byte."""
+    """802.11 and telemetry radio: duration in seconds of the part of a frame before its first byte."""
     symbol_s: float | None = None
-    """802.11: seconds of a symbol. A frame has whole symbols."""
+    """802.11: duration of a symbol in seconds. A frame consists of whole symbols."""
     padding_bits: int | None = None
-    """802.11: bits of a frame that carry no byte."""
+    """802.11: bits of a frame that do not belong to a byte."""
     extension_s: float | None = None
-    """802.11: seconds of silence that belong to the end of a frame."""
+    """802.11: seconds of silence that count as part of a frame, at its end."""
     slot_s: float | None = None
-    """802.11: seconds of a slot of the backoff."""
+    """802.11: duration of a slot of the backoff in seconds."""
     difs_s: float | None = None
-    """802.11: seconds that the channel must be idle before a station counts slots."""
+    """802.11: seconds that the channel must be idle before a station begins to count slots."""
     eifs_s: float | None = None
-    """802.11: the same after a frame with an error, in seconds. At least `difs_s`."""
+    """802.11: the same as `difs_s`, but after a frame with an error. At least `difs_s`."""
     contention_window: int | None = None
-    """802.11: greatest number of slots of a backoff."""
+    """802.11: maximum number of slots of a backoff."""
     sense_s: float | None = None
     """802.11: seconds until a station senses that a frame has begun."""
     energy_dbm: float | None = None
-    """802.11: received power in dBm from which a station senses a frame that it does not receive."""
+    """802.11: minimum received power in dBm at which a station senses a frame that it does not receive."""
     turn_s: float | None = None
-    """Telemetry radio: seconds of the time slot of a vehicle."""
+    """Telemetry radio: duration of the time slot of a vehicle in seconds."""
     guard_s: float | None = None
     """Telemetry radio: seconds of silence at the end of a time slot."""
     duty: float | None = None
-    """Telemetry radio and LoRa: largest share of the time in which a radio may send, up to 1."""
+    """Telemetry radio and LoRa: maximum share of the time in which a radio may send, up to 1."""
     spreading_factor: int | None = None
     """LoRa: spreading factor, 6 to 12."""
     bandwidth_hz: float | None = None
     """LoRa: bandwidth in hertz."""
     coding_rate: int | None = None
-    """LoRa: bits that carry four bits of data, 5 to 8."""
+    """LoRa: number of bits that carry four bits of data, 5 to 8."""
     preamble_symbols: int | None = None
-    """LoRa: symbols of the preamble, without the 4.25 symbols that follow."""
+    """LoRa: number of symbols of the preamble, without the 4.25 symbols that follow it."""
 
     def radio(self) -> "Radio":
         """Return the radio model. Raises ValueError for a value out of range, or for a key that this kind of radio does

@@ -2,7 +2,8 @@
 
 The conditions have three layers: those of all links, those of single receivers, and those of single links. A layer
 replaces the keys that it contains. `netem.conditions` defines the values and their valid combinations. This module
-defines their notation in a scenario. `NetworkModel` is for the whole mission, `NetworkLayer` for a change of it.
+defines the notation of the values in a scenario. `NetworkModel` describes the network of the whole mission, and
+`NetworkLayer` a change of it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -59,7 +60,9 @@ class RadioModel(StrictModel):
     log_distance: LogDistance | None = None
     """A radio with a loss that grows with the distance."""
     update_s: Annotated[float, Field(ge=0.1, le=60)] = 1.0
-    """Mission seconds between two updates of the loss. Agents as processes get at most ten updates per second."""
+    """Mission seconds between two updates of the loss. For agents that are processes, there are at most ten updates per
+    second.
+    """
 
     def radio(self) -> radio.Radio:
         if self.hard_range is not None:
@@ -110,7 +113,9 @@ class RandomDelay(StrictModel):
 
 
 def _number_or(mapping: type[StrictModel], number: Any) -> BeforeValidator:
-    """Return a validator for a mapping or a number. An error message then concerns only the kind of the given value."""
+    """Return a validator for a value that is a mapping or a number. The error message for an invalid value mentions
+    only the form that the user chose.
+    """
     numbers = TypeAdapter(number)
 
     def choose(value: Any) -> Any:
@@ -120,7 +125,9 @@ def _number_or(mapping: type[StrictModel], number: Any) -> BeforeValidator:
 
 
 def _or_none(number: Any) -> BeforeValidator:
-    """Return a validator for the word none or a number. An error message then concerns only the number."""
+    """Return a validator for a value that is a number or the word `none`. The error message for an invalid value
+    mentions only the number.
+    """
     numbers = TypeAdapter(number)
     return BeforeValidator(lambda value: value if value == "none" else numbers.validate_python(value))
 
@@ -152,17 +159,22 @@ class ConditionOverrides(StrictModel):
     duplicate: Probability | None = None
     """Probability that a message arrives twice."""
     reorder: Probability | None = None
-    """Probability that a message is sent without the delay, and so overtakes others. Above 0 it needs a `delay`."""
+    """Probability that a message is sent without the delay and overtakes other messages. If it is above 0, a `delay` is
+    required.
+    """
     corrupt: Probability | None = None
     """Probability that one bit of a message flips. The receiver drops such a message because of its checksum."""
     rate: Rate | None = None
-    """Bits per mission second from each sender to each receiver, headers included, at least 8. `none`: no limit."""
+    """Bits per mission second from each sender to each receiver, headers included, at least 8. With `none`, there is no
+    limit.
+    """
     limit: Limit | None = None
     """Number of messages from one sender to one receiver that may wait for delay or rate, 1 to 100,000. Further
-    messages are lost. `none`: no limit. It needs a `delay` or a `rate`."""
+    messages are lost. With `none`, there is no limit. A `limit` requires a `delay` or a `rate`.
+    """
 
     def given(self) -> dict[str, Any]:
-        """Return the conditions that have a value, by key."""
+        """Return the conditions that were given a value, by key."""
         return {key: value for key in KEYS if (value := getattr(self, key)) is not None}
 
 
@@ -182,9 +194,9 @@ class LinkOverrides(ConditionOverrides):
     model_config = ConfigDict(serialize_by_alias=True)
 
     from_: VehicleIds = Field(alias="from")
-    """Sender, or a list of senders."""
+    """ID of the sender, or a list of senders."""
     to: VehicleIds
-    """Receiver, or a list of receivers. A vehicle that is a sender too is an error."""
+    """ID of the receiver, or a list of receivers. It is an error if a vehicle is both a sender and a receiver."""
     both: bool = False
     """True if the conditions also apply to the opposite direction."""
 
@@ -196,9 +208,9 @@ class LinkOverrides(ConditionOverrides):
 
 
 Scope = None | int | tuple[int, int]
-"""Scope of a condition: None for all links, a receiver, or a link as (sender, receiver)."""
+"""Scope of a condition: None for all links, a vehicle ID for one receiver, or (sender, receiver) for one link."""
 NetworkValues = dict[Scope, dict[str, Any]]
-"""The conditions of a network, or a change of them: scope -> key -> value."""
+"""Network conditions, or a change of them: scope -> key -> value."""
 
 
 class NetworkLayer(ConditionOverrides):
@@ -216,8 +228,8 @@ class NetworkLayer(ConditionOverrides):
         return self
 
     def by_scope(self) -> NetworkValues:
-        """Return the conditions by scope: all links, one receiver, or one link. Raises ConditionsError if entries
-        overlap.
+        """Return the conditions by scope: all links, one receiver, or one link. Raises ConditionsError if two entries
+        concern the same link.
         """
         return {None: self.given(), **_values_of(self.receivers, self.links)}
 
@@ -232,9 +244,9 @@ class NetworkDisturbance(StrictModel):
     loss: Loss | None = None
     """Probability that a message is lost, or loss in bursts. The same as `network: {loss: ...}`."""
     partition: list[list[VehicleId]] | None = None
-    """Groups of vehicles that no message connects. Vehicles in no group form a further group."""
+    """Groups of vehicles. Messages between different groups are lost. Vehicles in no group form a further group."""
     network: NetworkLayer | None = None
-    """Other conditions of the network. Keys that it does not contain stay as they are."""
+    """Other conditions of the network. Conditions that it does not contain do not change."""
 
     @model_validator(mode="after")
     def _check_loss(self) -> "NetworkDisturbance":
@@ -263,16 +275,21 @@ class NetworkModel(StrictModel):
     delay: DelayTime = 0.0
     """Delay in mission seconds, 0 to 60, or a distribution of delays."""
     duplicate: Probability = 0.0
-    """Probability that a message arrives twice."""
+    """Probability that a message is sent without the delay and overtakes other messages. If it is above 0, a `delay` is
+    required.
+    """
     reorder: Probability = 0.0
     """Probability that a message is sent without the delay, and so overtakes others. Above 0 it needs a `delay`."""
     corrupt: Probability = 0.0
     """Probability that one bit of a message flips. The receiver drops such a message because of its checksum."""
     rate: Rate = "none"
-    """Bits per mission second from each sender to each receiver, headers included, at least 8. `none`: no limit."""
+    """Bits per mission second from each sender to each receiver, headers included, at least 8. With `none`, there is no
+    limit.
+    """
     limit: Limit = "none"
     """Number of messages from one sender to one receiver that may wait for delay or rate, 1 to 100,000. Further
-    messages are lost. `none`: no limit. It needs a `delay` or a `rate`."""
+    messages are lost. With `none`, there is no limit. A `limit` requires a `delay` or a `rate`.
+    """
     receivers: dict[VehicleKey, ReceiverOverrides] = {}
     """Conditions of single receivers, by vehicle ID."""
     links: Annotated[list[LinkOverrides], Field(max_length=10_000)] = []
@@ -294,8 +311,8 @@ class NetworkModel(StrictModel):
         return _named(self.receivers, self.links)
 
     def by_scope(self) -> NetworkValues:
-        """Return the conditions by scope: all links, one receiver, or one link. Raises ConditionsError if entries
-        overlap.
+        """Return the conditions by scope: all links, one receiver, or one link. Raises ConditionsError if two entries
+        concern the same link.
         """
         return {None: {key: getattr(self, key) for key in KEYS}, **_values_of(self.receivers, self.links)}
 
@@ -332,7 +349,7 @@ def overlay(network: NetworkValues, layer: NetworkValues) -> NetworkValues:
 
 
 def scope_in_words(scope: Scope) -> str:
-    """Return a phrase about the affected links for the end of a sentence, as in "loss from 1 to 2"."""
+    """Describe the affected links in a phrase for the end of a sentence, as in "loss from 1 to 2"."""
     if scope is None:
         return ""
     return f" from {scope[0]} to {scope[1]}" if isinstance(scope, tuple) else f" to {scope}"

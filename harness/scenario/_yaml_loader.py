@@ -27,14 +27,14 @@ except ImportError:  # PyYAML was built without libyaml
 MAX_NESTING = 50
 MAX_VALUES = 300_000
 MAX_NUMBER = 200
-"""Maximum number of characters of a number or a time."""
+"""Maximum number of characters of a number or a time in a YAML file."""
 
 
 class YamlLoader(Composer, CParser, SafeConstructor, Resolver):
     """A safe loader that rejects duplicate keys, deep nesting, many values, and long numbers.
 
-    YAML forbids duplicate keys, but the safe loader of PyYAML uses the last one. Each alias counts as all values of its
-    anchor: a few lines of aliases can stand for gigabytes. The conversion of a number takes time that grows with the
+    YAML forbids duplicate keys, but the safe loader of PyYAML uses the last one. An alias counts as many values as its
+    anchor contains, because a few lines of aliases can stand for gigabytes. The time to convert a number grows with the
     square of its length.
     """
 

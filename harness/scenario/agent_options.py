@@ -4,7 +4,8 @@
     agent_command: {2: [./my_agent, --fast], 5: [./another_agent]}
     quirks: {ignore_commit: 0.2, crash_on_tie: {agents: [32, 122]}}
 
-Each agent receives its own settings in its mission file. It does not know that other agents have other settings.
+The mission file of each agent contains only the agent's own settings. An agent does not know the settings of other
+agents.
 """
 
 import base64
@@ -67,7 +68,7 @@ class QuirkOfAgents(StrictModel):
     agents: Annotated[list[VehicleId], Field(min_length=1)]
     """IDs of the agents that make the mistake."""
     value: bool | float = True
-    """true, or the probability 0 to 1 of a quirk that needs one."""
+    """true, or a probability from 0 to 1 if the quirk needs one."""
 
 
 def _schema() -> dict[str, Any]:
@@ -90,7 +91,7 @@ QuirkValue = Annotated[
     BeforeValidator(lambda value: QuirkOfAgents.model_validate(value) if isinstance(value, Mapping) else value),
 ]
 QuirkValues = Annotated[dict[str, QuirkValue], WithJsonSchema(_schema())]
-"""Quirk -> its value for all agents, or the agents that have it."""
+"""Name of a quirk -> its value for all agents, or the agents that have the quirk."""
 
 
 def check_quirks(asked: Mapping[Any, Any]) -> None:
@@ -112,7 +113,7 @@ def quirks_of_agent(asked: Mapping[str, bool | float | QuirkOfAgents], agent_id:
 
 
 def quirks_in_words(asked: Mapping[str, bool | float | QuirkOfAgents]) -> Iterator[str]:
-    """Yield each deliberate error that is switched on, with its agents, such as "ignore_commit 0.2 (all agents)"."""
+    """Yield a text for each quirk that is switched on, with its agents, such as "ignore_commit 0.2 (all agents)"."""
     for name, quirk in asked.items():
         value = quirk.value if isinstance(quirk, QuirkOfAgents) else quirk
         if value:
@@ -126,19 +127,24 @@ def _agents(ids: list[int]) -> str:
 
 
 class SecurityOptions(StrictModel):
-    """A secured mission. Agents seal each datagram, refuse forged and repeated ones, and sign their blocks."""
+    """A secured mission. Agents encrypt each datagram, reject forged and repeated datagrams, and sign their blocks."""
 
     keys: Annotated[str, Field(min_length=1, max_length=4000)] = "fresh"
-    """`fresh`: each run generates its keys. Otherwise a directory from `ucp-harness keys new`, or a directory of
-    bundles."""
+    """`fresh`, or a directory. With `fresh`, each run generates its keys. The directory comes from `ucp-harness keys
+    new`, or contains bundles.
+    """
     fingerprint: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
-    """Fingerprint of the public keys, as `ucp-harness keys inspect` prints it. The run ends with an error if `keys` is
-    a directory of other keys. Default: not compared."""
+    """Fingerprint of the public keys, as `ucp-harness keys inspect` prints it. The run ends with an error if the
+    directory in `keys` contains other keys. By default, the fingerprint is not compared.
+    """
     captured: VehicleId | None = None
-    """ID of a captured vehicle. The rogue node seals its datagrams with the keys of this vehicle. Default: none."""
+    """ID of a captured vehicle. The rogue node encrypts its datagrams with the keys of this vehicle. By default, no
+    vehicle is captured.
+    """
     seal: bool = False
-    """True if event data is encrypted for the depot, so that no agent can read the data of others. A block then has
-    room for 48 bytes less."""
+    """True if event data is encrypted for the depot, so that no agent can read the data of other agents. A block then
+    has room for 48 bytes less.
+    """
 
     @model_validator(mode="after")
     def _fingerprint_is_of_a_directory(self) -> "SecurityOptions":
@@ -149,7 +155,9 @@ class SecurityOptions(StrictModel):
 
 Staggered = Literal["vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s", "finalize_gap_s"]
 Stagger = dict[Staggered, Annotated[float, Field(ge=0, le=MAX_TIMER_S)]]
-"""Timer -> mission seconds by which it is longer than the timer of the agent with the next lower ID."""
+"""Timer -> number of mission seconds by which this timer of an agent is longer than the same timer of the agent with
+the next lower ID.
+"""
 
 
 def staggered(settings: Settings, stagger: Mapping[Staggered, float], place: int) -> Settings:
@@ -161,20 +169,22 @@ def staggered(settings: Settings, stagger: Mapping[Staggered, float], place: int
 
 
 Bytes = bytes
-"""The type `bytes`. A scripted event has a key of the same name."""
+"""The type `bytes` under a second name, because a key of scripted events is also called `bytes`."""
 MAX_DATA_CHARACTERS = 1400
-"""Maximum length of event data in base64: 1024 bytes, with a margin."""
+"""Maximum length of event data in base64. It is enough for 1024 bytes."""
 
 
 class ScriptedEvent(StrictModel):
-    """One event that an agent logs. Its data are a given number of zero bytes, or the data of a recorded event."""
+    """One event that an agent logs. Its data are a given number of zero bytes, or those of a recorded event."""
 
     at_s: MissionSecond
     """Mission second at which the agent logs the event."""
     agent: VehicleId
     """ID of the agent."""
     bytes: Annotated[int, Field(ge=0, le=1024)] = 256
-    """Number of data bytes, all zero. `data` replaces them. More than `settings.max_event_bytes` allows is an error."""
+    """Number of data bytes, which are all zero. If `data` is given, it is used instead. More than
+    `settings.max_event_bytes` allows is an error.
+    """
     event_id: Annotated[int, Field(ge=1, le=254, strict=True)] = 1
     """ID of the kind of event."""
     data: Annotated[Data, Field(max_length=MAX_DATA_CHARACTERS)] | None = None
@@ -182,8 +192,9 @@ class ScriptedEvent(StrictModel):
     timestamp_us: Annotated[int, Field(ge=0, lt=2**64, strict=True)] | None = None
     """Timestamp of a recorded event in microseconds, in virtual time only. Default: the clock of the agent."""
     sealed: Annotated[Data, Field(max_length=MAX_DATA_CHARACTERS)] | None = None
-    """Sealed data, in base64, of the block that this recorded event completed. A replay has no keys to seal the block
-    again. It needs a `timestamp_us`."""
+    """Encrypted event data, in base64, of the block that this recorded event completed. A replay does not have the keys
+    to encrypt the data again. The key requires `timestamp_us`.
+    """
 
     @property
     def event_data(self) -> Bytes:
@@ -225,7 +236,7 @@ class EventOptions(StrictModel):
 
 
 MIN_MEMORY_MIB = 6
-"""Docker refuses a container with a lower limit."""
+"""Minimum memory limit in MiB. Docker refuses a container with a lower limit."""
 
 
 class DockerOptions(StrictModel):
@@ -237,8 +248,10 @@ class DockerOptions(StrictModel):
     image_from_host: bool = False
     """True if containers use the programs and packages of this machine, read-only, instead of the project's image."""
     memory_mib: Annotated[int, Field(ge=MIN_MEMORY_MIB, strict=True)] | None = None
-    """Maximum memory in MiB. Default: no limit."""
+    """Maximum memory in MiB. By default, there is no limit."""
     cpus: Annotated[float, Field(ge=0.01, allow_inf_nan=False)] | None = None
-    """Maximum processor time per second, in processors. 0.5 is half of one processor. Default: no limit."""
+    """Maximum processor time per second, as a number of processors. 0.5 is half of one processor. By default, there is
+    no limit.
+    """
     pids: Annotated[int, Field(ge=1, strict=True)] | None = None
-    """Maximum number of processes and threads. Default: no limit."""
+    """Maximum number of processes and threads. By default, there is no limit."""

@@ -11,7 +11,7 @@ from harness.scenario.scenario import Scenario
 _AGENT_PREFIX = re.compile(r"(?P<agent>[0-9]{1,5})=")
 
 Programs = Mapping[int | None, list[str]]
-"""Agent ID -> command. The key None has the command of all agents without a command of their own here."""
+"""Agent ID -> command. The key None stands for all agents that have no own entry."""
 
 
 def programs_of(options: Iterable[str]) -> Programs:

@@ -1,7 +1,7 @@
 """Represent the timeline of a run as objects: network changes, faults and injections.
 
 The timeline is computed before the run from the scenario alone. Therefore every backend plays the same timeline. The
-checker does not use it.
+checker does not use this timeline.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,11 +16,11 @@ from harness.scenario.injection import Injection, InjectionName
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 RANGE = "range"
-"""Name of a network change caused by the flight of vehicles, not by the scenario."""
+"""Name of a network change that the flight of vehicles causes, and not the scenario."""
 FINAL_RECONCILE = "final reconcile"
 """Name of the network change before the final reconcile."""
 NO_MORE_FATES = "no more fates"
-"""Name of the record at the end of the scripted fates. No change happens then."""
+"""Name of the record that marks the end of the scripted fates. Nothing changes at this time."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,16 @@ class NetworkChange:
     detail: str
     conditions: NetworkConditions
     clears_all: bool = False
-    """True if the loss over distance ends too."""
+    """True if the change also ends the loss that depends on distance."""
     losses: Mapping[str, float] = field(default_factory=dict)
-    """Changed losses of the radio: pair of vehicles, as in "1-2" -> probability, 0 to 1."""
+    """Radio losses that have changed: pair of vehicles, as in "1-2" -> probability, 0 to 1."""
     by_hand: bool = False
     """True if a user requested the change during the run."""
     channel: str | None = None
-    """Preset of the channel that vehicles share. A channel may lose any message."""
+    """Preset of the radio channel that vehicles share. On a shared channel, any message may be lost."""
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        """Return the record of this change, made at mission second `at_s`."""
+        """Return the record of this change. It was made at mission second `at_s`."""
         return {
             "at_s": at_s,
             "what": self.what,
@@ -72,7 +72,7 @@ class TimedInjection:
         return self.injection.in_words()
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        """Return the record of this injection, started at mission second `at_s`."""
+        """Return the record of this injection. It started at mission second `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail}
         return {**record, **planned_key(self.at_s, at_s), **_hand(self.by_hand)}
 
@@ -100,8 +100,8 @@ def injections_of(scenario: Scenario) -> list[TimedInjection]:
 
 
 def silent_injections(begun: Sequence[TimedInjection], sent: Mapping[int, int]) -> list[str]:
-    """Return a sentence for each injection that sent nothing. `sent` maps the number of an injection to its datagram
-    count.
+    """Return a sentence for each injection that sent nothing. `sent` maps the number of an injection to the number of
+    its datagrams.
     """
     return [
         f"{injected.what} at {injected.at_s:g} s ({injected.detail}) sent nothing, for nothing like it was heard"
@@ -120,7 +120,7 @@ def _network_states(scenario: Scenario) -> list[Change]:
 
 
 def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the records of network changes. Those before the end of scripted deliveries at `at_s` are marked as not
+    """Return the records of network changes. While scripted deliveries are active, until `at_s`, they are marked as not
     fully connected.
     """
     since = round(at_s + 0.001, 3)  # include messages of the same instant
@@ -131,8 +131,8 @@ def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[
 
 
 def final_reconcile(at_s: float) -> NetworkChange:
-    """Return the network change for the final reconcile. It removes all network conditions, so that all messages
-    arrive.
+    """Return the network change for the final reconcile. The change removes all network conditions, so that all
+    messages arrive.
     """
     return replace(_change(at_s, FINAL_RECONCILE, NetworkConditions()), clears_all=True)
 
@@ -148,7 +148,7 @@ def describe(conditions: NetworkConditions) -> str:
     """Return network conditions as text, such as "loss 15 %, loss 50 % to 3, loss 90 % from 1 to 2, partition 1 2 | 3 4
     5".
 
-    The text has the differences of each receiver from the default, and of each link from its receiver.
+    The text contains the differences between each receiver and the default, and between each link and its receiver.
     """
     words = _differences(conditions.default, LinkConditions())
     if conditions.default.loss == 0.0:

@@ -55,10 +55,10 @@ FigureName = Literal[
     "mutual_chain_before_final_reconcile",
     "distinct_chains_before_final_reconcile",
 ]
-"""The figures that `harness.checker._figures` computes."""
+"""Names of the numeric results that `harness.checker._figures` computes."""
 
 CHARACTERISTIC_NUMBERS = {number: int(number) for number in CHARACTERISTICS}
-"""Number of a characteristic as a JSON key -> as an integer."""
+"""Number of a characteristic as a JSON key -> the same number as an integer."""
 
 AS_EXPECTED = "as expected"
 """The remark on a bad verdict that the scenario expects."""
@@ -76,7 +76,7 @@ def _known_number(key: Any) -> int:
 
 
 class NumberRange(StrictModel):
-    """A range of numbers. Needs `min`, `max`, or both. A single number in its place means exactly this number."""
+    """A range of numbers. Needs `min`, `max`, or both. If the value is a single number, only this number is allowed."""
 
     min: Number | None = None
     """Lowest allowed value."""
@@ -115,16 +115,16 @@ Count = Annotated[NumberRange, BeforeValidator(_exactly)]
 
 
 class CommonBlocks(StrictModel):
-    """The expected length of the common part of several chains, or of the chain of one agent."""
+    """The expected length of the common beginning of several chains, or of the chain of one agent."""
 
     agents: Annotated[list[VehicleId], Field(min_length=1)]
     """IDs of the agents."""
     blocks: Count
-    """Number of blocks, from the inception block on, that the chains of all these agents share."""
+    """Number of blocks at the beginning that the chains of all these agents have in common."""
 
 
 class Expect(StrictModel):
-    """Expected results. pytest plays every seed on every backend, one test each.
+    """Expected results. pytest runs a test for each combination of seed and backend.
 
     A check without an expected verdict passes unless its verdict is bad.
     """
@@ -136,16 +136,17 @@ class Expect(StrictModel):
     records: RecordsVerdict | None = None
     """Expected verdict of the check that compares records of the same facts."""
     liveness: LivenessVerdict | None = None
-    """Expected verdict of the check whether the swarm became idle."""
+    """Expected verdict of the check that tests whether the swarm became idle."""
     figures: dict[FigureName, Count] = {}
-    """Expected figures of the run, by name, as a number or a range."""
+    """Expected numeric results of the run, by name. A value is a number or a range."""
     chains: dict[VehicleKey, ChainHash] = {}
-    """Expected top chain hash at the end, by agent ID. It identifies the whole chain."""
+    """Expected top chain hash at the end, by agent ID. The top chain hash identifies the whole chain."""
     common: Annotated[list[CommonBlocks], Field(max_length=1000)] = []
-    """Expected lengths of chains, and of the common parts of chains."""
+    """Expected lengths of chains, or of the common beginnings of chains."""
     deviations: dict[VehicleKey, str] = {}
-    """Agent ID -> the handler in which the agent first deviates from the algorithms. Other agents must not deviate. Any
-    other value of `steps` than `deviates` is an error."""
+    """Agent ID -> the handler in which the agent first deviates from the algorithms. Other agents must not deviate. If
+    `steps` is given, its value must be `deviates`.
+    """
     backends: Annotated[list[BackendName], Field(min_length=1)] = ["sim"]
     """Backends to play, each once."""
     seeds: Annotated[list[Annotated[int, Field(ge=0, strict=True)]], Field(min_length=1, max_length=10_000)] = [1]
@@ -203,8 +204,8 @@ class Expect(StrictModel):
         return kind_of(verdict) != "bad" if expected is None else verdict == expected
 
     def remark(self, key: str, verdict: str) -> str:
-        """Return the words that follow a verdict: "as expected" if it is expected although it is not good, "expected:
-        holds" if a different verdict was expected, and otherwise an empty text.
+        """Return the remark on a verdict. It is "as expected" if the scenario expects this verdict although it is not
+        good, "expected: holds" if the scenario expects another verdict, and otherwise empty.
         """
         expected = self.verdict(key)
         if verdict == expected:
@@ -223,7 +224,7 @@ class Expect(StrictModel):
     ) -> Iterator[tuple[str, list[str]]]:
         """Yield each kind of expectation other than verdicts, with a sentence for each unmet expectation of this kind.
 
-        `chains` has the block hashes of each agent's chain, and `found` an agent and a handler for each deviation.
+        `chains` has the block hashes of each agent's chain. `found` has an agent and a handler for each deviation.
         """
         if self.figures:
             yield "expected figures", list(self.out_of_range(figures))
@@ -241,7 +242,7 @@ class Expect(StrictModel):
                 yield f"{name.replace('_', ' ')} is {shown}, and should be {wanted.describe()}"
 
     def unexpected_chains(self, top_chain_hashes: Mapping[int, str]) -> Iterator[str]:
-        """Yield a sentence for each agent whose chain differs from the expected one. `top_chain_hashes` are from the
+        """Yield a sentence for each agent whose chain differs from the expected one. `top_chain_hashes` comes from the
         exports.
         """
         for agent_id, wanted in self.chains.items():
@@ -259,7 +260,7 @@ class Expect(StrictModel):
             yield from ((f"common.{index}.agents", agent) for agent in common.agents)
 
     def unexpected_common_blocks(self, chains: Mapping[int, Sequence[str]]) -> Iterator[str]:
-        """Yield a sentence for each chain, or common part of chains, whose length differs from the expected one."""
+        """Yield a sentence for each chain or common beginning of chains whose length differs from the expected one."""
         for common in self.common:
             there = all(agent in chains for agent in common.agents)
             levels = zip(*(chains[agent] for agent in common.agents), strict=False) if there else ()

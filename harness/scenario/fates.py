@@ -29,10 +29,12 @@ MessageName = Literal[
 
 _BLOCK_NAME = r"^[1-9]\d{0,4}\.[1-9]\d{0,6}$"
 BlockName = Annotated[str, Field(pattern=_BLOCK_NAME)]
-"""`<agent>.<ordinal>`, the ordinal counting from 1 that agent's completed blocks. YAML needs quotes: "4.10"."""
+"""Name of a block: `<agent>.<ordinal>`. The ordinal numbers the completed blocks of this agent from 1. YAML needs
+quotes: "4.10".
+"""
 
 OUTCOMES = ("drop", "delay_s", "hold_until_s", "after", "arrivals")
-"""Keys that decide about the delivery of a message."""
+"""Keys of a fate that decide about the delivery of a message."""
 
 FateName = Annotated[str, Field(min_length=1, max_length=100)]
 
@@ -50,41 +52,42 @@ def _quoted(value: Any) -> Any:
 class Fate(StrictModel):
     """A rule that decides about the delivery of the messages that match it.
 
-    A message matches if it agrees with all of the keys `message`, `sender`, `receiver`, `block`, `from_s` and `until_s`
-    that the fate has. The first fate that matches decides. A fate needs exactly one of `drop`, `delay_s`,
-    `hold_until_s`, `after` and `arrivals`, or only a `name`. With only a name, the network conditions decide about the
-    message. A partition cuts messages in any case.
+    A message matches if it has the values of all keys `message`, `sender`, `receiver`, `block`, `from_s` and `until_s`
+    that the fate contains. If several fates match, the first one decides. A fate needs exactly one of `drop`,
+    `delay_s`, `hold_until_s`, `after` and `arrivals`, or only a `name`. A fate that has only a name leaves the delivery
+    to the network conditions. A partition stops messages in any case.
     """
 
     message: MessageName | None = None
-    """Type of the message. Default: any."""
+    """Type of the message. By default, any type matches."""
     sender: VehicleId | None = None
-    """ID of the sender. Default: any."""
+    """ID of the sender. By default, any sender matches."""
     receiver: VehicleId | None = None
-    """ID of the receiver. Default: each receiver."""
+    """ID of the receiver. By default, every receiver matches."""
     block: Annotated[BlockName | None, BeforeValidator(_quoted)] = None
-    """Block that the message is about: an agent and the number of its block, as in "4.11", in quotes."""
+    """Block that the message concerns: an agent and the number of its block, in quotes, as in "4.11"."""
     count: Annotated[int, Field(ge=1)] | list[Annotated[int, Field(ge=1)]] | None = None
-    """Position among the matching messages, from 1, or a list of positions. Default: all of them."""
+    """Which of the matching messages: a number, counted from 1, or a list of numbers. By default, all of them."""
     from_s: MissionSecond | None = None
-    """Mission second from which the message is sent."""
+    """First mission second at which the message may have been sent."""
     until_s: MissionSecond | None = None
-    """Mission second before which the message is sent, after `from_s`."""
+    """Mission second before which the message must have been sent. It must be later than `from_s`."""
 
     drop: Literal[True] | None = None
-    """The message is lost."""
+    """If true, the message is lost."""
     delay_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     """The message arrives after this number of mission seconds, regardless of the network conditions."""
     hold_until_s: MissionSecond | None = None
-    """The message arrives at this mission second if it would arrive earlier."""
+    """If the message would arrive before this mission second, it arrives at this mission second."""
     after: FateName | None = None
     """The message arrives directly after the message of the fate with this `name`."""
     arrivals: Arrivals | None = None
     """Arrivals of all datagrams from `sender` to `receiver`. In "0@12.3 1@12.75" datagram 0 arrives at mission second
-    12.3 and datagram 1 at 12.75. Numbers start at 0 and count across reboots of the sender. A number that is listed
-    twice arrives twice. All other datagrams are lost."""
+    12.3 and datagram 1 at 12.75. The datagrams are numbered from 0, across reboots of the sender. A datagram that is
+    listed twice arrives twice. All other datagrams are lost.
+    """
     name: FateName | None = None
-    """Name of the fate, for `after`. Two fates with the same name are an error."""
+    """Name of the fate, to which `after` of another fate can refer. Two fates with the same name are an error."""
 
     @property
     def left_to_chance(self) -> bool:

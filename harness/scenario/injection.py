@@ -10,9 +10,10 @@ timeline:
   - {at_s: 700, flood: {for_s: 10, per_s: 50, message: Chain Contain Query}}
   - {at_s: 800, lie: {message: Commit Block, sender: 3, receivers: [1, 2], block: made 790.5, chain: ["2.1", "1.1"]}}
 
-A rogue node plays the injections. It receives every message that an agent sends, and every agent receives its messages,
-regardless of network conditions and partitions. It cannot remove messages: the original of a delayed or corrupted
-message arrives too, and so does the true answer beside a forged one.
+A rogue node plays the injections. The rogue node is a sender outside the swarm. It receives every message that an agent
+sends, and every agent receives its messages, regardless of network conditions and partitions. It cannot remove
+messages. If it sends a delayed or corrupted copy, the original also arrives. If it forges an answer, the true answer
+also arrives.
 
 datagrams:
   - {source: 32, datagram: VUMBBQ..., reaches: {10: 812.3, 28: 812.31}}
@@ -27,19 +28,19 @@ from harness.scenario.strict_model import Data, MissionSecond, Seconds, StrictMo
 
 InjectionName = Literal["replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie"]
 INJECTIONS: tuple[InjectionName, ...] = ("replay", "duplicate", "delay", "corrupt", "forge", "flood", "lie")
-"""Keys of a timeline entry."""
+"""Keys of a timeline entry that inject messages."""
 
 MAX_FLOOD = 100_000
-"""Datagrams of one flood."""
+"""Maximum number of datagrams of one flood."""
 
 
 class _MatchingMessages(StrictModel):
     """The messages of one type and one sender, among those that the rogue node receives."""
 
     message: MessageName | None = None
-    """Type of the messages. Default: any."""
+    """Type of the messages. By default, any type matches."""
     sender: VehicleId | None = None
-    """ID of the sender. Default: any."""
+    """ID of the sender. By default, any sender matches."""
 
     def matches(self, message: str, sender: int) -> bool:
         return self.message in (None, message) and self.sender in (None, sender)
@@ -114,7 +115,7 @@ class Forgery(StrictModel):
     """The rogue node sends messages in the name of an agent.
 
     A forged Commit Block is sent once. It contains a new block in the name of `sender`, on top of the last chain that
-    the rogue node knows. The other messages are answers: for `for_s`, the rogue node answers each question of the other
+    the rogue node knows. The other messages are answers. During `for_s`, the rogue node answers each query of the other
     agents before `sender` does. Its answer to a Chain Hash Successor Query is always "Is Top Of Chain".
     """
 
@@ -125,10 +126,11 @@ class Forgery(StrictModel):
     sender: VehicleId
     """ID of the agent in whose name the rogue node sends."""
     for_s: Seconds | None = None
-    """Duration in mission seconds. Needed for answers, an error for a Commit Block."""
+    """Duration in mission seconds. Required for answers, and an error for a Commit Block."""
     approve: bool | None = None
-    """True if a forged Block Add Response or Chain Contain Response approves. Default: no. An error for other
-    messages."""
+    """True if a forged Block Add Response approves, or a forged Chain Contain Response answers yes. The default is
+    false. For other messages, the key is an error.
+    """
 
     @property
     def lasts_s(self) -> float:
@@ -155,7 +157,7 @@ class Flood(_LastingInjection):
     """
 
     per_s: Annotated[float, Field(gt=0, le=10_000, allow_inf_nan=False)]
-    """Messages per mission second."""
+    """Number of messages per mission second."""
 
     @model_validator(mode="after")
     def _can_be_counted(self) -> "Flood":
@@ -173,8 +175,8 @@ BlockName = Annotated[str, Field(pattern=r"^(\d{1,5}\.\d{1,6}|made \d{1,9}(\.\d{
 class Lie(StrictModel):
     """The rogue node sends one message with the given content in the name of an agent.
 
-    The type of the message decides which of `block`, `chain`, `approve` and `timestamp_s` it needs. A missing or
-    additional key is an error.
+    The type of the message determines which of the keys `block`, `chain`, `approve` and `timestamp_s` are required. A
+    missing or additional key is an error.
     """
 
     REQUIRED_KEYS: ClassVar[dict[str, tuple[str, ...]]] = {
@@ -198,16 +200,17 @@ class Lie(StrictModel):
     sender: VehicleId
     """ID of the agent in whose name the rogue node sends."""
     receivers: Annotated[list[VehicleId], Field(min_length=1)] | None = None
-    """IDs of the agents that receive the message. Default: all."""
+    """IDs of the agents that receive the message. By default, all agents receive it."""
     block: BlockName | None = None
     """Block in the message. "2.1" is the first block that agent 2 proposed. "made 12.5" is a new block in the name of
     `sender` with a timestamp of 12.5 mission seconds. A Next in Sequence Response without a block means "Is Top Of
     Chain"."""
     chain: Annotated[list[BlockName], Field(max_length=1000)] | Literal["nobody's"] | None = None
     """Blocks of the chain in the message, oldest first, without the inception block. `nobody's` stands for a hash that
-    no chain has. The block of a Commit Block goes on top of this chain."""
+    no chain has. The block of a Commit Block is on top of this chain.
+    """
     approve: bool | None = None
-    """True if the message approves the block, or if the chain of `sender` contains `chain`."""
+    """True if the message approves the block, or states that the chain of `sender` contains `chain`."""
     timestamp_s: MissionSecond | None = None
     """Timestamp in a Next in Sequence Response, in mission seconds."""
 
@@ -246,7 +249,7 @@ MODELS: dict[str, type[Injection]] = {
 
 
 MAX_CHARACTERS = 4 * (65536 // 3 + 1)
-"""Length in base64 of the largest UDP datagram."""
+"""Maximum length in base64 of a UDP datagram."""
 
 
 class ScriptedDatagram(StrictModel):

@@ -29,8 +29,8 @@ def scenario_names() -> list[str]:
 
 
 def find_file(path: Path) -> Path:
-    """Return the file of the included scenario that `path` names. Return `path` if it exists, or if it names no
-    included scenario.
+    """Return the path of the included scenario that `path` names. If a file `path` exists, or no included scenario has
+    this name, return `path`.
     """
     file_name = f"{path}.yaml"
     if len(path.parts) != 1 or not LIBRARY.is_dir() or file_name not in (file.name for file in LIBRARY.iterdir()):
@@ -39,7 +39,7 @@ def find_file(path: Path) -> Path:
 
 
 def first_sentence(name: str) -> str:
-    """Return the first sentence of the comment at the top of the scenario file."""
+    """Return the first sentence of the comment at the top of an included scenario."""
     comment = []
     for line in (LIBRARY / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
@@ -49,12 +49,14 @@ def first_sentence(name: str) -> str:
 
 
 MAX_ERRORS = 20_000
-"""Maximum number of errors that are described. Their description takes a kilobyte each."""
+"""Maximum number of validation errors that are described. The description of each takes a kilobyte."""
 MAX_PROBLEM = 200
-"""Maximum number of characters of a parser message in an error."""
+"""Maximum number of characters of a parser message that an error contains."""
 MAX_FILES_BESIDE = 1000
 MAX_SCENARIO_BYTES = 8 * 1024 * 1024
-"""Maximum size of a scenario file. The events of a flight of two hours with twenty vehicles take half of it."""
+"""Maximum size of a scenario file in bytes. The events of a flight of two hours with twenty vehicles take half of
+it.
+"""
 
 
 def load_scenario(path: Path | str) -> Scenario:
@@ -123,7 +125,7 @@ def read_yaml(path: Path, what: str) -> dict[str, Any]:
 
 
 def _near(path: Path) -> Iterator[str]:
-    """Yield suggestions for a missing file: the names of the included scenarios, and the YAML files in the same
+    """Yield suggestions when a file is missing: the names of the included scenarios, and the YAML files in the same
     directory.
     """
     if len(path.parts) == 1:
@@ -159,7 +161,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def _siblings(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
-    """Return the keys that are allowed at this place of the document."""
+    """Return the keys that are allowed at a place of the document."""
     current = model
     for part in location[:-1]:
         for name, field in current.model_fields.items():

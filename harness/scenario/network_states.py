@@ -1,9 +1,10 @@
 """Compute the states of the network during a mission from the scenario, its timeline, and its schedules.
 
 A change of the timeline lasts until a later change of the same value, or ends after `for_s`. Two temporary changes of
-the same value must not overlap, unless one lies within the other. The inner one then applies, and after its end the
-outer one again. Other overlaps are ambiguous and are rejected. A lasting change must not start during a temporary
-change of the same value. A value is a key of all links, of a receiver or of a link, or the partition.
+the same value must not overlap, unless one lies inside the other. The inner change then applies, and after its end the
+outer change applies again. Other overlaps are ambiguous and are rejected. A lasting change must not start during a
+temporary change of the same value. A *value* is a condition of all links, of one receiver or of one link, or the
+partition.
 """
 
 import math
@@ -26,9 +27,9 @@ class NetworkState:
 
     roster: tuple[int, ...]
     lasting: NetworkValues
-    """Lasting conditions, of the scenario and of its timeline so far."""
+    """Lasting conditions: those of the scenario, changed by the timeline so far."""
     layers: list[TemporaryChange]
-    """The current layer of each schedule."""
+    """The change that each schedule makes at this moment."""
     partition: Groups = ()
     temporary: list[TimelineEntry] = field(default_factory=list)
     """Active temporary changes of the timeline, in the order of their start."""
@@ -51,7 +52,7 @@ class NetworkState:
         return replace(conditions, links={**conditions.links, **severed})
 
     def _undivided_groups(self) -> Groups:
-        """Return the groups into which all active partitions together divide the vehicles."""
+        """Return the groups of vehicles that remain connected when all active partitions are combined."""
         temporary = [entry.groups for entry in self.temporary if entry.network_key == PARTITION]
         standing = temporary[-1] if temporary else self.partition
         partitions = [partition for partition in (standing, *(layer.partition for layer in self.layers)) if partition]
@@ -79,7 +80,7 @@ class NetworkStep:
     what: str
     keys: list[str]
     network: NetworkState
-    """The network after the change. The next step changes this object."""
+    """The network after the change. It is valid only until the next step, which changes the same object."""
 
 
 def network_steps(
@@ -121,8 +122,8 @@ def network_steps(
 
 
 def refuse_ambiguous_overlaps(timeline: Sequence[TimelineEntry]) -> None:
-    """Raise ValueError if a change starts during an earlier temporary change of the same value, but ends after it. The
-    result would be ambiguous.
+    """Raise ValueError if a change starts during an earlier temporary change of the same value, but ends after this
+    change. The result would be ambiguous.
     """
     active: dict[tuple[Scope, str], list[tuple[float, int]]] = defaultdict(list)
     for number, entry in sorted(enumerate(timeline), key=lambda numbered: numbered[1].at_s):

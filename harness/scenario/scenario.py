@@ -43,7 +43,7 @@ from ucp.settings import Settings
 from ucp.short_value import shown
 
 MAX_DURATION_S = 31 * 86400
-"""Maximum duration of a mission. A longer run in virtual time would take hours and fill the memory."""
+"""Maximum duration of a mission in seconds. A longer run in virtual time would take hours and fill the memory."""
 MAX_INITIAL_DATA = 64 * 1024
 
 
@@ -51,7 +51,7 @@ class SettlePhase(StrictModel):
     """The time after the mission in which agents finish their votes and reconciles."""
 
     limit_s: Seconds = 1800.0
-    """Maximum number of mission seconds. The run ends earlier when all agents are idle."""
+    """Maximum number of mission seconds. The run ends as soon as all agents are idle."""
 
 
 class AgentClock(StrictModel):
@@ -79,15 +79,17 @@ class Scenario(StrictModel):
     about: Annotated[str, Field(max_length=2000)] = ""
     """Purpose of the run, of at most 2000 characters. The report shows it."""
     agents: int | list[int] = 5
-    """Number of agents, 1 to 1000, or a list of their IDs. A number `n` stands for the IDs 1 to `n`."""
+    """Number of agents, 1 to 1000, or a list of their IDs. The number `n` stands for the IDs 1 to `n`."""
     duration_s: Annotated[Seconds, Field(le=MAX_DURATION_S)] = 1200.0
-    """Duration of the mission in mission seconds. Agents log events until its end. Then `settle` begins."""
+    """Duration of the mission in mission seconds. Agents log events until the end of the mission. Then the time of
+    `settle` begins.
+    """
     speedup: Annotated[float, Field(gt=0, le=1000)] = 20.0
     """Mission seconds per second of wall time, for processes and containers. Virtual time ignores it."""
     network: NetworkModel = NetworkModel()
     """Network conditions at the start. `timeline` and `schedule` can change them."""
     timeline: Annotated[list[TimelineEntry], Field(max_length=10_000)] = []
-    """Changes of the network, faults of agents, and injected messages, each at one instant."""
+    """Changes of the network, faults of agents, and injected messages, each at one mission second."""
     schedule: Annotated[list[Schedule], Field(max_length=100)] = []
     """Ramps and repeated changes of the network."""
     events: EventOptions = EventOptions()
@@ -97,19 +99,21 @@ class Scenario(StrictModel):
     flight: Annotated[list[Flight], Field(max_length=MAX_AGENTS)] = []
     """Flight plans. A vehicle without a plan takes off and stays in place."""
     agent_command: AgentCommand = None
-    """Any program that follows ucp/contract/CONTRACT.md, with its arguments. A list is the command of all agents. A
-    mapping has one command per agent ID, and the other agents are reference agents. Default: reference agents."""
+    """A program that follows ucp/contract/CONTRACT.md, with its arguments. A list is the command of all agents. A
+    mapping has a command for each listed agent ID. All other agents are the harness's own.
+    """
     docker: DockerOptions = DockerOptions()
     """Image and resource limits of containers. Only the backend `docker` uses them."""
     settings: Settings = Settings()
-    """Timers and sizes of the agents, and their readings of ambiguous passages of the thesis."""
+    """Timers and sizes of the agents, and their interpretations of ambiguous passages in the thesis."""
     stagger: Stagger = {}
-    """Mission seconds by which a timer of each agent is longer than that of the agent with the next lower ID. Each
-    agent receives its own durations in its mission file."""
+    """Timer -> mission seconds by which it is longer than the same timer of the agent with the next lower ID. The
+    mission file of each agent contains the agent's own durations.
+    """
     security: SecurityOptions | None = None
-    """Keys of a secured mission. Without them agents accept every datagram."""
+    """Keys of a secured mission. Without this key, the mission is not secured, and agents accept every datagram."""
     quirks: QuirkValues = {}
-    """Mistakes that all agents, or the listed agents, make on purpose. `ucp.quirks` declares them."""
+    """Deliberate mistakes (quirks) of all agents, or of the listed agents. `ucp.quirks` declares them."""
     clocks: dict[VehicleKey, AgentClock] = {}
     """Clocks of agents, by agent ID. Other agents have an exact clock. In virtual time only."""
     fates: Annotated[list[Fate], Field(max_length=100_000), FailFast()] = []
@@ -118,20 +122,25 @@ class Scenario(StrictModel):
     """Datagrams that no agent sent but that agents receive. In virtual time only."""
     lateness: dict[VehicleKey, Lateness] = {}
     """Late timers, by agent ID. In "3+0.25 8+1" the timer with number 3 expires 0.25 mission seconds late, and number 8
-    one second late. Numbers start at 0 and count all timers that the agent starts, across its reboots. Other timers are
-    punctual."""
+    one second late. The timers that the agent starts are numbered from 0, across its reboots. Other timers are
+    punctual.
+    """
     initial_data: Annotated[Data, Field(max_length=MAX_INITIAL_DATA)] | None = None
     """Data of the inception block (BD_0), in base64, at most 65536 characters. By default each run has its own data. In
-    virtual time it follows from `name` and seed."""
+    virtual time they are computed from `name` and the seed.
+    """
     settle: SettlePhase = SettlePhase()
     """Time after the mission in which agents may finish."""
     final_reconcile: bool = False
-    """True if the run ends with perfect network conditions, under which one agent after another reconciles."""
+    """True if the run ends with a final reconcile: under perfect network conditions, one agent after another
+    reconciles.
+    """
     capture: bool = False
-    """True if the run writes every frame that a vehicle sent or received to capture/<ID>.pcapng."""
+    """True if the run writes all frames that a vehicle sent or received to capture/<ID>.pcapng."""
     trace_quota_mb: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    """Maximum size of all traces together, in megabytes, but at least 8 for each agent. A trace ends early at its share
-    of it. Default: half of the free disk space."""
+    """Maximum size of all traces together, in megabytes, but at least 8 for each agent. Each agent has an equal share,
+    and its trace ends early when the share is used up. By default, the maximum is half of the free disk space.
+    """
     gcs: Annotated[str, Field(max_length=300)] | None = None
     """HOST:PORT of a ground station, usually 127.0.0.1:14550. It receives the telemetry of all vehicles by UDP, and may
     command them."""
@@ -152,7 +161,7 @@ class Scenario(StrictModel):
         return tuple(range(1, self.agents + 1)) if isinstance(self.agents, int) else tuple(sorted(self.agents))
 
     def secured(self) -> "Scenario":
-        """Return the scenario with new keys, or unchanged if it already has keys."""
+        """Return a copy of the scenario with new keys. If it already has keys, return it unchanged."""
         return self if self.security else self.model_copy(update={"security": SecurityOptions()})
 
     def settings_of(self, agent_id: int) -> Settings:
@@ -167,7 +176,7 @@ class Scenario(StrictModel):
 
     @property
     def rogue(self) -> int | None:
-        """The vehicle ID of the rogue node, which differs from all agents. None if the timeline injects no messages."""
+        """The ID of the rogue node in the network, which no agent has. None if the timeline injects no messages."""
         if not any(entry.injection for entry in self.timeline):
             return None
         taken = set(self.roster)
@@ -179,13 +188,13 @@ class Scenario(StrictModel):
         return self.roster if self.rogue is None else (*self.roster, self.rogue)
 
     def command_of(self, agent_id: int) -> list[str] | None:
-        """Return the command of this agent without the mission file. Return None for an agent of the harness."""
+        """Return the command of this agent without the mission file. Return None for the harness's own agent."""
         asked = self.agent_command
         return asked.get(agent_id) if isinstance(asked, dict) else asked
 
     @property
     def foreign(self) -> tuple[int, ...]:
-        """The IDs of agents with a command in `agent_command`, in ascending order."""
+        """The IDs of foreign agents, which have a command in `agent_command`, in ascending order."""
         return tuple(agent_id for agent_id in self.roster if self.command_of(agent_id) is not None)
 
     def quirks_of(self, agent_id: int) -> Quirks:
@@ -262,7 +271,7 @@ class Scenario(StrictModel):
         return self
 
     def _named_vehicles(self) -> Iterator[tuple[str, int]]:
-        """Yield each vehicle ID in the scenario, with the key that contains it. Omit the IDs in partitions."""
+        """Yield each vehicle ID in the scenario, with the key that contains it. IDs in partitions are not included."""
         yield from ((f"network.{key}", vehicle) for key, vehicle in self.network.named_vehicles())
         yield from ((f"events.script.{index}.agent", event.agent) for index, event in enumerate(self.events.script))
         yield from (("clocks", vehicle) for vehicle in self.clocks)

@@ -27,7 +27,7 @@ ORDER = (
     "settle",
     "final_reconcile",
 )
-"""Order of the keys in the file. Other keys follow at the end."""
+"""Order of the keys in the file. Keys that are not listed follow at the end."""
 WIDTH = 112
 
 Document = dict[str, Any]
@@ -36,9 +36,7 @@ Document = dict[str, Any]
 def to_yaml(
     document: Document, comment: Iterable[str], remark: Callable[[Document], str | None] = lambda entry: None
 ) -> str:
-    """Return the scenario as YAML text. `remark` returns a comment for an entry of a list. It returns None for no
-    comment.
-    """
+    """Return the scenario as YAML text. `remark` returns a comment for an entry of a list, or None."""
     lines = [f"# {line}".rstrip() for line in comment]
     for key in sorted(document, key=lambda key: ORDER.index(key) if key in ORDER else len(ORDER)):
         lines += _lines(key, _plain(document[key]), remark)
@@ -91,13 +89,13 @@ def _is_long(value: Any) -> bool:
 
 
 def in_one_line(value: Any) -> str:
-    """Return the value as YAML in a single line."""
+    """Return the value as YAML on a single line."""
     written: str = yaml.safe_dump([value], default_flow_style=True, sort_keys=False, width=1e9, allow_unicode=True)
     return written.strip()[1:-1]
 
 
 def _plain(value: Any) -> Any:
-    """Return the value with whole decimal numbers as integers. Agent IDs that are keys also become integers."""
+    """Return the value with decimal numbers such as 5.0 as integers. Agent IDs that are keys also become integers."""
     if isinstance(value, dict):
         named = ((int(key) if isinstance(key, str) and key.isdecimal() else key, item) for key, item in value.items())
         return {key: _plain(item) for key, item in named}

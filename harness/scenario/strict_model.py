@@ -15,7 +15,7 @@ MAX_AGENTS = 1000
 Probability = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 MissionSecond = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-"""Mission seconds since the start."""
+"""A time in mission seconds since the start of the mission."""
 VehicleId = Annotated[int, Field(ge=1, le=MAX_AGENT_ID, strict=True)]
 
 VehicleKey = Annotated[
@@ -33,7 +33,7 @@ def _check_base64(text: str) -> str:
 
 
 Data = Annotated[str, AfterValidator(_check_base64)]
-"""Bytes, in base64."""
+"""Bytes, encoded in base64."""
 
 
 class StrictModel(BaseModel):
@@ -61,7 +61,7 @@ def format_pairs(pairs: Iterable[tuple[int, float]], sign: str) -> str:
 
 
 def _check_pairs(sign: str, example: str) -> BeforeValidator:
-    """Return a validator whose error message shows an example, in place of the regular expression."""
+    """Return a validator whose error message shows an example instead of the regular expression."""
 
     def check(text: Any) -> Any:
         if isinstance(text, str) and len(text) <= MAX_CHARACTERS and not re.match(_pairs_pattern(sign), text):

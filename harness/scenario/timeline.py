@@ -6,10 +6,10 @@
       - {repeat: {network: {links: [{from: 1, to: 2, loss: 0.9}]}}, every_s: 120, for_s: 30}
       - {nemesis: halves, every_s: 60, for_s: 20, seed: 7}
 
-Each schedule is a layer over the network of the scenario and its timeline. The layers are computed before the run, so
-that every backend plays the same. A schedule can change the same keys as a timeline entry: `loss`, `partition`, and
-`network` with any of its keys. If layers overlap, the value of the later layer counts for each key. A message is cut if
-a partition of any layer cuts it.
+Each schedule is a layer on top of the network that the scenario and its timeline define. The layers are computed before
+the run, so every backend plays the same changes. A schedule can change the same keys as a timeline entry: `loss`,
+`partition`, and `network` with any of its keys. If several layers change the same key, the value of the last layer
+applies. A message is lost if a partition of any layer separates sender and receiver.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -44,23 +44,25 @@ from harness.scenario.injection import (
 from harness.scenario.strict_model import MissionSecond, Probability, Seconds, StrictModel, VehicleId
 
 NETWORK_KEYS = ("loss", "partition", "heal", "network")
-"""Keys of an entry that change the network."""
+"""Keys of a timeline entry that change the network."""
 
 
 class _TimelineEntryBase(NetworkDisturbance):
-    """One change at one instant. An entry needs `at_s` and exactly one kind of change.
+    """One change at one mission second. An entry needs `at_s` and exactly one kind of change.
 
     A change of the network is `loss`, `partition`, `heal` or `network`. A fault, such as `kill`, has a list of agents.
-    An injection, such as `replay`, makes a rogue node send messages. Two entries at the same instant are an error.
+    An injection, such as `replay`, makes a rogue node send messages. Two entries at the same mission second are an
+    error.
     """
 
     at_s: MissionSecond
     """Mission second of the change, at most `duration_s`."""
     for_s: Seconds | None = None
-    """Mission seconds until the end of a change by `loss`, `partition` or `network`. Default: it lasts until a later
-    change of the same value."""
+    """Mission seconds until the end of a change by `loss`, `partition` or `network`. By default, the change lasts until
+    a later change of the same value.
+    """
     heal: Literal[True] | None = None
-    """End of the partition."""
+    """If true, the partition ends."""
     replay: Replay | None = None
     """The rogue node repeats messages that it received before."""
     duplicate: Duplicate | None = None
@@ -130,7 +132,7 @@ class _TimelineEntryBase(NetworkDisturbance):
 
 
 def _keys_of_faults() -> dict[str, Any]:
-    """Return the model fields for faults in a timeline entry: the name of each fault, and its further keys."""
+    """Return the model fields for faults in a timeline entry: the names of all faults, and their further keys."""
     annotations: dict[str, Any] = {}
     descriptions: dict[str, str] = {}
     for kind in TIMELINE_FAULTS:
@@ -152,7 +154,7 @@ else:
 
 
 MAX_STEPS = 10_000
-"""Maximum number of changes by one schedule."""
+"""Maximum number of changes that one schedule makes."""
 
 Groups = Annotated[list[list[VehicleId]], Field(min_length=1)]
 Pairs = frozenset[tuple[int, int]]
@@ -160,22 +162,22 @@ Pairs = frozenset[tuple[int, int]]
 
 @dataclass(frozen=True)
 class TemporaryChange:
-    """A temporary change of the network by a schedule. Without values, it changes nothing."""
+    """A temporary change of the network by a schedule. A change without values has no effect."""
 
     values: NetworkValues = field(default_factory=dict)
     partition: tuple[frozenset[int], ...] = ()
     cut: Pairs = frozenset()
-    """Pairs of a sender and a receiver. All messages from this sender to this receiver are lost."""
+    """Pairs (sender, receiver). All messages from this sender to this receiver are lost."""
 
 
 EMPTY_LAYER = TemporaryChange()
 
 LayerStep = tuple[float, str, TemporaryChange]
-"""Mission second, name of the change, and the layer from this second on."""
+"""A step of a schedule: its mission second, the name of the change, and the layer that applies from this second on."""
 
 
 class Ramp(StrictModel):
-    """A change of network conditions from first values to last values, in equal steps. Needs at least one key."""
+    """A change of network conditions in equal steps, from the first to the last values. Needs at least one key."""
 
     loss: tuple[Probability, Probability] | None = None
     """First and last probability that a message is lost."""
@@ -200,11 +202,11 @@ class Ramp(StrictModel):
         return self
 
     def _ends(self) -> tuple[NetworkValues, NetworkValues]:
-        """Return the values of the key `network` at the beginning and at the end of the ramp."""
+        """Return the values of the key `network` at the beginning and the end of the ramp."""
         return (self.network[0].by_scope(), self.network[1].by_scope()) if self.network else ({}, {})
 
     def at(self, share: float) -> NetworkValues:
-        """Return the network conditions after this share of the ramp, from 0 to 1."""
+        """Return the network conditions at this point of the ramp. `share` is 0 at its beginning and 1 at its end."""
         short = {key: ends for key in ("loss", "delay") if (ends := getattr(self, key)) is not None}
         first, last = (
             overlay({None: {key: ends[number] for key, ends in short.items()}}, end)
@@ -224,7 +226,7 @@ class RepeatedChange(NetworkDisturbance):
     """A temporary change of the network. Needs at least one key."""
 
     partition: Groups | None = None
-    """Groups of vehicles that no message connects. Vehicles in no group form a further group."""
+    """Groups of vehicles. Messages between different groups are lost. Vehicles in no group form a further group."""
     delay: DelaySeconds | None = None
     """Delay in mission seconds, 0 to 60."""
 
@@ -248,23 +250,27 @@ class Schedule(StrictModel):
     """A gradual or repeated change of the network. Needs exactly one of `ramp`, `repeat` and `nemesis`."""
 
     ramp: Ramp | None = None
-    """A change in equal steps from one value to another. After the end, the last value stays."""
+    """A change in equal steps from one value to another. After the end of the ramp, the last value remains."""
     repeat: RepeatedChange | None = None
     """A change that starts every `every_s` and ends after `for_s`."""
     nemesis: Nemesis | None = None
     """A random change that starts every `every_s` and ends after `for_s`. `halves` splits the swarm into two random
-    halves. `isolate` cuts off one vehicle. `majorities ring` lets each vehicle hear a different majority, as the
-    nemesis of Jepsen does. `bridge` splits the swarm into two halves, and one vehicle hears both. `flapping` cuts one
-    pair of vehicles."""
+    halves. `isolate` separates one vehicle from all others. With `majorities ring`, each vehicle receives messages from
+    a different majority, as with the nemesis of Jepsen. `bridge` splits the swarm into two halves, and connects one
+    vehicle with both. `flapping` separates one pair of vehicles.
+    """
     from_s: MissionSecond = 0.0
     """Mission second of the start."""
     until_s: MissionSecond | None = None
-    """Mission second of the end, after `from_s`. Default: the end of the mission."""
+    """Mission second of the end, which must be after `from_s`. By default, it is the end of the mission."""
     every_s: Seconds | None = None
-    """Mission seconds between two changes. Needed for `repeat` and `nemesis`. Default of a ramp: 10 s."""
+    """Mission seconds between the starts of two changes. Required for `repeat` and `nemesis`. For a ramp, the default
+    is 10 s.
+    """
     for_s: Seconds | None = None
-    """Mission seconds until a change ends, less than `every_s`. Needed for `repeat` and `nemesis`, an error for
-    `ramp`."""
+    """Mission seconds until a change ends, less than `every_s`. Required for `repeat` and `nemesis`, and an error for
+    `ramp`.
+    """
     seed: int = 0
     """Seed of the random choices of `nemesis`."""
 
@@ -286,14 +292,14 @@ class Schedule(StrictModel):
         return self
 
     def named_vehicles(self) -> Iterator[tuple[str, int]]:
-        """Yield each vehicle ID in the schedule, with the key that contains it. Omit the IDs in partitions."""
+        """Yield each vehicle ID in the schedule, with the key that contains it. IDs in partitions are not included."""
         if self.repeat is not None and self.repeat.network is not None:
             yield from ((f"repeat.network.{key}", vehicle) for key, vehicle in self.repeat.network.named_vehicles())
         for number, end in enumerate((self.ramp.network if self.ramp else None) or ()):
             yield from ((f"ramp.network.{number}.{key}", vehicle) for key, vehicle in end.named_vehicles())
 
     def steps(self, roster: Sequence[int], end_s: float) -> list[LayerStep]:
-        """Return the steps of the schedule in order of time. Raises ValueError if there are more than MAX_STEPS."""
+        """Return the steps of the schedule in order of time. Raises ValueError if it has more than MAX_STEPS steps."""
         until = end_s if self.until_s is None else self.until_s
         every = self.every_s or 10.0
         if (until - self.from_s) / every > MAX_STEPS:
@@ -365,7 +371,7 @@ NEMESES: dict[Nemesis, Callable[[list[int]], TemporaryChange]] = {
     "bridge": _bridge,
     "flapping": _flapping,
 }
-"""Nemesis -> function that turns the vehicles in random order into a layer."""
+"""Nemesis -> function that creates the layer from the vehicles in random order."""
 
 MIN_VEHICLES: dict[Nemesis, int] = {"halves": 2, "isolate": 2, "majorities ring": 4, "bridge": 3, "flapping": 2}
-"""Nemesis -> minimum number of vehicles."""
+"""Nemesis -> minimum number of vehicles that it needs."""

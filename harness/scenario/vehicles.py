@@ -23,13 +23,13 @@ MAX_ARGUMENTS = 100
 LONG_OPTIONS = ("instance", "home", "model", "speedup", "console", "defaults", "sysid", "base-port", "uartA", "uartB")
 RESERVED_LONG_OPTIONS = frozenset({*(f"--{name}" for name in LONG_OPTIONS), *(f"--serial{port}" for port in range(3))})
 RESERVED_SHORT_OPTIONS = frozenset({"-I", "-O", "-M", "-s", "-C"})
-"""Options that the harness sets on the command line of ArduPilot."""
+"""Options of ArduPilot's command line that only the harness may set."""
 
 
 def _from_file(read: Callable[[str, Path], Any], written_out: Any) -> BeforeValidator:
-    """Return a validator that replaces a file name by the content of that file in the scenario's directory.
+    """Return a validator that replaces the name of a file in the scenario's directory by the content of the file.
 
-    `read` reads the file. `written_out` is the type of a value that is no text.
+    `read` reads the file. `written_out` is the type of a value that is not a file name.
     """
 
     def value(asked: Any, info: ValidationInfo) -> Any:
@@ -84,17 +84,19 @@ def _check_place(home: tuple[float, float, float, float]) -> tuple[float, float,
 
 Coordinates = tuple[float, float, float, float]
 Place = Annotated[Coordinates, AfterValidator(_check_place), _from_file(_named_place, Coordinates)]
-"""Latitude and longitude in degrees, altitude in metres, heading in degrees. Or a name in a `locations.txt`."""
+"""A place: latitude and longitude in degrees, altitude in metres, heading in degrees. Or a name from a
+`locations.txt`.
+"""
 
 Pairs = dict[str, float]
 Parameters = Annotated[
     Pairs, AfterValidator(_checked), _from_file(lambda name, beside: parameters.read(beside / name), Pairs)
 ]
-"""Parameter -> value, or the name of a parameter file."""
+"""ArduPilot parameters: name -> value, or the name of a parameter file."""
 
 Offsets = dict[Annotated[int, Field(ge=0, le=start_places.MAX_INSTANCE)], HomeOffset]
 SwarmOffsets = Annotated[Offsets, _from_file(lambda name, beside: start_places.swarm(beside / name), Offsets)]
-"""Instance, from 0 -> offset, or the name of a file of offsets."""
+"""Number of an ArduPilot instance, from 0 -> its offset. Or the name of a file with offsets."""
 
 Frame = Annotated[str, Field(pattern=r"^[A-Za-z0-9+][A-Za-z0-9_.+-]{0,63}$"), AfterValidator(_check_frame)]
 Arguments = Annotated[
@@ -103,7 +105,7 @@ Arguments = Annotated[
 
 
 class Wind(StrictModel):
-    """The wind in ArduPilot's simulation, from the start on."""
+    """The wind in ArduPilot's simulation from the start of the mission on."""
 
     speed_ms: Annotated[float, Field(ge=0, le=100)]
     """Speed in metres per second (`SIM_WIND_SPD`)."""
@@ -126,7 +128,9 @@ class EachVehicle(StrictModel):
     wind: Wind | None = None
     """Wind at this vehicle. Default: the wind of all vehicles."""
     home: Place | None = None
-    """Home of this vehicle, as `vehicles.home`. Default: a place in the field, or from `vehicles.swarm`."""
+    """Home of this vehicle, in the form of `vehicles.home`. By default, it is a place in the field, or comes from
+    `vehicles.swarm`.
+    """
     arguments: Arguments = []
     """Arguments for ArduPilot, after those of all vehicles."""
     debugger: Debugger | None = None
@@ -137,41 +141,47 @@ class Vehicles(StrictModel):
     """The vehicles that carry the agents."""
 
     kind: VehicleKind | None = None
-    """`ardupilot`: ArduPilot's SITL. `embedded`: simple vehicles inside the harness. `none`: no vehicles. Default:
-    ArduPilot if a binary for each type is installed, otherwise embedded vehicles."""
+    """`ardupilot`: ArduPilot's SITL. `embedded`: simple vehicles inside the harness. `none`: no vehicles. The default
+    is `ardupilot` if a binary for each type is installed, and otherwise `embedded`.
+    """
     type: VehicleType = "copter"
     """Type of all vehicles that `types` does not list."""
     types: dict[VehicleKey, VehicleType] = {}
     """Types of single vehicles, by vehicle ID."""
     binary: Path | None = None
-    """ArduPilot binary. An error if the vehicles have more than one type."""
+    """Path of the ArduPilot binary. It is an error if the vehicles have more than one type."""
     frame: Frame | None = None
-    """Frame that ArduPilot simulates, such as quadplane, motorboat, heli or hexa. An unknown frame, and a frame of
-    another type of vehicle, is an error. Default: the frame of the type."""
+    """Frame that ArduPilot simulates, such as quadplane, motorboat, heli or hexa. It is an error if the frame is
+    unknown or belongs to another type of vehicle. Default: the frame of the type.
+    """
     parameters: Parameters = {}
     """ArduPilot parameters at the start, as pairs of name and value, or the name of a parameter file."""
     wind: Wind | None = None
     """Wind in ArduPilot's simulation."""
     arguments: Arguments = []
-    """Additional arguments for ArduPilot, at most 100. Options that the harness sets, such as `--home`, are an
-    error."""
+    """Additional arguments for ArduPilot, at most 100. It is an error to give an option that the harness sets itself,
+    such as `--home`.
+    """
     debugger: Debugger | None = None
     """Debugger that runs ArduPilot. gdb reports the place of a crash. valgrind reports memory errors."""
     log_mib: Annotated[int, Field(ge=0, le=1_000_000)] | None = 16
-    """Maximum size in MiB of ArduPilot's log of one vehicle. 0: no log. null: no limit. A log grows by about 3 MiB per
-    minute."""
+    """Maximum size in MiB of ArduPilot's log of one vehicle. With 0, ArduPilot writes no log. With null, the size is
+    not limited. A log grows by about 3 MiB per minute.
+    """
     takeoff_altitude_m: Annotated[float, Field(gt=0, le=1000)] = 20.0
     """Altitude in metres above home to which vehicles without a flight plan take off."""
     home: Place = (-35.363262, 149.165237, 584.0, 353.0)
     """Home of the first vehicle: latitude and longitude in degrees, altitude in metres, heading in degrees. Or a name
-    in a `locations.txt` in ArduPilot's format: in the directory of the scenario, in the user's own, or next to the
-    binary."""
+    from a file `locations.txt` in ArduPilot's format. The file is searched in the directory of the scenario, in the
+    user's own ArduPilot directory, and next to the binary.
+    """
     spacing_m: Annotated[float, Field(gt=0, le=10_000)] = SPACING_M
     """Approximate distance in metres between homes. The homes form a field around the home of the first vehicle."""
     swarm: SwarmOffsets = {}
     """Homes of single vehicles, relative to `home`: [east, north, up in metres, heading in degrees]. Or the name of a
-    file like ArduPilot's swarminit.txt. Keys are ArduPilot's instance numbers: 0 is the vehicle with the lowest ID.
-    Other vehicles start in the field."""
+    file in the format of ArduPilot's swarminit.txt. The keys are ArduPilot's instance numbers: 0 is the vehicle with
+    the lowest ID. Vehicles that are not listed start in the field.
+    """
     each: dict[VehicleKey, EachVehicle] = {}
     """Settings of single vehicles, by vehicle ID."""
 
@@ -204,7 +214,7 @@ class Vehicles(StrictModel):
 
     @property
     def field(self) -> Home:
-        """The home position of the first vehicle, which is the middle of the field."""
+        """The home position of the first vehicle. It is the middle of the field."""
         return Home(*self.home[:3], self.home[3] % 360)
 
     def check_frames(self, roster: tuple[int, ...]) -> None:
@@ -233,13 +243,13 @@ class Leg(StrictModel):
     go_to: tuple[float, float] | None = None
     """Destination as [north, east] in metres from home."""
     altitude_m: float | None = None
-    """Altitude in metres above home, for `go_to` only. Default: the altitude before this leg."""
+    """Altitude in metres above home, only for `go_to`. By default, the altitude does not change."""
     speed_ms: float | None = None
-    """Speed in metres per second, for `go_to` only. Default: the speed of the type."""
+    """Speed in metres per second, only for `go_to`. The default depends on the type of the vehicle."""
     loiter_s: float | None = None
-    """Mission seconds to stay in place. A plane circles."""
+    """Mission seconds for which the vehicle stays in place. A plane flies circles."""
     land: Literal[True] | None = None
-    """The vehicle lands."""
+    """If true, the vehicle lands."""
 
     @model_validator(mode="after")
     def _one_leg(self) -> "Leg":
@@ -261,12 +271,13 @@ class Flight(StrictModel):
     """A flight plan and the vehicles that fly it."""
 
     vehicles: Annotated[list[VehicleId], Field(min_length=1)]
-    """IDs of the vehicles. A vehicle in two plans is an error."""
+    """IDs of the vehicles that fly the plan. It is an error if a vehicle is in two plans."""
     by: By = "mission"
-    """`mission`: upload the plan by the MAVLink mission protocol, and fly it in AUTO mode. `guided`: command one leg
-    after another in GUIDED mode."""
+    """`mission` or `guided`. With `mission`, the plan is uploaded with the MAVLink mission protocol and flown in AUTO
+    mode. With `guided`, the legs are commanded one after another in GUIDED mode.
+    """
     plan: Annotated[list[Leg], Field(min_length=1, max_length=MAX_LEGS)]
-    """Legs in order. A leg that the type of vehicle cannot fly is an error."""
+    """Legs in the order of the flight. It is an error if the type of vehicle cannot fly a leg."""
 
     def to_plan(self) -> Plan:
         return Plan(tuple(leg.to_planned_leg() for leg in self.plan))

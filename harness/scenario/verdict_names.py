@@ -1,7 +1,7 @@
 """List the checks and their possible verdicts.
 
 The six characteristics (Section 4.3) concern the chains of a swarm. Three further checks concern its behaviour and its
-records. They have keys instead of numbers.
+records. The further checks have keys instead of numbers.
 """
 
 from typing import Literal
@@ -14,7 +14,7 @@ CHARACTERISTICS = {
     "5": "all committed everywhere",
     "6": "one uniform chain",
 }
-"""Number -> short name."""
+"""Number of a characteristic -> its short name."""
 
 CharacteristicVerdict = Literal["holds", "violated", "not applicable"]
 StepsVerdict = Literal["as specified", "deviates", "not applicable"]
@@ -27,7 +27,7 @@ FURTHER_CHECKS = {"steps": "every step", "records": "every record", "liveness": 
 """Key of a further check -> short name."""
 
 ALL_CHECKS = {**CHARACTERISTICS, **FURTHER_CHECKS}
-"""All checks in the order of the report: number or key -> short name."""
+"""All checks in the order of the report: number of a characteristic or key of a further check -> short name."""
 
 BAD_IN_WORDS = {
     **{number: f"characteristic {number} violated" for number in CHARACTERISTICS},
@@ -35,10 +35,10 @@ BAD_IN_WORDS = {
     "records": "records contradict",
     "liveness": "swarm not finished",
 }
-"""Number or key of a check -> a bad verdict in words."""
+"""Number or key of a check -> phrase for its bad verdict."""
 
 UNFINISHED: Verdict = "not finished"
-"""The bad verdict of a swarm that may only need more time. It has an exit status of its own."""
+"""The bad verdict on a swarm that may only need more time. It leads to its own exit status."""
 
 Kind = Literal["good", "bad", "unknown"]
 

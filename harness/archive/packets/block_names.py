@@ -1,9 +1,9 @@
-"""Name blocks and chains in output. A block is called `3.12` if its name is known, and otherwise by the first digits of
-its hash.
+"""Name blocks and chains in output. If the name of a block is known, it is for example `3.12`. Otherwise the first
+digits of its hash are used.
 
-The exports of a run give the names. Without exports, the order of an agent's first proposals gives them, because an
-agent proposes its blocks in the order in which it completed them. That requires a capture from the agent's first
-datagram on.
+The names come from the exports of a run. Without exports, they come from the order of each agent's first proposals,
+because an agent proposes its blocks in the order in which it completed them. This requires a capture that begins before
+the agent's first datagram.
 """
 
 from collections.abc import Iterable
@@ -28,7 +28,7 @@ class BlockNames:
         self._top_of: dict[bytes, bytes | None] = {}
         self._mentioned: set[bytes] = set()
         self._sealed = False
-        """True if some messages are sealed, so that their blocks are unknown."""
+        """True if some messages are encrypted, so that their blocks are unknown."""
         self._from_start: set[int] = set()
         self._proposed: dict[int, int] = {}
         for run in runs:
@@ -102,7 +102,7 @@ class BlockNames:
 
 
 def run_directories(paths: Iterable[Path]) -> list[Path]:
-    """Return the run directories in `paths`, and the run directories that contain a capture in `paths`."""
+    """Return the run directories among `paths`, and the run directories that contain a capture file in `paths`."""
     runs = [
         path if path.is_dir() else path.resolve().parent.parent
         for path in paths

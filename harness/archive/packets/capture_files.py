@@ -11,15 +11,15 @@ if TYPE_CHECKING:
     from ucp.secure.opening import DatagramOpener
 
 DIRECTORY = "capture"
-"""Directory of captures in a run directory."""
+"""Name of the directory with captures in a run directory."""
 SUFFIXES = (".pcapng", ".pcap")
 
 
 class CaptureClock(NamedTuple):
     """A converter from capture times to mission seconds. `epoch_ns` is the capture time of mission second 0.
 
-    `of_run` is false if no capture has a comment with the start of the run. Then `epoch_ns` is the time of the first
-    packet. Captures from the field differ by the errors of the vehicles' clocks.
+    `of_run` is false if no capture has a comment with the start of the run. In this case `epoch_ns` is the time of the
+    first packet. The times of captures from the field differ by the errors of the vehicles' clocks.
     """
 
     epoch_ns: int
@@ -40,15 +40,15 @@ class Captures(NamedTuple):
 
     @property
     def problems(self) -> list[str]:
-        """A sentence for each problem of a usable file."""
+        """A sentence for each problem of a file that is used."""
         return [problem for capture in self.used for problem in capture.problems]
 
 
 def capture_files(paths: Iterable[Path]) -> list[Path]:
-    """Return the captures in run directories and in directories of captures, and the captures among `paths`. Each is
-    listed once.
+    """Return the capture files at `paths`: the paths that are files, and the captures in run directories and
+    directories of captures. Each file is listed once.
 
-    Raises RunDirectoryError if a path does not exist, or a directory holds no capture.
+    Raises RunDirectoryError if a path does not exist, or a directory contains no capture.
     """
     files: list[Path] = []
     for path in paths:
@@ -66,10 +66,9 @@ def capture_files(paths: Iterable[Path]) -> list[Path]:
 
 
 def read_captures(paths: Iterable[Path], opener: "DatagramOpener | None" = None) -> Captures:
-    """Read all captures of one mission. This is the mission named in the first capture that has a comment.
+    """Read all captures of one mission. The first capture with a comment determines the mission.
 
-    Captures from the field have no comment and are always used. `opener` decrypts the sealed datagrams of a secured
-    mission.
+    Captures from the field have no comment and are always used. `opener` decrypts the datagrams of a secured mission.
     """
     used: list[Capture] = []
     errors: list[str] = []

@@ -1,8 +1,8 @@
 """Read one packet capture file. It contains the datagrams that one vehicle, or a separate observer, sent or received.
 
 The capture of a run names its vehicle in a comment (`ucp-harness run --capture`). A capture from the field has no
-comment. It belongs to the sender of its outbound datagrams, else to the vehicle in its file name, such as `7.pcap`.
-Otherwise it is an observation point without a vehicle.
+comment. It belongs to the sender of its outbound datagrams. If it has none, it belongs to the vehicle in its file name,
+such as `7.pcap`. If the name has no vehicle either, the capture comes from a separate observer.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
 _LAST_NS = 2**63 - 1
 
 ListenerName = int | str
-"""The ID of the vehicle that captured, or the name of another observation point."""
+"""The ID of the vehicle that captured, or the name of a separate observer."""
 
 
 class CaptureComment(BaseModel):
@@ -47,8 +47,8 @@ class CaptureComment(BaseModel):
 class Datagram:
     """A datagram, identified by its bytes, with all its occurrences in all captures.
 
-    `seen` is a flat array, because there may be millions of sightings. It alternates a time in ns with a number that
-    encodes the capture and the direction of the frame.
+    `seen` is a flat array, because there may be millions of occurrences. Each occurrence takes two elements: the time
+    in ns, and a number that encodes the capture and the direction of the frame.
     """
 
     __slots__ = ("seen", "sender", "sequence", "summary")
@@ -95,7 +95,8 @@ class Capture:
     def read(
         self, datagrams: dict[bytes, Datagram], most_frames: int | None = None, opener: "DatagramOpener | None" = None
     ) -> None:
-        """Add the datagrams of the file, or of its first frames, to `datagrams`. `opener` decrypts secured datagrams.
+        """Read the file, or only its first frames, and add its datagrams to `datagrams`. `opener` decrypts secured
+        datagrams.
 
         Raises CaptureError if the file is not a capture.
         """
@@ -164,8 +165,8 @@ class Capture:
             return None
 
     def direction(self, sender: int, direction: int) -> int:
-        """Return the direction of a datagram. If the file does not record directions, datagrams of the vehicle itself
-        count as outbound.
+        """Return the direction of a datagram. If the file contains no directions, datagrams of the vehicle itself count
+        as outbound.
         """
         return direction or (OUTBOUND if sender == self.vehicle else INBOUND)
 
@@ -180,7 +181,7 @@ _CONTROL_REASONS = {
     CHALLENGE: "a challenge, which asks for a sign of life",
     ECHO: "an echo, which answers a challenge",
 }
-"""Type of a control datagram -> why it has no message."""
+"""Type of a control datagram -> the reason why it contains no message."""
 
 
 def _secured(payload: bytes, opener: "DatagramOpener | None") -> Datagram:

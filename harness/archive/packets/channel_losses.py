@@ -9,7 +9,9 @@ from harness.archive.packets.capture_reader import ListenerName
 from harness.archive.packets.transmissions import Transmission
 
 ChannelLosses = Mapping[tuple[int, int], Mapping[str, list[int]]]
-"""(sender, sequence number) -> reason -> vehicles. A reason in DROPS has no vehicles."""
+"""(Sender, sequence number) -> reason -> vehicles that lost the message. If the reason is in DROPS, no vehicles are
+listed.
+"""
 
 DROPS = ("queue", "too_long")
 """Reasons for which a radio does not send a message."""

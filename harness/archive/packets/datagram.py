@@ -1,11 +1,11 @@
 """Extract the UCP datagram from a captured frame, and summarise its message.
 
-A frame with a wrong checksum was damaged, and the receiver's kernel dropped it. There is one exception: a UDP checksum
-that covers only the addresses. The sender's kernel writes it and leaves the rest to the network card, but a virtual
-network has no card. Such a frame is intact.
+A frame with a wrong checksum was damaged, and the receiver's kernel dropped it. One wrong checksum is an exception: a
+UDP checksum that covers only the addresses. The sender's kernel writes it and expects the network card to complete it,
+but a virtual network has no card. Such a frame is intact.
 
-Agents of a run use one port. In the field they may use another, so a payload that begins like a UCP message is accepted
-from any port.
+Agents of a run use one port. In the field they may use a different port, so a payload that begins like a UCP message is
+accepted from any port.
 """
 
 import struct
@@ -33,7 +33,7 @@ _ETHERTYPES = {0x0806: "ARP", 0x86DD: "IPv6", 0x888E: "EAPOL"}
 _PROTOCOLS = {1: "ICMP", 2: "IGMP", 6: "TCP"}
 _UDP = 17
 _OUTGOING = 4
-"""Packet type in Linux cooked headers of a packet that the host itself sent."""
+"""The packet type in Linux cooked headers that marks packets sent by the host itself."""
 _ENDS = struct.Struct("!4H")
 
 
@@ -109,7 +109,7 @@ def _udp(addresses: bytes, segment: bytes) -> bytes:
 def _sum(data: bytes) -> int:
     """Return the sum of 16-bit words for the Internet checksum (RFC 1071), modulo 65535.
 
-    0 means that the checksum is right.
+    If the checksum is correct, the result is 0.
     """
     return int.from_bytes(data + b"\0" if len(data) % 2 else data, "big") % 0xFFFF
 
@@ -120,7 +120,7 @@ RESPONSES: dict[str, str] = {
     ChainHashSuccessorQuery.NAME: NextInSequenceResponse.NAME,
     RequestForBlock.NAME: BlockResponse.NAME,
 }
-"""Request -> its response. A Commit Block is neither of them."""
+"""Name of a request -> name of its response. A Commit Block is neither of them."""
 
 CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 TOP_OF_CHAIN = "top of chain"
@@ -139,31 +139,29 @@ class MessageSummary(NamedTuple):
 
     @property
     def is_sealed(self) -> bool:
-        """True if the content is unknown because the message is encrypted."""
+        """True if the content of the message is unknown because the message is encrypted."""
         return self.block_hash is None and self.chain_hash is None
 
     @property
     def request_key(self) -> tuple[str, bytes | None] | None:
-        """The type and the subject that an answer to this request has. They can be compared with `answers`. The value
-        is None if the message is not a request.
+        """The type and the subject of an answer to this request, which can be compared with `answers`. None if the
+        message is not a request.
 
-        Responses do not name the agent that asked.
+        The agent that sent the request is not included, because answers do not name it.
         """
         response = RESPONSES.get(self.message)
         return None if response is None or self.is_sealed else (response, self._subject)
 
     @property
     def answers(self) -> tuple[str, bytes | None] | None:
-        """The type of this answer, and the chain or block that it is about. The value is None if the message is not an
-        answer.
-        """
+        """The type of this answer, and the chain or block that it concerns. None if the message is not an answer."""
         return None if self.answer is None else (self.message, self._subject)
 
     @property
     def _subject(self) -> bytes | None:
         """The chain or block that a request and its answer have in common.
 
-        A Next In Sequence response names the found block too, but the request named only the chain.
+        A Next In Sequence response also names the found block, but its request names only the chain.
         """
         return self.chain_hash if self.message == NextInSequenceResponse.NAME else self.block_hash or self.chain_hash
 

@@ -1,8 +1,9 @@
 """Match requests with their answers, and count the losses of each link.
 
-Responses are broadcast and do not name the agent that asked. But an agent answers each request at once or never, and in
-order. Therefore the responses of an agent are assigned from the last to the first: each answers the latest request on
-its subject that reached the agent before it, and that no later response answers.
+Responses are broadcast and do not name the agent that sent the request. But an agent answers requests immediately and
+in order, or not at all. The responses of an agent are therefore assigned from the last to the first. Each response
+belongs to the latest request with the same subject that reached the agent before the response, unless a later response
+already belongs to this request.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,10 +19,10 @@ _Asked = tuple[float, int]
 
 
 class RequestOutcome(NamedTuple):
-    """The result of a request at the vehicle `by`. `response` is the first answer of this vehicle. It is None without
-    an answer.
+    """The result of a request at the vehicle `by`. `response` is the first answer of this vehicle, or None without an
+    answer.
 
-    The outcome is "answered" unless the response is known to be lost on its way to the agent that asked.
+    The outcome is "answered" unless captures show that the agent that sent the request did not receive the response.
     """
 
     by: int
@@ -30,7 +31,7 @@ class RequestOutcome(NamedTuple):
 
 
 class RequestAnswers:
-    """The answers of vehicles to each captured request."""
+    """The answers of the vehicles to each captured request."""
 
     def __init__(self, transmissions: Sequence[Transmission]) -> None:
         self._responses: dict[int, list[Transmission]] = {}
@@ -42,7 +43,7 @@ class RequestAnswers:
         return self._responses.get(request.number, ())
 
     def answers(self, request: Transmission) -> list[RequestOutcome]:
-        """Return the result of a request at each vehicle that received the request or should have received it."""
+        """Return the outcome of a request at each vehicle that received it or should have received it."""
         first: dict[int, Transmission] = {}
         for response in self.responses(request):
             first.setdefault(response.sender, response)
@@ -61,7 +62,7 @@ class RequestAnswers:
 
 
 def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission, Transmission]]:
-    """Yield each pair of request and answer. A forged answer belongs to no request."""
+    """Yield each pair of request and answer. A forged answer is never matched."""
     asked: dict[Subject, list[_Asked]] = {}
     reached: dict[tuple[ListenerName, Subject], list[_Asked]] = {}
     sent: dict[tuple[ListenerName, Subject], list[Transmission]] = {}
@@ -86,7 +87,7 @@ def _match(transmissions: Sequence[Transmission]) -> Iterator[tuple[Transmission
 
 
 class LinkLosses(NamedTuple):
-    """The losses on a link: the receiver should have received `sent` datagrams, and did not receive `lost` of them."""
+    """The losses on a link. The receiver should have received `sent` datagrams, but did not receive `lost` of them."""
 
     sender: int
     receiver: ListenerName

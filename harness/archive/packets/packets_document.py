@@ -24,7 +24,7 @@ _ListenerName = Annotated[
 
 class CaptureRecord(BaseModel):
     """One capture file. It covers the mission seconds `began_s` to `ended_s`, which are null if the file is empty.
-    `dropped` frames are missing in it.
+    `dropped` is the number of frames that are missing in the file.
     """
 
     file: str
@@ -39,8 +39,8 @@ class CaptureRecord(BaseModel):
 
 
 class PairRecord(BaseModel):
-    """The datagrams from one sender to one receiver. `sent` counts the datagrams that should have been received, and
-    `lost` those of them that were not.
+    """The datagrams from one sender to one receiver. `sent` is the number of datagrams that the receiver should have
+    received. `lost` is the number of them that it did not receive.
     """
 
     sender: int
@@ -59,8 +59,8 @@ class ReceptionRecord(BaseModel):
 
 
 class AnswerRecord(BaseModel):
-    """The result of a request at vehicle `by`: its answer, and the number of the datagram that contains the answer. The
-    number is null without an answer.
+    """The outcome of a request at vehicle `by`: the answer of the vehicle, and the number of the datagram that contains
+    the answer. The number is null without an answer.
     """
 
     by: int
@@ -73,10 +73,11 @@ class DatagramRecord(BaseModel):
     """One datagram, sent once. `number` is its position in the order of sending. `answers` is null if the message is
     not a request.
 
-    `origin` is `captured` (the capture of its sender has it), `inferred` (its sender had no capture then, and `at_s` is
-    the time of the first reception) or `forged` (the named agent did not send it). The vehicles in `lost_by` had a
-    capture but did not receive it. Those in `not_listening` had no capture. `loss_reasons` has vehicles of `lost_by` by
-    the reason for which a shared channel lost the message. Without such a loss the key is absent.
+    `origin` is `captured` (the capture of its sender contains it), `inferred` (its sender was not captured at that
+    time, and `at_s` is the time of the first reception) or `forged` (the agent that it names did not send it). The
+    vehicles in `lost_by` were captured but did not receive the datagram. The vehicles in `not_listening` were not
+    captured. `loss_reasons` lists vehicles of `lost_by` by the reason why the shared channel lost the message. The key
+    is missing without such a loss.
     """
 
     number: int
@@ -99,7 +100,7 @@ class DatagramRecord(BaseModel):
 
 class PacketsRecord(BaseModel):
     """The datagrams in several captures. All times are mission seconds, and `epoch_us` is the time of mission second 0.
-    If the captures belong to no run, `epoch_us` is the time of the first packet.
+    If the captures do not come from a run, `epoch_us` is the time of the first packet.
     """
 
     model_config = ConfigDict(populate_by_name=True)
@@ -122,7 +123,7 @@ def document(
     names: BlockNames,
     losses: ChannelLosses,
 ) -> Iterator[str]:
-    """Yield the lines of one JSON document. Each datagram has its own line."""
+    """Yield the lines of a JSON document with all data. Each datagram has its own line."""
     clock = captures.clock
     packets = PacketsRecord(
         epoch_us=clock.epoch_ns // 1000,

@@ -23,7 +23,7 @@ from ucp.messages import (
 )
 
 _NAMED = 10
-"""Maximum number of receivers that are listed by ID. More receivers are only counted."""
+"""Maximum number of receivers whose IDs are listed. If there are more, only their number is printed."""
 _OUTCOMES: tuple[Outcome, ...] = ("answered", "response lost", "no answer", "request lost")
 _INDENT = " " * 16
 
@@ -31,7 +31,7 @@ Paint = Callable[[str], str]
 
 
 class TransmissionFormatter:
-    """A formatter for messages and the results of requests. `paint` highlights losses."""
+    """A formatter for messages and the outcomes of requests. `paint` highlights losses."""
 
     def __init__(self, names: BlockNames, paint: Paint, losses: ChannelLosses) -> None:
         self._names = names
@@ -59,8 +59,8 @@ class TransmissionFormatter:
         return "  ".join(parts)
 
     def _reasons(self, transmission: Transmission) -> str:
-        """Return the reasons why vehicles lost the message on the shared radio channel. Return an empty text if there
-        is none.
+        """Return the reasons why vehicles lost the message on the shared radio channel. Return an empty text if the
+        channel caused no loss.
         """
         words = [
             reason.replace("_", " ") + ("" if reason in DROPS else f": {_list(names)}")
@@ -92,7 +92,7 @@ class TransmissionFormatter:
                 return block
 
     def answers(self, answers: Iterable[RequestOutcome]) -> str:
-        """Return the results of a request as text. Vehicles with the same result are listed together."""
+        """Return the outcomes of a request as text. Vehicles with the same outcome are listed together."""
         together: dict[str, list[ListenerName]] = {}
         for answer in sorted(answers, key=lambda answer: _OUTCOMES.index(answer.outcome)):
             together.setdefault(self._outcome(answer), []).append(answer.by)
@@ -125,7 +125,7 @@ def transmission_lines(
     text: TransmissionFormatter,
     answers_of: int | None,
 ) -> Iterator[str]:
-    """Yield a line for each message. Below each request, yield the results at all vehicles, or only at the vehicle
+    """Yield a line for each message. Below each request, yield the outcomes at all vehicles, or only at the vehicle
     `answers_of`.
     """
     for transmission in transmissions:

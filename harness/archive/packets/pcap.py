@@ -1,8 +1,8 @@
-"""Read packet capture files frame by frame, in the formats pcapng and pcap with any byte order. The files may have any
-origin.
+"""Read packet capture files frame by frame, in the formats pcapng and pcap with any byte order. The files may come from
+any source.
 
-scapy is not used, because its reader drops the comment and the statistics of a section, does not report where a file is
-damaged, and trusts any length in a file. Formats: draft-ietf-opsawg-pcapng, draft-ietf-opsawg-pcap.
+scapy is not used for this. Its reader ignores the comment and the statistics of a section, does not report where a file
+is damaged, and does not limit the lengths in a file. Formats: draft-ietf-opsawg-pcapng, draft-ietf-opsawg-pcap.
 """
 
 import struct
@@ -14,10 +14,10 @@ from harness.archive.bounded_file import BoundedFile
 from harness.errors import CaptureError
 
 INBOUND, OUTBOUND = 1, 2
-"""Directions of a frame, as in the flags of pcapng. 0 is unknown."""
+"""Directions of a frame, as in the flags of pcapng. The direction 0 is unknown."""
 
 MAX_BLOCK_BYTES = 1024 * 1024
-"""Maximum size of a block, four times the longest frame that tcpdump captures."""
+"""Maximum size of a block in bytes. It is four times the longest frame that tcpdump captures."""
 MAX_INTERFACES = 1024
 
 _SECTION, _INTERFACE, _STATISTICS, _PACKET = b"\x0a\x0d\x0d\x0a", 1, 5, 6
@@ -32,13 +32,14 @@ _PCAP = {  # magic -> byte order, nanoseconds in a unit of the fraction
 }
 PCAPNG_MAGIC = _SECTION
 MAGICS = (_SECTION, *_PCAP)
-"""The first bytes of capture files."""
+"""The possible first bytes of capture files."""
 
 
 class Frame(NamedTuple):
     """A network frame in a packet capture file.
 
-    `time_ns` counts from the Unix epoch. `length` is the length on the wire, and `data` may be shorter.
+    `time_ns` counts from the Unix epoch. `length` is the length on the wire. `data` is shorter if the frame was
+    truncated.
     """
 
     time_ns: int
@@ -65,8 +66,8 @@ class CaptureFile:
     """A packet capture file. Iterate over the object to read its frames. The iteration also sets the attributes.
 
     `comment` is the comment of the first section. `started_ns`, `ended_ns` and `dropped` (the number of frames that the
-    capture missed) come from the statistics and are None without them. `problem` describes where the reading ended
-    early, if it did.
+    capture missed) come from the statistics of the file, and are None without them. If reading ended early, `problem`
+    describes the place.
     """
 
     def __init__(self, path: Path) -> None:
@@ -201,7 +202,7 @@ def _halves(order: str, value: bytes) -> int:
 
 
 def _options(order: str, data: bytes) -> dict[int, bytes]:
-    """Return the options of a block in a pcapng file, by their code. If a code occurs several times, its first option
+    """Return the options of a block in a pcapng file, by option code. If a code occurs several times, the first option
     is used.
     """
     options: dict[int, bytes] = {}

@@ -17,7 +17,7 @@ MESSAGES = [message.NAME for message in TYPE_CODES]
 @dataclass(frozen=True)
 class MessageFilter:
     """A filter for messages by sender, receiver, type, time and other properties. A property that is None accepts every
-    message. Upper and lower case are equal in `message`.
+    message. The name in `message` may be in upper or lower case.
 
     Raises CaptureError for an unknown message or an empty time interval.
     """
@@ -34,8 +34,8 @@ class MessageFilter:
             raise CaptureError("--between {:g} {:g}: the first second is not before the last".format(*self.between_s))
 
     def filter(self, transmissions: Iterable[Transmission], captures: Captures) -> Iterator[Transmission]:
-        """Yield the messages that the filter accepts. If the filter has a receiver, all other receivers are removed
-        from the yielded messages.
+        """Yield the messages that the filter accepts. If the filter has a receiver, the yielded messages contain only
+        this receiver.
 
         Raises CaptureError if the receiver has no capture.
         """
@@ -61,7 +61,9 @@ class MessageFilter:
 
 
 class AnsweredMessage(NamedTuple):
-    """A message that is not an answer. `answers` contains the answers to it that concern the selected block."""
+    """A message that is no answer, with the answers to it. If a block is selected, only answers about this block are
+    included.
+    """
 
     first: Transmission
     answers: Sequence[Transmission]
@@ -80,7 +82,7 @@ def exchanges_about(
 
 
 def in_order(exchanges: Iterable[AnsweredMessage]) -> list[Transmission]:
-    """Return all messages in these exchanges, each once, in the order of sending."""
+    """Return all messages in these exchanges in the order of sending, each once."""
     by_number = {
         transmission.number: transmission
         for exchange in exchanges

@@ -1,8 +1,8 @@
 """Find the same packets in all captures, and combine them into messages with their receivers.
 
-A datagram is identified by its bytes. A restarted agent may send the same bytes again. Therefore each reception belongs
-to the latest transmission of the datagram before it. If a complete capture of the sender does not contain the
-transmission, the datagram is forged.
+A datagram is identified by its bytes. An agent that was restarted may send the same bytes again. Each reception
+therefore belongs to the latest earlier transmission of the datagram. If a complete capture of the sender does not
+contain the transmission, the datagram is forged.
 """
 
 from bisect import bisect_right
@@ -15,8 +15,10 @@ from harness.archive.packets.datagram import MessageSummary
 from harness.archive.packets.pcap import OUTBOUND
 
 Origin = Literal["captured", "inferred", "forged"]
-"""The origin of a transmission. `captured`: the capture of its sender contains it. `inferred`: its sender was not
-captured then, and `at_s` is the time of the first reception. `forged`: the agent that it names did not send it."""
+"""The origin of a transmission. `captured` means that the capture of its sender contains it. `inferred` means that its
+sender was not captured at that time, so `at_s` is the time of the first reception. `forged` means that the agent that
+it names did not send it.
+"""
 
 
 class DatagramReception(NamedTuple):
@@ -31,11 +33,12 @@ class DatagramReception(NamedTuple):
 
 
 class Transmission(NamedTuple):
-    """A datagram that was sent once, at mission second `at_s`. `number` is its position in the order of sending, from
-    0.
+    """A datagram that was sent once, at mission second `at_s`. `number` is its position in the order of sending,
+    counted from 0.
 
-    `seen_leaving` is the listener whose capture contains the sending. The listeners in `lost_by` captured at that time
-    but did not receive the datagram. Those in `absent` did not capture at that time, so their reception is unknown.
+    A listener is a captured vehicle or a separate observer. `seen_leaving` is the listener whose capture shows that the
+    datagram was sent. The listeners in `lost_by` captured at that time but did not receive the datagram. The listeners
+    in `absent` did not capture at that time, so their reception is unknown.
     """
 
     number: int
@@ -77,7 +80,7 @@ class _Listeners:
     def would_record_sending(self, sender: ListenerName, time_ns: int) -> bool:
         """Return true if a datagram that the sender sent at this time must be in its packet captures.
 
-        It need not be if the captures contain only received datagrams, or have missed frames.
+        This is not certain if the captures contain only received datagrams, or lack frames.
         """
         captures = self._transmissions.get(sender, ())
         sound = any(capture.sees_itself for capture in captures) and not any(capture.dropped for capture in captures)
@@ -85,7 +88,7 @@ class _Listeners:
 
 
 def join(captures: Captures) -> list[Transmission]:
-    """Return the messages of all captures, in the order of sending."""
+    """Combine all captures to messages, in the order of sending."""
     by_number = {capture.number: capture for capture in captures.used}
     listeners = _Listeners(captures.used)
     transmissions = [

@@ -30,7 +30,7 @@ class DamagedBytes:
             self.first_at = at
 
     def ends_reading(self, at: int) -> bool:
-        """Return true if the file has so much damage before the byte `at` that reading must stop."""
+        """Return true if the damage before the byte `at` is large enough to stop reading."""
         if self.searches <= MAX_SEARCHES:
             return False
         self.ends_at = at

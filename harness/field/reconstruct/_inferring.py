@@ -225,7 +225,7 @@ class _InputSequence:
         self.inputs: list[RecordedInput] = []
         self.problem: str | None = None
         self.choices: list[int] = []
-        """For each timer, the number of other positions that are possible."""
+        """The number of other possible positions of each timer."""
         self._header = header
         self._agent = _agent(header)
         self.pause: Pause | None = None

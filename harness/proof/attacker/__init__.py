@@ -1,1 +1,1 @@
-"""The attacker in a proof: the messages that the holder of a captured vehicle's keys can send."""
+"""The attacker in a proof. It has the keys of a captured vehicle, and can send the messages that these keys allow."""

@@ -2,7 +2,8 @@
 receivers.
 
 The attacker receives all messages. It therefore knows each block that an agent has committed, and the hash of each
-proposed block. It can create blocks in the name of the captured vehicle. These blocks differ only in their timestamps.
+proposed block. It can also create blocks in the name of the captured vehicle. In a proof, these blocks differ only in
+their timestamps.
 """
 
 from collections.abc import Iterable, Iterator
@@ -25,7 +26,7 @@ MOST_KNOWN = 200_000
 
 
 class _KnowledgeFromAgent(NamedTuple):
-    """The blocks, hashes and queries that the attacker knows from one agent."""
+    """The blocks, hashes and queries that the attacker learned from one agent."""
 
     asked: PendingQuestions
     committed: frozenset[Block]
@@ -34,8 +35,8 @@ class _KnowledgeFromAgent(NamedTuple):
 
 
 class ForgedTimestamps:
-    """Timestamps before, between and after the timestamps of `blocks` honest blocks. They let up to `lies` forged
-    blocks have any age.
+    """Timestamps before, between and after the timestamps of `blocks` honest blocks. With them, up to `lies` forged
+    blocks can have any age relative to honest blocks.
     """
 
     def __init__(self, blocks: int, lies: int) -> None:
@@ -58,7 +59,7 @@ class Attacker:
         ages = ForgedTimestamps(bounds.blocks, max(1, bounds.lies))
         blocks = [made_block(self.captured, timestamp_us) for timestamp_us in ages.of_blocks]
         self.made = {block.block_hash: block for block in blocks}
-        """The blocks that the attacker may make, by block hash."""
+        """Block hash -> block, for the blocks that the attacker may create."""
         self._own = frozenset(blocks)
         self._times_us = ages.said
         self._knowledge: dict[int, _KnowledgeFromAgent] = {}
@@ -87,8 +88,8 @@ class Attacker:
         return step.local != local or bool(step.sent or step.started)
 
     def material(self, locals_: tuple[int, ...]) -> Iterator[tuple[int, ForgeryMaterial]]:
-        """Yield, for each living agent, its index and the blocks and hashes from which the attacker can form messages
-        to it.
+        """Yield the index of each living agent, and the blocks and hashes from which the attacker can form messages to
+        it.
         """
         looks = {place: self._look(local) for place, local in enumerate(locals_) if local != DEAD}
         blocks = self._own.union(*(look.committed for look in looks.values()))
@@ -115,11 +116,11 @@ class Attacker:
 
 
 class AttackerKnowledge:
-    """The knowledge of an attacker when each agent is explored alone (in the network model `any`).
+    """The knowledge of the attacker in the network model `any`, where each agent is explored alone.
 
     The attacker can send each message to each agent any number of times.
 
-    The blocks with the given `ordinals`, in the order of their timestamps, are in the name of the captured vehicle. The
+    The blocks with the given `ordinals` (in the order of their timestamps) are in the name of the captured vehicle. The
     attacker has these blocks from the beginning. It repeats proposals of other agents. It need not repeat their
     queries, because each agent can receive the originals.
     """

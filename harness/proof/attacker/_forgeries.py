@@ -1,8 +1,8 @@
 """List the messages that an attacker can send to an agent: one message for each kind of effect on the agent.
 
-A handler checks only three things of a message: whether the agent holds a hash, which of two timestamps is older, and
-whether the answer is yes or no. docs/explanation/proof.md explains why these messages are enough. A test compares their
-effects with those of random messages.
+The effect of a message depends only on three properties: whether the agent holds a hash, which of two timestamps is
+older, and whether the answer is yes or no. docs/explanation/proof.md explains why these messages are enough. A test
+compares their effects with those of random messages.
 """
 
 from collections.abc import Iterable, Iterator
@@ -26,7 +26,7 @@ from ucp.state import AgentState
 
 
 class PendingQuestions(NamedTuple):
-    """The queries and requests of an agent to which it still waits for answers.
+    """The open queries and requests of an agent, for which it still waits for answers.
 
     `vote` is the block and the chain hash of the agent's proposal. The other fields are the chain hash or block hash of
     its query in phases 1, 2 and 3.
@@ -39,9 +39,7 @@ class PendingQuestions(NamedTuple):
 
 
 class ForgeryMaterial(NamedTuple):
-    """The contents from which an attacker forms messages: blocks, block hashes, queries of other agents, and
-    timestamps.
-    """
+    """The data from which an attacker forms messages: blocks, block hashes, queries of other agents, and timestamps."""
 
     blocks: frozenset[Block]
     named: frozenset[bytes]
@@ -50,7 +48,7 @@ class ForgeryMaterial(NamedTuple):
 
 
 def asked(state: AgentState) -> PendingQuestions:
-    """Return the queries and requests of an agent to which it still waits for answers."""
+    """Return the open queries and requests of an agent, for which it still waits for answers."""
     candidate, top = state.candidate_block, state.chain.top_chain_hash
     voting = state.voting_timer.active and candidate is not None
     return PendingQuestions(
@@ -102,7 +100,7 @@ def _commits(state: AgentState, blocks: Iterable[Block]) -> Iterator[Message]:
 
 
 def _questions(state: AgentState, others: Iterable[PendingQuestions]) -> Iterator[Message]:
-    """Yield forged queries to this agent. Another agent waits for exactly the answer to such a query."""
+    """Yield forged queries to this agent. Other agents wait for exactly the answers to these queries."""
     chain = state.chain
     for waits in sorted(others, key=repr):
         if waits.vote is not None:

@@ -1,7 +1,7 @@
 """Create agents that check signatures. Also create the datagrams that an attacker signs with the keys of a captured
 vehicle.
 
-`ucp.secure` decides which datagrams an agent accepts. This module makes no assumption about its decisions.
+The real code in `ucp.secure` decides which datagrams an agent accepts. This module makes no assumptions about it.
 """
 
 from collections.abc import Iterable, Iterator
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 BOOT = b"in a proof".ljust(16, b"\0")
 ATTACKERS_BOOT = b"later than that".ljust(16, b"\0")
-"""The boot of the attacker. It is later than all other boots, so agents drop datagrams of the vehicle itself."""
+"""The boot of the attacker. It is later than all other boots, so agents drop the datagrams of the captured vehicle
+itself.
+"""
 
 
 class SecurityGate:
@@ -34,11 +36,11 @@ class SecurityGate:
         self._captured = captured
         self._sequence = 0
         self._mouths: dict[int, Session] = {}
-        """Sender -> session in which the attacker sends in the sender's name."""
+        """Sender -> the session with which the attacker sends in this sender's name."""
 
     def agent(self, agent_id: int, *arguments: Any, revoked: bool = False, **options: Any) -> Agent:
         """Return an agent that checks signatures. If `revoked` is true, the agent knows that the captured vehicle is
-        excluded.
+        revoked.
         """
         from ucp.secure.secured_agent import SecuredAgent
         from ucp.secure.session import Session
@@ -53,9 +55,9 @@ class SecurityGate:
     def sealed(self, message: Message, now: float, *, sender: int | None = None, genuine: bool = False) -> bytes:
         """Return a new encrypted datagram with this message, in the name of the captured vehicle or of `sender`.
 
-        If `genuine` is true, the block in the message has the signature of its author, which the attacker received with
-        the block. Otherwise it is signed with the captured key. An answer names a request that no agent has received,
-        so no agent knows a newer request.
+        If `genuine` is true, the block in the message has the signature of its author, which the attacker received
+        together with the block. Otherwise the attacker signs the block with the captured key. An answer names a request
+        that no agent has received, so no agent knows a newer request.
         """
         from ucp.secure.block_signature import sign_block
         from ucp.secure.sealed_datagrams import AnsweredRequest

@@ -14,8 +14,8 @@ Document = dict[str, Any]
 
 
 class AttackEntries:
-    """The timeline entries for the attacker's messages on one path through the states. `made` contains the attacker's
-    own blocks by hash.
+    """The timeline entries for the attacker's messages on one path through the states. `made` contains the blocks that
+    the attacker created, by hash.
     """
 
     def __init__(self, local: LocalStates, captured: int, made: Mapping[bytes, Block]) -> None:
@@ -23,12 +23,12 @@ class AttackEntries:
         self._captured = captured
         self._made = made
         self._lies: list[tuple[Document, Message]] = []
-        """The entries and their messages."""
+        """The timeline entries, each with its message."""
         self._names: dict[bytes, str] = {}
         self._chains: dict[bytes, tuple[bytes, ...]] = {}
         self._count: Counter[int] = Counter()
         self._completed_s = [0.0]
-        """Mission second of the completion of each block, after that of the inception block."""
+        """Mission second at which each block was completed. The first element is the inception block."""
 
     def completed(self, agent_id: int, ordinal: int, at_s: float) -> None:
         """Record that an agent completed a block. `ordinal` is its number among all blocks of the path."""
@@ -37,7 +37,7 @@ class AttackEntries:
         self._completed_s.append(at_s)
 
     def sees(self, local: int) -> None:
-        """Record the chain hashes of an agent in this state, so that timeline entries can name the chains."""
+        """Record the chain hashes that an agent knows in this state, so that timeline entries can name its chains."""
         chain = self._local.state(local).chain
         below: tuple[bytes, ...] = ()
         self._chains[chain.inception.chain_hash] = below
@@ -45,10 +45,10 @@ class AttackEntries:
             below = self._chains[chain_hash] = (*below, block.block_hash)
 
     def lie(self, receiver: int, number: int, at_s: float) -> list[Document]:
-        """Add a message of the attacker, and return its timeline entry in a list. The method `word` completes the entry
-        later.
+        """Add a message of the attacker, and return a list with its timeline entry. The method `word` completes the
+        entry later.
 
-        If the previous message has the same content and time, its entry gets the receiver instead, and the list is
+        If the previous message has the same content and time, the receiver is added to its entry, and the list is
         empty.
         """
         message = self._local.messages[number]
@@ -83,7 +83,7 @@ class AttackEntries:
         return said
 
     def _below(self, commit: CommitBlock) -> bytes:
-        """Return the hash of the chain on top of which a Commit Block message adds its block."""
+        """Return the hash of the chain to which a Commit Block message adds its block."""
         return next(
             (below for below in self._chains if next_chain_hash(below, commit.block.block_hash) == commit.chain_hash),
             NOBODYS,

@@ -3,7 +3,7 @@
 See docs/explanation/coverage.md.
 
 `reached` collects states, inputs and branches from traces, or while a simulated run is judged. `_share` compares them
-with everything that exists within the bounds of `harness.proof`.
+with all states, inputs and branches within the bounds of a proof.
 """
 
 from harness.proof.coverage._share import CoverageShare, ExistingStates, existing, in_words, to_json

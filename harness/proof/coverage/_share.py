@@ -1,4 +1,4 @@
-"""Compute the share of an agent's existing states and inputs that runs have reached."""
+"""Compute the shares of an agent's existing states and inputs that runs have reached."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from harness.proof.model._shape import HeldBlockOrder, Shape, shape_of
 
 @dataclass
 class ExistingStates:
-    """The agent states and (state, input) pairs that exist within `bounds`. Both sets are complete if `ended` is
-    "complete".
+    """The agent states and (state, input) pairs that exist within `bounds`. If `ended` is "complete", they are all of
+    them.
     """
 
     bounds: Bounds
@@ -65,8 +65,8 @@ SCHEMA = "ucp-coverage/1"
 
 @dataclass(frozen=True)
 class CoverageShare:
-    """The number of existing states, inputs or branches that runs reached, and the number that they reached outside the
-    bounds.
+    """The number of existing states, inputs or branches that runs reached. It also has the number that they reached
+    outside the bounds.
     """
 
     reached: int
@@ -95,13 +95,13 @@ class CoverageShare:
 
 
 def not_taken(reached: ReachedStates) -> list[Branch]:
-    """Return the branches (cases of a handler) in the agent contract that no run has taken."""
+    """Return the branches of handlers in the agent contract that no run has taken."""
     return [branch for branch in BRANCHES if not reached.branches[branch]]
 
 
 def to_json(reached: ReachedStates, there: ExistingStates | None) -> dict[str, Any]:
-    """Return the coverage as a JSON document. If `there` is given, the document also contains the shares of all
-    existing states.
+    """Return the coverage as a JSON document. If `there` is given, the document also contains the shares of the
+    existing states and pairs.
     """
     missing = not_taken(reached)
     document = {

@@ -1,7 +1,7 @@
 """Collect the states, inputs and branches of agents that runs reach, while the step judge examines their traces.
 
-The step judge (`harness.checker.steps`) follows the steps of each agent with its reference core. Programs of other
-authors and recorded runs therefore count like our agents and simulated runs.
+The step judge (`harness.checker.steps`) repeats the steps of each agent with the reference. Coverage can therefore be
+measured for agents in any language, and for recorded runs.
 """
 
 from collections import Counter
@@ -26,17 +26,17 @@ Branch = tuple[str, str]
 BRANCHES: tuple[Branch, ...] = tuple(
     (name, branch) for name, handler in HANDLERS.items() for branch in handler.branches
 )
-"""All branches of the contract."""
+"""All branches in the agent contract."""
 
 MOST = 2_000_000
-"""Maximum number of local states, and of pairs. More would need too much memory."""
+"""Maximum number of local states, and of pairs, that are stored. More would need too much memory."""
 KEPT = 20_000
 """Maximum number of cached `HeldBlockOrder` objects."""
 
 
 @dataclass
 class ReachedStates:
-    """The agent states that runs reached, and the reached (state, input) pairs in which the input had an effect or an
+    """The agent states that runs reached, and the (state, input) pairs in which the input had an effect or caused an
     answer.
     """
 
@@ -44,7 +44,7 @@ class ReachedStates:
     pairs: set[int] = field(default_factory=set)
     branches: Counter[Branch] = field(default_factory=Counter)
     steps: int = 0
-    """Number of handler runs that were followed."""
+    """Number of handler runs that were examined."""
     untold: str | None = None
     """The reason why some steps are unknown. None if all are known."""
 
@@ -61,8 +61,8 @@ class ReachedStates:
 
 
 class CoverageWatcher:
-    """A recorder of the reached states, pairs and branches after each judged step of an agent. Callers may replace
-    `reached`.
+    """A recorder of the states, pairs and branches that an agent has reached after each judged step. Callers may
+    replace `reached`.
     """
 
     def __init__(self) -> None:
@@ -111,7 +111,7 @@ class CoverageWatcher:
 
 
 def _given(run: HandlerRun | None, held: HeldBlockOrder) -> tuple[Any, ...] | None:
-    """Return the abstract form of an input to an agent that held the blocks in `held`.
+    """Return the form in which an input is counted, for an agent that held the blocks in `held`.
 
     Return None for inputs that do not exist within any bounds.
     """
@@ -136,7 +136,7 @@ def reached_in(evidence: Evidence) -> ReachedStates:
 
 
 def simulate_watched(scenario: Scenario, seed: int, watch: Watch, **options: Any) -> Simulated:
-    """Simulate a run with traces. Messages without effect are delivered too, so that traces show their branches."""
+    """Simulate a run with traces. Messages without effect are delivered too, so that traces contain their branches."""
     return simulate_in_memory(_WatchedRunRecorder(watch), scenario, seed, deliver_all=True, **options)
 
 

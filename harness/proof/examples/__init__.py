@@ -1,1 +1,1 @@
-"""Write examples of a violation: a path through the state graph becomes a scenario that the simulation plays."""
+"""Convert a violation to an example: the path to it in the state graph becomes a scenario that the simulation plays."""

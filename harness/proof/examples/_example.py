@@ -23,7 +23,7 @@ Document = dict[str, Any]
 
 @dataclass(frozen=True)
 class ViolationExample:
-    """A path to a violation as a scenario file. `judged` contains the bad verdicts on its simulated run."""
+    """A scenario file that plays a path to a violation. `judged` contains the bad verdicts on the simulated run."""
 
     path: Path
     instants: int
@@ -50,7 +50,7 @@ class ViolationExample:
 
 @dataclass(frozen=True)
 class PlayedExample:
-    """A simulated run: its bad verdicts, and the endless cycle of its agents, if there is one."""
+    """A simulated run: its bad verdicts, and the endless cycle of its agents or None."""
 
     document: Document
     judged: dict[str, Judgement]

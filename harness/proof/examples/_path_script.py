@@ -1,9 +1,10 @@
 """Write a path through the state graph as a scenario.
 
-Scripted events, message fates and timer delays make the simulation take the same path. A message takes LATENCY_S. If
-the path requires a different order of arrivals, or if the next instant follows soon, a fate gives the message a
-different delay. A message that is lost on the path has the fate `drop`. A timer expires on time, unless messages of the
-previous instant arrive later.
+Scripted events, message fates and timer delays make the simulation take the same path. A message takes LATENCY_S. An
+*instant* is a moment at which one or more agents act. An *instant* is a moment at which one or more agents act. If the
+path requires a different order of arrivals, or if the next instant follows soon, a fate gives the message a different
+delay. A message that is lost on the path has the fate `drop`. A timer expires on time, unless messages of the previous
+instant arrive later.
 """
 
 from collections import Counter, defaultdict
@@ -28,20 +29,22 @@ LATENCY_S = 0.02
 ROGUE_LATENCY_S = LATENCY.mean_s
 """Seconds from the sending of a rogue node's message to its arrival."""
 MOMENT_S = 0.001
-"""Seconds between two events that must happen in a fixed order."""
+"""Seconds between two events that must happen in a certain order."""
 NEXT_INSTANT_SOON_S = 0.1
-"""Distance in seconds to the next instant below which messages take only MOMENT_S, so that they arrive before it."""
+"""Seconds. If the next instant is nearer than this, messages take only MOMENT_S, so that they arrive before it."""
 SETTLES_S = 60
 NO_CLOCKS = "if ties of phase 2 go as no clocks make them go"
-"""The text for contradictory ties: two blocks must be older than each other, or an agent's clock must go back."""
+"""A text about contradictory ties: each of two blocks would have to be older than the other, or an agent's clock would
+have to go back.
+"""
 
 Document = dict[str, Any]
 
 
 @dataclass(eq=False)
 class _BroadcastOnPath:
-    """A broadcast message that an agent sends on a path through the state graph. `count` numbers this sender's messages
-    of the same type.
+    """A broadcast message on a path through the state graph. `count` numbers the messages of the same sender and
+    type.
     """
 
     sender: int
@@ -54,8 +57,8 @@ class _BroadcastOnPath:
 
 @dataclass
 class _AgentOnPath:
-    """An agent on a path through the state graph. `timers` gives for each running timer its number among all started
-    timers, and its expiry.
+    """An agent on a path through the state graph. For each running timer, `timers` contains its number among all timers
+    that the agent started, and its expiry.
     """
 
     agent_id: int
@@ -73,7 +76,7 @@ class CompletionInterval(NamedTuple):
 
 
 class PathScript:
-    """A writer that follows a path through the state graph step by step, and collects the entries of a scenario."""
+    """A writer that follows a path through the state graph step by step and collects the entries of a scenario."""
 
     def __init__(self, graph: StateGraph, path: Sequence[int]) -> None:
         self._graph = graph
@@ -83,16 +86,16 @@ class PathScript:
             self._swarm.coincidences(graph.states[number], move.actions)
             for number, move in zip(path, self._moves, strict=False)
         )
-        """Number of pairs of instants on the path that must be equal by chance."""
+        """Number of pairs of instants on the path that are equal only by chance."""
         begin = graph.states[path[0]]
         self._agents = [_AgentOnPath(place + 1, local) for place, local in enumerate(begin[AGENTS:])]
         self._sent: Counter[tuple[int, str]] = Counter()
         self._events: list[Document] = []
         self._ages = BlockAges()
         self.contradictory = False
-        """True if no clocks give all ties the required results. `document` sets it."""
+        """True if no clocks can give all ties the results that the path requires. `document` sets it."""
         self.losses = 0
-        """Number of messages that receivers lose on the path. `document` sets it."""
+        """Number of messages that are lost on the path, counted once per receiver. `document` sets it."""
         self._timeline: list[Document] = []
         self._fates: list[Document] = []
         self._late: dict[int, dict[int, float]] = defaultdict(dict)
@@ -133,7 +136,7 @@ class PathScript:
         }
 
     def completions(self) -> Iterator[CompletionInterval]:
-        """Yield, for each block, the interval in which it can be completed with these timer durations."""
+        """Yield, for each block, the interval in which it can be completed with the timer durations of this path."""
         agents = [agent.agent_id for agent in self._agents]
         for move, (earliest_s, latest_s) in zip(
             self._moves, windows_s(len(self._moves), list(self._runs())), strict=True
@@ -144,7 +147,7 @@ class PathScript:
             agents = [agents[old] for old in move.places]
 
     def _move(self, before: int, after: int) -> SwarmTransition:
-        """Return a transition from one state to the next. Prefer a transition without lost messages."""
+        """Return a transition from one state to the next. If possible, return one without lost messages."""
         state, wanted = self._graph.states[before], self._graph.states[after]
         for lossy in (False, True) if self._swarm.bounds.network == "lossy" else (False,):
             for actions in self._swarm.actions(state):
@@ -155,7 +158,7 @@ class PathScript:
     # Times
 
     def _runs(self) -> list[TimerRun]:
-        """Return the interval in which each timer on the path runs."""
+        """Return the interval in which each timer of the path is running."""
         running: dict[tuple[int, int], tuple[int, float]] = {}
         runs = []
         for instant, move in enumerate(self._moves):
@@ -180,7 +183,7 @@ class PathScript:
     # Events
 
     def _play(self, move: SwarmTransition, at_s: float) -> None:
-        """Play one moment of the path: first the actions of the agents, then the reception of all messages."""
+        """Play one instant of the path: first the actions of the agents, then the reception of all messages."""
         earliest = self._end_s + MOMENT_S if self._end_s else 0.0
         ends = [
             max(self._agents[action.place].timers[action.number][1], earliest)
@@ -255,7 +258,7 @@ class PathScript:
         return flights
 
     def _in_wave_order(self, wave: MessageRound, flights: Sequence[_BroadcastOnPath]) -> list[_BroadcastOnPath]:
-        """Return the broadcasts in the order in which this round of messages lists them."""
+        """Return the broadcasts in the order in which the round `wave` lists them."""
         left, ordered = list(flights), []
         for place, message in wave.air:
             sender = self._agents[place].agent_id
@@ -265,7 +268,7 @@ class PathScript:
         return ordered
 
     def _hear(self, wave: MessageRound, air: Sequence[_BroadcastOnPath], acted_s: float) -> list[_BroadcastOnPath]:
-        """Deliver the messages of one round to each agent, and return the answers."""
+        """Deliver the messages of the round `wave` to each agent, and return the answers."""
         answers: dict[int, list[_BroadcastOnPath]] = {}
         received: set[int] = set()
         for place, heard in enumerate(wave.heard):
@@ -308,7 +311,7 @@ class PathScript:
         self._fates.append({"message": flight.name, "sender": flight.sender, **whom, "count": flight.count, **what})
 
     def _delay_open_timers(self) -> None:
-        """Delay each timer that still runs at the end of the path, so that it does not expire before this end."""
+        """Delay each timer that still runs at the end of the path, so that it does not expire before the end."""
         for agent in self._agents:
             for number, ends_s in agent.timers.values():
                 if ends_s <= self._end_s:

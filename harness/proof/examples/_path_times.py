@@ -1,9 +1,10 @@
 """Compute the mission second of each step of a path, and the timestamps of its blocks.
 
-The time of each instant is a variable, and each timer duration is a constraint on the difference of two variables. If a
-solution exists, the longest paths in the graph of these constraints are a solution (Bellman and Ford).
+The time of each step is a variable, and each timer duration is a constraint on the difference of two variables. If a
+solution exists, the lengths of the longest paths in the graph of these constraints are a solution (Bellman and Ford).
 
-If either of two blocks may be the older one (`Bounds.clocks_any`), the scenario contains the timestamps of the events.
+With `Bounds.clocks_any`, either of two blocks may be the older one. The scenario then contains the timestamps of the
+events.
 """
 
 from collections.abc import Collection, Sequence
@@ -16,7 +17,7 @@ from harness.proof.model._block_renaming import Ordinals
 from ucp.clock import MICROSECONDS
 
 DISTANCES_S = (5.0, 2.0, 1.0, 0.5, 0.2, 0.0)
-"""Minimum distances in seconds between two instants. The first one that allows a solution is used."""
+"""Minimum number of seconds between two steps. The first of these values that allows a solution is used."""
 FIRST_INSTANT_S = 1.0
 
 
@@ -35,7 +36,7 @@ class TimerRun:
 def instants_s(count: int, runs: Sequence[TimerRun]) -> list[float]:
     """Return the mission second of each of the `count` steps of a path.
 
-    If no solution with punctual timers exists (timers may expire in any order), timers may be late.
+    If timers may expire in any order, a solution with punctual timers may not exist. Timers are then late.
     """
     for apart_s in DISTANCES_S:
         solution = _solve(count, runs, apart_s, punctual=True)
@@ -58,14 +59,16 @@ def windows_s(count: int, runs: Sequence[TimerRun]) -> list[tuple[float, float]]
 
 
 def _solve(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: bool) -> list[float] | None:
-    """Return the earliest times that satisfy the constraints of all timers. Return None if there are none."""
+    """Return the earliest times that satisfy the constraints of all timers. Return None if the constraints have no
+    solution.
+    """
     later = _bounds(count, runs, apart_s, punctual=punctual)
     return _longest_paths([FIRST_INSTANT_S] * count, later)
 
 
 def _longest_paths(at_least: Sequence[float], later: Sequence[tuple[int, int, float]]) -> list[float] | None:
-    """Return the length of the longest path to each step in the constraint graph `later`. Return None if a cycle makes
-    it infinite.
+    """Return the length of the longest path to each step in the constraint graph `later`. Return None if the graph has
+    a cycle, so that a length would be infinite.
     """
     longest = [*at_least]
     for _ in range(len(longest) + 1):
@@ -95,16 +98,16 @@ def _bounds(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: b
 
 
 class BlockAges:
-    """The required age order of all blocks on a path, from which their timestamps are chosen.
+    """The required order of the ages of all blocks on a path. Their timestamps are chosen to satisfy this order.
 
-    Blocks are identified by their ordinals in the states of the path. The ordinals change along the path.
+    Blocks are identified by their ordinals in the states of the path. These ordinals change along the path.
     """
 
     def __init__(self) -> None:
         self._events: list[int] = []
         """Ordinal of a block minus 1 -> index of the event that completes it."""
         self._older: dict[int, set[int]] = {}
-        """Index of an event -> indices of the events that complete older blocks."""
+        """Index of an event -> indices of the events whose blocks are older than its block."""
 
     def completed(self, ordinal: int) -> None:
         """Record that the next event completes the block with this number."""
@@ -119,16 +122,16 @@ class BlockAges:
             self._events = [self._events[ordinal - 1] for ordinal in (*blocks, *rest)]
 
     def require_older(self, oldest: int, others: Collection[int]) -> None:
-        """Require that one block is older than the given other blocks. Block 0 is the inception block, which is always
-        the oldest.
+        """Require that the block `oldest` is older than the blocks `others`. Block 0 is the inception block, which is
+        always the oldest.
         """
         for other in others if oldest else ():
             self._older[self._events[other - 1]].add(self._events[oldest - 1])
 
     def date(self, events: list[dict[str, Any]]) -> bool:
-        """Choose timestamps for the events that satisfy the required age order, and return true.
+        """Choose timestamps for the events that satisfy the required order, and return true.
 
-        Return False if no timestamps satisfy it, because the requirements contradict each other or an agent's clock
+        Return false if no timestamps satisfy it, because the requirements contradict each other or an agent's clock
         would go back.
         """
         for index, event in enumerate(events):

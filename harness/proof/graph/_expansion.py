@@ -14,16 +14,16 @@ from harness.proof.questions._attractor import ByTimer
 
 NumberOf = Callable[[State], int]
 _Following = dict[Actions, dict[int, None]]
-"""Actions of an instant -> numbers of the possible successors, in order."""
+"""Actions of an instant -> the numbers of the possible successors, in order."""
 
 
 class StateExpansion(NamedTuple):
     """The successors of one state of the swarm. `ways` is the number of transitions from the state to its successors.
 
-    The other fields contain the numbers of those successors that need no lost message and no new block. `by_timer` has,
-    for each timer that may expire next, the possible successors: the timer expires alone, or timers that must expire at
-    the same moment expire before it or together with it. `crossing` has the successors if several timers expire at
-    once.
+    The other fields contain only successors without a lost message and without a new block. For each timer that may
+    expire next, `by_timer` contains the possible successors: the timer expires alone, or timers that must expire at the
+    same moment expire before it or together with it. `crossing` contains the successors in which several timers expire
+    at once.
     """
 
     ways: int
@@ -32,7 +32,9 @@ class StateExpansion(NamedTuple):
 
 
 def expanded(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
-    """Return the successors of a state. `number_of` is called for each successor in order, and returns its number."""
+    """Return the successors of a state. For each successor in order, the function `number_of` is called, which returns
+    its number.
+    """
     lossy = swarm.bounds.network == "lossy"
     ways = 0
     losing_nothing: _Following = {}
@@ -46,7 +48,7 @@ def expanded(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpan
 
 
 def quiet(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
-    """Return the successors of a state that need no lost message and no new block.
+    """Return those successors of a state that are reached without a lost message and without a new block.
 
     The field `ways` of the result is 0.
     """
@@ -56,7 +58,9 @@ def quiet(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansio
 def _quiet(
     swarm: ModelSwarm, state: State, number_of: NumberOf, ending: Sequence[Actions], known: _Following
 ) -> StateExpansion:
-    """Return the successors that need no lost message and no new block. `known` may already contain some of them."""
+    """Return those successors that are reached without a lost message and without a new block. `known` may already
+    contain some of them.
+    """
     after = {
         actions: known[actions]
         if actions in known
@@ -118,7 +122,7 @@ class StateStore(Sequence[State]):
 class SuccessorStore(Sequence[ByTimer]):
     """The successors of each state, grouped by the timer that expires.
 
-    One flat array holds all groups. Each group is its number of successors, followed by the successors.
+    One flat array contains all groups. Each group consists of the number of its successors and the successors.
     """
 
     def __init__(self) -> None:

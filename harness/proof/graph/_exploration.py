@@ -1,7 +1,6 @@
-"""Explore all reachable states of a swarm, breadth first. Therefore no violation has a shorter path than the first one
-that is found.
+"""Explore all reachable states of a swarm, breadth first. The first violation found therefore has a shortest path.
 
-The graph also keeps, for each state, the successors that need no lost message and no new block (`quiet`).
+For each state, the graph also keeps the successors without a lost message and without a new block (`quiet`).
 `../questions/_convergence.py` uses them.
 """
 
@@ -39,11 +38,11 @@ class StateGraph:
     ended: Ended = "complete"
     flawed: int | None = None
     shown: dict[str, int] = field(default_factory=dict)
-    """Characteristic -> first state in which an attacker has violated it without a flaw of the agents."""
+    """Characteristic -> first state in which an attacker has violated it although the agents are correct."""
     workers_bytes: float = 0.0
     workers_s: float = 0.0
     workers_steps: int = 0
-    """Memory and processor time of the workers, and the number of steps that they have computed."""
+    """Memory and processor time of the workers, and the number of agent steps that they have computed."""
 
     def __post_init__(self) -> None:
         self.states = StateStore(self.swarm.bounds.agents)
@@ -65,8 +64,8 @@ class StateGraph:
         return number
 
     def take_in(self, expansion: StateExpansion) -> None:
-        """Store the successors of the next state. Call this method once for each state, in the order of the state
-        numbers.
+        """Store the successors of the next state. The caller must call this method once for each state, in the order of
+        the state numbers.
         """
         number = len(self.quiet)
         self.transitions += expansion.ways
@@ -78,7 +77,7 @@ class StateGraph:
         return ExplorationProgress(len(self.states), self.looked_at, self.transitions, self.depth, seconds, asked)
 
     def path(self, number: int) -> list[int]:
-        """Return the states on the path from the initial state to this one."""
+        """Return the states on the path from the initial state to this state."""
         path = [number]
         while (parent := self.parents[path[-1]]) != NO_PARENT:
             path.append(parent)
@@ -94,9 +93,9 @@ def explore(
     workers: Workers | None = None,
     watch: Callable[[ExplorationProgress], None] = lambda progress: None,
 ) -> StateGraph:
-    """Explore all states, until a limit of memory or time is reached or a state shows a violation.
+    """Explore all states, until a limit of memory or time is reached or a violation is found.
 
-    The result is the same with and without workers.
+    The result does not depend on the use of workers.
     """
     graph, budget = StateGraph(swarm), ExplorationBudget(most_bytes, most_s)
     try:
@@ -128,9 +127,9 @@ def _all(graph: StateGraph, budget: ExplorationBudget, workers: Workers | None) 
 
 
 def _expansions(graph: StateGraph, budget: ExplorationBudget, workers: Workers | None) -> Iterator[StateExpansion]:
-    """Yield the successors of each state in order. States that are added during the loop are included.
+    """Yield the successors of each state in order, including states that are added during the loop.
 
-    If there are many waiting states, worker processes compute their successors.
+    If many states are waiting, worker processes compute their successors.
     """
     swarm, states, looked_at = graph.swarm, graph.states, 0
     while looked_at < len(states):

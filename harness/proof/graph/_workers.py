@@ -1,8 +1,9 @@
 """Explore states in worker processes on all processor cores.
 
 The workers are forked processes. Each worker starts with the agents and steps that are known at the fork. From then on,
-it numbers new local states and zones itself. A message between two processes uses the receiver's number of a state if
-the sender knows it. Otherwise it uses the sender's number, the first time together with its definition.
+it numbers new local states and zones itself, so the numbers of processes differ. A message between two processes uses
+the receiver's number of a state if the sender knows it. Otherwise it uses the sender's number. The first such message
+also contains the definition of the state.
 
 The main process distributes the states in order, and adds their successors in the same order. The result is therefore
 the same as with one process.
@@ -28,24 +29,24 @@ from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
 from harness.run.parallel import FailedTask, WorkerProcess, signals_blocked
 
 WAIT_S = 0.5
-"""Maximum time in seconds to wait for an answer before memory and time are checked again."""
+"""Maximum number of seconds to wait for an answer of a worker before memory and time are checked again."""
 WORTH_WORKERS = 500
 """Minimum number of unexplored states at which the workers are used."""
 CHUNK = 100
 """Maximum number of states in one task of a worker."""
 MAX_REPORTED = 500_000
-"""Maximum number of reported states that a worker remembers.
+"""Maximum number of states that a worker remembers as reported.
 
 Above it, the worker forgets them and reports them again.
 """
 
 Definitions = list[tuple[int, Any]]
-"""Numbers of the sender, with their definitions."""
+"""Numbers of the sending process, with their definitions."""
 
 
 class StateBatch(NamedTuple):
-    """States that one process sends to another process, in a flat array, with the definitions that the receiver does
-    not have yet.
+    """States that one process sends to another process, in a flat array. It includes the definitions that the receiver
+    does not have yet.
     """
 
     locals: Definitions
@@ -75,15 +76,15 @@ class SuccessorBatch(NamedTuple):
 
 
 class NeededVotes(NamedTuple):
-    """A worker's answer: the result of `ExtraVotes.needed` for each state. `votes` is None if the worker reached its
-    limit of states.
+    """A worker's answer: the number of further votes that each state needs until all chains are equal. `votes` is None
+    if the search reached its limit.
     """
 
     votes: list[int | PropertyViolation | None] | None
 
 
 class WorkerAnswer(NamedTuple):
-    """An answer of a worker process, with the time and memory that it has used so far."""
+    """An answer of a worker process, with the time and memory that the worker has used so far."""
 
     answer: SuccessorBatch | NeededVotes
     memory_bytes: float
@@ -102,8 +103,8 @@ class _NumberTranslator:
         self._new_definitions: Definitions = []
 
     def code(self, ours: int) -> int:
-        """Return the other process's number for our number. If it is unknown, return a value below -1, which stands for
-        our own number.
+        """Return the other process's number for a number of this process. If it is unknown, return a value below -1
+        that encodes this process's number.
         """
         code = self._codes.get(ours)
         if code is None:
@@ -125,7 +126,7 @@ class _NumberTranslator:
 
 
 class _StateTranslator:
-    """A translator of state numbers at one end of the connection between two processes."""
+    """A converter of state numbers at one end of the connection between two processes."""
 
     def __init__(self, swarm: ModelSwarm) -> None:
         local, zones = swarm.local, swarm.zones
@@ -162,7 +163,7 @@ class _StateTranslator:
 
 
 class _WorkerFunction:
-    """The function that a worker process runs. It returns the successors of the states in a task, or the number of
+    """The function that a worker process runs. It returns the successors of the states in a task, or the numbers of
     votes that they need.
     """
 
@@ -205,7 +206,7 @@ class _WorkerFunction:
 
 
 class _WorkerHandle:
-    """A worker process, as the main process sees it."""
+    """The main process's view of a worker process."""
 
     def __init__(self, swarm: ModelSwarm) -> None:
         self.memory_bytes = 0.0
@@ -215,7 +216,7 @@ class _WorkerHandle:
         self._translator = _StateTranslator(swarm)
         self._worker: WorkerProcess[StateBatch | ForkedStates, WorkerAnswer] = WorkerProcess(_WorkerFunction(swarm))
         self._numbers: list[int] = []
-        """The main process's numbers of the states that the worker reported, in order of the reports."""
+        """The main process's numbers of the states that the worker has reported, in the order of the reports."""
 
     @property
     def connection(self) -> Connection:
@@ -269,7 +270,7 @@ Give = Callable[["_WorkerHandle", Sequence[State]], None]
 
 
 class Workers:
-    """A pool of `size` worker processes. They start with the first task and stop at the end of the `with` block."""
+    """A pool of `size` worker processes. They start with the first task and stop at the end of the context."""
 
     def __init__(self, swarm: ModelSwarm, size: int) -> None:
         self._swarm = swarm
@@ -297,7 +298,7 @@ class Workers:
         return sum(other.steps for other in self._handles)
 
     def pays_off(self, waiting: int) -> bool:
-        """Return true if the number of waiting states is large enough for a use of the workers."""
+        """Return true if enough states are waiting that using the workers saves time."""
         return self._size > 1 and waiting >= WORTH_WORKERS
 
     def expansions(
@@ -323,8 +324,8 @@ class Workers:
     def _answers(
         self, give: Give, states: Sequence[State], check: Check, first: int = 0
     ) -> Iterator[tuple[_WorkerHandle, int, SuccessorBatch | NeededVotes]]:
-        """Yield the answers of the workers in the order of the tasks. Each comes with its worker and the number of its
-        first state.
+        """Yield the answers of the workers in the order of the tasks. Each has its worker and the number of its first
+        state.
 
         `states` may grow during the loop.
         """

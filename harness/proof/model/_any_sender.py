@@ -2,13 +2,13 @@
 sent.
 
 A message may be lost, duplicated, delayed for any time and overtaken. An agent can therefore receive each sent message
-at any moment, any number of times. It depends on other agents in no other way, with one exception: no agent can mention
-a block before it is completed.
+at any moment, any number of times. Otherwise it does not depend on the other agents, with one exception: no agent can
+mention a block before it is completed.
 
 The local states of each agent and the sent messages are collected together until no new ones appear. The result
-contains every local state and message of every possible run. It may contain more, because one run need not be able to
-send all these messages. A property that holds for all of these states therefore holds for every run. If it does not
-hold for one of them, a violation in a run is not yet proven.
+contains every local state and message of every possible run. It may contain more, because some of these messages may
+never occur in the same run. If a property holds for all of these states, it holds in every run. If it does not hold for
+one of them, this does not prove that a run violates it.
 """
 
 import time
@@ -28,9 +28,9 @@ from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 LOOK_EVERY = 500
 
 Alone = tuple[int, int, int, int]
-"""A single agent: its ID, local state, zone, and number of its own completed blocks."""
+"""A single agent: its ID, its local state, its zone, and the number of blocks that it has completed."""
 Said = tuple[int, int]
-"""The number of a sender and the number of a message."""
+"""A sent message: the number of the sender and the number of the message."""
 
 
 @dataclass
@@ -50,9 +50,9 @@ class SingleAgentFigures:
     ended: Ended = "complete"
     flaw: PropertyViolation | None = None
     way: list[str] = field(default_factory=list)
-    """The earlier actions and received messages of the agent with the flaw."""
+    """The actions and received messages that led the agent to the flaw."""
     shown: set[str] = field(default_factory=set)
-    """Characteristics that an attacker violates without a flaw of the agents."""
+    """Characteristics that an attacker violates although the agents are correct."""
 
 
 def collect(
@@ -65,7 +65,7 @@ def collect(
 ) -> SingleAgentFigures:
     """Collect all agent states and messages, until a limit of memory or time is reached or a violation is found.
 
-    `keep` is called with the local states for each distribution of the blocks among the agents.
+    For each distribution of the blocks among the agents, `keep` is called with the local states.
     """
     collected, began = SingleAgentFigures(bounds), time.monotonic()
     try:
@@ -97,7 +97,7 @@ def collect(
 def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator[tuple[int, ...]]:
     """Yield each distribution of the blocks among the agents: a tuple that contains the author of each block.
 
-    Two distributions count as one if they differ only by an exchange of agents. The captured agent is not exchanged.
+    Distributions that differ only by an exchange of agents are yielded once. The captured agent is never exchanged.
     """
     others = [agent_id for agent_id in range(1, agents + 1) if agent_id != captured]
     begun: list[tuple[int, ...]] = [()]
@@ -127,14 +127,16 @@ class _BlockDistribution:
         self._names: dict[int, frozenset[int]] = {}
         self._by_agent: dict[int, list[Alone]] = {agent_id: [] for agent_id in self._own if agent_id != bounds.captured}
         self._heard = None if bounds.captured is None else AttackerKnowledge(bounds, self._own[bounds.captured])
-        """The knowledge of the attacker, who can send at any moment.
+        """The knowledge of the attacker, which can send at any moment.
 
-        It has the blocks of its vehicle from the beginning.
+        The attacker has the blocks of the captured vehicle from the beginning.
         """
         self._lied: dict[int, tuple[ForgeryMaterial, int]] = {}
-        """Agent -> material of the last attack messages to it, and number of its states that have received them."""
+        """Agent -> the data of the last forged messages to it, and the number of its states that have received these
+        messages.
+        """
         self._looked_at = 0
-        """Number of states whose own actions have been explored."""
+        """Number of states whose own actions (those without a message) have been explored."""
 
     def collect(self, began: float) -> Iterator[ExplorationProgress]:
         """Explore until no new states or messages appear. Yield the progress."""
@@ -229,7 +231,7 @@ class _BlockDistribution:
             self._heard.hears(said[0], self.local.messages[said[1]])
 
     def _lied_to(self, agent_id: int, states: list[Alone]) -> bool:
-        """Deliver all messages of the attacker to an agent in each of these states. Return true if at least one message
+        """Deliver all messages that the attacker can send to an agent in each of these states. Return true if a message
         is new.
         """
         if self._heard is None:

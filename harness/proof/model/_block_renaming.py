@@ -1,7 +1,7 @@
-"""Find the blocks that an agent's state contains, and replace them with different blocks.
+"""Find the blocks that an agent's state contains, and exchange them for other blocks.
 
-Agents only compare blocks for equality, with one exception: a tie of phase 2 (Algorithm 15) compares their ages. If
-either of two blocks may be the older one (`Bounds.clocks_any`), the identity of blocks makes no difference.
+Agents only compare blocks for equality, with one exception: a tie of phase 2 (Algorithm 15) compares their ages. With
+`Bounds.clocks_any`, either of two blocks may be the older one, so the identity of blocks makes no difference.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -13,7 +13,7 @@ from ucp.chain import Chain
 from ucp.messages import Message
 
 Ordinals = tuple[int, ...]
-"""Ordinals of blocks: the number of each block among all completed blocks."""
+"""Ordinals of blocks. The ordinal of a block is its number among all completed blocks."""
 Completed = tuple[bytes, int, int]
 """A completed block: its hash, the number of its agent, and its ordinal."""
 
@@ -34,7 +34,7 @@ class NumberedBlocks:
         self._block = cache(make)
 
     def note_completed(self, blocks: Iterable[Completed]) -> None:
-        """Add blocks that an agent completed in this process or in a worker process."""
+        """Add blocks that an agent has completed, in this process or in a worker process."""
         for block_hash, agent_id, ordinal in blocks:
             if block_hash not in self.makers:
                 self.makers[block_hash] = agent_id
@@ -46,7 +46,7 @@ class NumberedBlocks:
         return next(made for made, maker, number in self.completed if (maker, number) == (agent_id, ordinal))
 
     def in_words(self, block_hash: str) -> str:
-        """Return the name of the block with this hash, for printed text."""
+        """Return the name of the block with this hash, for text output."""
         ordinal = self.numbers.get(bytes.fromhex(block_hash))
         return f"#{ordinal}" if ordinal else block_hash[:12]
 
@@ -68,16 +68,16 @@ class NumberedBlocks:
         return self._chains.get(digest, ()) if number is None else (number,)
 
     def named_in(self, message: Message) -> frozenset[int]:
-        """Return the numbers of the blocks that a message contains or names, and of all blocks in the chains that it
-        names.
+        """Return the ordinals of the blocks in a message: the block that it contains or names, and all blocks of the
+        chains that it names.
         """
         fields = (getattr(message, name) for name in message.__slots__)
         hashes = [field.block_hash if isinstance(field, Block) else field for field in fields]
         return frozenset().union(*(self.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     def of(self, snapshot: Snapshot) -> Ordinals:
-        """Return the numbers of the blocks in a state, each once. Two states that differ only in their blocks list them
-        in the same order.
+        """Return the numbers of the blocks in a state, each once. States that differ only in their blocks list them in
+        the same order.
         """
         return tuple(dict.fromkeys(self._all(snapshot)))
 

@@ -1,4 +1,5 @@
-"""Choose one order of the agents to represent all equivalent orders. Equal agents and equal blocks are interchangeable.
+"""Choose one of the equivalent orders of the agents to represent all of them. Equal agents and equal blocks are
+interchangeable.
 
 The choice depends on the states of the agents and the relations of their timers, but not on the numbers of states and
 zones. The order is therefore the same on all machines, and for any order of exploration.
@@ -16,7 +17,7 @@ from harness.proof.model._snapshot import NAMES_OF_OTHERS
 from harness.proof.model._zones import ZoneTable
 
 Places = tuple[int, ...]
-"""The previous place of the agent at each place of a state."""
+"""The previous position of the agent at each position of a state."""
 
 
 class OrderedAgents(NamedTuple):
@@ -34,16 +35,16 @@ class OrderedAgents(NamedTuple):
 MOST_KNOWN = 200_000
 """Maximum number of cached orders. Above it, the cache is emptied."""
 MOST_ORDERS = 120
-"""Maximum number of compared orders of agents that look alike.
+"""Maximum number of orders of similar agents that are compared.
 
-Above it, equivalent states may count as several states.
+If there are more, equivalent states may count as several states.
 """
 
 
 class CanonicalOrder:
     """A sorter that puts agents into their canonical order.
 
-    `name_of` returns the ID that the agent at one position uses for the agent at a second position.
+    `name_of` returns the ID by which the agent at one position knows the agent at another position.
     """
 
     def __init__(self, local: LocalStates, zones: ZoneTable, name_of: Callable[[int, int], int]) -> None:
@@ -87,14 +88,14 @@ class CanonicalOrder:
     def _blocks(self, agents: Sequence[int]) -> Ordinals:
         """Return the numbers of the agents' blocks in the order in which the blocks first occur.
 
-        The result is empty if blocks keep their ordinals.
+        The result is empty if blocks are not renumbered.
         """
         if not self._local.bounds.blocks_alike:
             return ()
         return tuple(dict.fromkeys(chain.from_iterable(map(self._local.about, agents))))
 
     def _timers(self, locals_: Sequence[int]) -> list[range]:
-        """Return, for each agent, the range of its timers in the list of all timers of the swarm."""
+        """Return, for each agent, the range of its timers in the list of the swarm's timers."""
         timers, first = [], 1
         for local in locals_:
             end = first if local == DEAD else first + len(self._local.known[local].running)
@@ -103,8 +104,8 @@ class CanonicalOrder:
         return timers
 
     def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range]) -> Iterator[Places]:
-        """Yield all orders of the agents in which their descriptions ascend. Agents with equal descriptions appear in
-        every possible order.
+        """Yield all orders of the agents in which their descriptions ascend. Agents with equal descriptions are yielded
+        in every order.
         """
         known, pattern = self._local.known, self._local.pattern
         bounds = self._zones.bounds(zone) if zone else [()]
@@ -163,8 +164,8 @@ class CanonicalOrder:
     ) -> bool:
         """Return true if these agents with equal descriptions differ only in their blocks.
 
-        They then have no timers and have counted no agent. Each vote count of the remaining agents contains all of them
-        or none.
+        In this case they have no timers and have counted no agent, and each vote count of the other agents contains all
+        of them or none.
         """
         if timers[group[0]]:
             return False
@@ -175,7 +176,7 @@ class CanonicalOrder:
         )
 
     def _named(self, local: int, place: int) -> list[set[int]]:
-        """Return, for each type of vote count, the positions of the agents that the agent at `place` has counted."""
+        """Return, for each kind of vote count, the positions of the agents that the agent at `place` has counted."""
         if local == DEAD:
             return [set() for _ in NAMES_OF_OTHERS]
         snapshot = self._local.known[local].snapshot
@@ -186,8 +187,8 @@ class CanonicalOrder:
         return name - 2 if name - 2 < place else name - 1
 
     def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:
-        """Return a description of the state with this order of the agents. Two orders with equal descriptions lead to
-        the same state.
+        """Return a description of the state with this order of the agents. Orders with equal descriptions lead to the
+        same state.
         """
         new_place = {old: new for new, old in enumerate(places)}
         named = [
@@ -213,8 +214,8 @@ class CanonicalOrder:
 
 
 def _groups(looks: Sequence[Any]) -> list[list[int]]:
-    """Return the agents grouped by equal descriptions, as positions. The groups are in ascending order of their
-    descriptions.
+    """Group the agents by equal descriptions. Return the positions of each group. The groups are in ascending order of
+    their descriptions.
     """
     in_order = sorted(range(len(looks)), key=looks.__getitem__)
     return [list(group) for _, group in groupby(in_order, looks.__getitem__)]

@@ -1,4 +1,4 @@
-"""Find violations that are visible in the state of one agent."""
+"""Find violations that the state of a single agent shows."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ class PropertyViolation:
 
 
 FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
-"""Kinds of flaws that the state after a step does not show."""
+"""Kinds of violations that only the step shows, not the state after it."""
 
 
 def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> PropertyViolation | None:
@@ -55,9 +55,7 @@ def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | N
 
 
 def is_deceived(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> bool:
-    """Return true if the agent holds a block in the name of the captured agent that the captured agent never
-    completed.
-    """
+    """Return true if the agent holds a block in the name of the captured agent that this agent never completed."""
     if captured is None:
         return False
     return any(maker == captured and made not in completed for made, maker in _makers(state).items())

@@ -1,8 +1,8 @@
 """Compute the states of a whole swarm and their successors.
 
 A global state is a tuple of small numbers: the completed blocks, the remaining faults, the zone of the running timers,
-and the local states of the agents. If `bounds.alike`, agents that are alike are interchangeable, and one order of the
-agents represents all orders. If `bounds.blocks_alike`, the same holds for blocks.
+and the local states of the agents. If `bounds.alike` is true, equal agents are interchangeable, and one order of the
+agents represents all orders. If `bounds.blocks_alike` is true, the same holds for blocks.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -31,22 +31,22 @@ from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 State = tuple[int, ...]
 """A global state: the number of completed blocks, the remaining faults, the zone, and the local states.
 
-The remaining faults are a bit for each fault and for the capture, and the numbers of remaining lies, coincidences and
-losses.
+The number for the remaining faults has a bit for each fault and for the capture, and contains the remaining numbers of
+forged messages, coincidences and losses.
 """
 MOST_KNOWN = 200_000
 """Maximum number of cached instants. Above it, the cache is emptied."""
 ONCE = (*FAULTS, "captured")
-"""Faults that can happen once, by the bit that is set while they remain."""
+"""Faults that can happen once. Each has a bit that is set while the fault can still happen."""
 ALL_LEFT = -1
 LIES = 1 << len(ONCE)
-"""The unit of the number of remaining lies."""
+"""The unit of the remaining number of forged messages."""
 COINCIDENCES = LIES << (MAX_LIES.bit_length())
-"""The unit of the number of remaining coincidences, if it is bounded."""
+"""The unit of the remaining number of coincidences, if this number is bounded."""
 LOSSES = COINCIDENCES << (MAX_COINCIDENCES.bit_length())
-"""The unit of the number of remaining losses, if it is bounded."""
+"""The unit of the remaining number of losses, if this number is bounded."""
 ANY_NUMBER = 1 << 30
-"""The number of losses that stands for an unlimited number."""
+"""The number that stands for an unlimited number of losses."""
 BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
 """The indices of the parts of a global state."""
 
@@ -55,7 +55,7 @@ class SwarmTransition(NamedTuple):
     """A transition between two states of the swarm: its actions, the new state, and the previous positions of the
     agents.
 
-    `wave` is the last round of received messages in the transition.
+    `wave` is the last round of messages in the transition.
     """
 
     actions: Actions
@@ -63,16 +63,16 @@ class SwarmTransition(NamedTuple):
     places: Places
     wave: MessageRound | None
     started: tuple[Started, ...]
-    """The started timers, by the places before the transition."""
+    """The timers that were started. Agents are identified by their positions before the transition."""
     blocks: Ordinals
-    """The previous ordinals of the blocks 1, 2, ... of `state`. Empty if they are unchanged."""
+    """The previous ordinals of the blocks 1, 2, ... of `state`. Empty if the ordinals did not change."""
 
 
 class _InstantResult(NamedTuple):
     """The states of all agents after one instant: simultaneous actions, and all messages that they cause.
 
-    `running` contains the previous number of each running timer. `started` and `way` describe how the result came
-    about.
+    `running` contains the previous number of each running timer. `started` and `way` describe the events that led to
+    this result.
     """
 
     agents: tuple[int, ...]
@@ -82,8 +82,8 @@ class _InstantResult(NamedTuple):
 
 
 class _InstantResults(NamedTuple):
-    """The results of one instant that do not depend on exact timer values: expired timers, new blocks, remaining
-    faults, and agents.
+    """All possible results of one instant, as far as they do not depend on exact timer values: expired timers, new
+    blocks, remaining faults, and agents.
     """
 
     ended: tuple[int, ...]
@@ -96,8 +96,8 @@ class _InstantResults(NamedTuple):
 class ModelSwarm:
     """The states of a swarm within `bounds`, and the transitions between them.
 
-    If `every_count` is true, the swarm explores all existing local states. Agents then receive answers in each order
-    even if they only count them, and keep vote counts even if these decide nothing.
+    If `every_count` is true, all existing local states are explored. Agents then receive answers in every order even if
+    they only count them, and keep vote counts even if these have no effect.
     """
 
     def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
@@ -143,8 +143,8 @@ class ModelSwarm:
     def alternatives(self, state: State) -> Iterator[tuple[AgentAction, frozenset[AgentAction]]]:
         """Yield each timer that may expire next, with the set of all timers that must expire at the same moment.
 
-        If an expiry has several results because the ages of blocks are open, each combination of results comes
-        separately. No agent can choose the older one of two blocks.
+        If an expiry has several results because the ages of blocks are not fixed, each combination of results is
+        yielded separately, because agents cannot choose which block is older.
         """
         firsts = self._firsts(state)
         tied = [(index,) for index in range(len(firsts))] if self.bounds.timers_any else self.zones.tied(state[ZONE])
@@ -157,7 +157,7 @@ class ModelSwarm:
         """Yield all sets of timers that may expire at the same moment, with at most one timer per agent. Some of these
         sets may be impossible.
 
-        Without crossing, timers expire one by one.
+        If messages must not cross (`bounds.crossing` is false), timers expire one by one.
         """
         by_place: dict[int, list[AgentAction]] = {}
         for action in self.firsts(state):
@@ -173,7 +173,7 @@ class ModelSwarm:
         """Yield all sets of actions that may happen at the same moment. An action is the expiry of a timer, the
         completion of a block, a fault, or an action of the attacker.
 
-        `ending` has the sets of timers, if they are known.
+        `ending` contains the sets of timers if they are already known.
         """
         alive = [place for place, local in enumerate(state[AGENTS:]) if local != DEAD]
         left = self.bounds.blocks - state[BLOCKS]
@@ -234,7 +234,7 @@ class ModelSwarm:
     def _unlike(self, state: State, choices: Iterable[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:
         """Yield one representative of each group of equivalent choices of agents.
 
-        Idle agents in the same local state are equivalent, unless a vote count distinguishes them.
+        Idle agents in the same local state are equivalent, unless a vote count contains only some of them.
         """
         known = self.local.known
         locals_ = state[AGENTS:]
@@ -251,7 +251,7 @@ class ModelSwarm:
     # Results of an instant
 
     def after(self, state: State, actions: Actions, lossy: bool) -> Iterator[State]:
-        """Yield the possible states after these simultaneous actions. Yield nothing if their timers cannot expire
+        """Yield the possible states after these simultaneous actions. Yield none if their timers cannot expire
         together.
         """
         key = state[AGENTS:], actions, self._most_lost(state, lossy)
@@ -284,8 +284,8 @@ class ModelSwarm:
         return ANY_NUMBER if self.bounds.losses is None else state[LEFT] // LOSSES
 
     def _can_be(self, state: State, instant: _InstantResults) -> bool:
-        """Return true if these timers can expire together and before all other timers. Each of them must be able to
-        expire first when it expires alone.
+        """Return true if these timers can expire together and before all other timers. Each of them alone must be able
+        to expire first.
         """
         if len(instant.ended) < 2 or self.bounds.timers_any:
             return True
@@ -306,8 +306,8 @@ class ModelSwarm:
                 yield self._order.of(outcome.agents, zone)
 
     def _left(self, state: State, actions: Sequence[AgentAction], instant: _InstantResults) -> int:
-        """Return what remains after these actions (faults, forged messages, coincidences and losses), encoded in one
-        number.
+        """Return the remaining numbers of faults, forged messages, coincidences and losses after these actions, encoded
+        in one number.
         """
         left = (state[LEFT] & instant.left) - instant.lies * LIES
         if self.bounds.coincidences:
@@ -334,7 +334,7 @@ class ModelSwarm:
     def _running_after(self, at: dict[tuple[int, int], int], there: AgentStates) -> tuple[int, ...]:
         """Return, for each timer that runs after a step, the number that it had before the step.
 
-        For a timer that was just started, return -1 minus its duration.
+        For a timer that was just started, the result contains -1 minus its duration.
         """
         running = []
         for place, local in enumerate(there.locals):
@@ -383,7 +383,8 @@ class ModelSwarm:
     def violated(self, state: State) -> Iterator[str]:
         """Yield the characteristics that the attacker has violated although all honest agents follow the protocol.
 
-        An agent accepted a message that the vehicle never sent, or holds a block in its name that it never completed.
+        Such a violation exists if an agent accepted a message that the captured vehicle never sent, or holds a block in
+        its name that it never completed.
         """
         if _lies(state) < self.bounds.lies:
             yield "1"

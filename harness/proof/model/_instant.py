@@ -1,4 +1,4 @@
-"""Compute the possible results of one moment. In it, timers expire or blocks are completed, and then agents receive all
+"""Compute the possible results of one instant: timers expire or blocks are completed, and then agents receive all
 messages.
 
 Several agents may act before they receive each other's messages, so their messages cross. The agents receive the
@@ -6,7 +6,8 @@ messages in any order of the senders. Then they receive the answers to them, and
 receiver in a lossy network may lose any of the messages. If an agent sends several messages in one action, they arrive
 in order. Answers can overtake each other.
 
-For each agent, the results of all orders and all losses are computed once. Mostly there are only one or two results.
+For each agent, the results of all orders and all losses are computed once. In most cases there are only one or two
+different results.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,19 +20,21 @@ from harness.proof.model._local_steps import LocalStates
 from harness.proof.model._snapshot import AgentStep, Started
 
 ReceivedMessages = tuple[tuple[int, int], ...]
-"""The messages that reach an agent in one round: (ID of the sender for this agent, message), in the order of
-senders.
+"""The messages that reach an agent in one round, in the order of the senders. Each is (ID of the sender for this agent,
+message).
 """
 
 
 ANSWERED = 2
-"""The number of the round of an instant in which answers are received. Questions are received in the round before."""
+"""The round of an instant in which answers are received. Queries are received in the round before it."""
 
 
 MOST_KNOWN = 200_000
 """Maximum number of cached outcomes. Above it, the cache is emptied."""
 MOST_SEEN = 500
-"""Maximum number of states that an agent can reach by one round of messages, unless it counts them without end."""
+"""Maximum number of states that a correct agent can reach by one round of messages. A wrong agent may count messages
+without limit and exceed it.
+"""
 
 
 class AgentAction(NamedTuple):
@@ -52,7 +55,7 @@ Actions = tuple[AgentAction, ...]
 
 
 class AgentStates(NamedTuple):
-    """The states of all agents, and the timers that each agent started in the present instant."""
+    """The states of all agents, and the timers that each agent started in the current instant."""
 
     locals: tuple[int, ...]
     started: tuple[Started, ...]
@@ -61,8 +64,8 @@ class AgentStates(NamedTuple):
 class MessageRound(NamedTuple):
     """A round of messages: the sent messages, and the messages that each agent received.
 
-    `air` contains each sent message as a pair (position of the sender, message). `heard` contains, for each agent, the
-    indices of its received messages in `air`, in order.
+    `air` contains each sent message as (position of the sender, message). For each agent, `heard` contains the indices
+    in `air` of the messages that it received, in order.
     """
 
     before: "MessageRound | None"
@@ -71,9 +74,9 @@ class MessageRound(NamedTuple):
 
 
 class FinalMessageRound(NamedTuple):
-    """The last round of messages in an instant. It is linked to all rounds before it.
+    """The last round of messages in an instant. Each round refers to the round before it.
 
-    `lost` is the number of lost messages, where a message counts once for each receiver that loses it. It is 0 if
+    `lost` is the number of lost messages. A message counts once for each receiver that loses it. The number is 0 if
     losses are not counted.
     """
 
@@ -82,9 +85,9 @@ class FinalMessageRound(NamedTuple):
 
 
 _Said = tuple[tuple[int, int], ...]
-"""The messages of a round: (place of the sender, message)."""
+"""The messages of a round, each as (position of the sender, message)."""
 _Agent = tuple[int, int, Started]
-"""An agent: its place, its local state, and the timers that it has started in this instant."""
+"""An agent: its position, its local state, and the timers that it has started in this instant."""
 _Choice = tuple[int, Started, _Said, tuple[int, ...], int]
 """A possible result for one agent: its local state, started timers, sent messages, received messages in order, and
 number of lost messages.
@@ -97,7 +100,7 @@ _Outcome = tuple[AgentStep, tuple[int, ...]]
 
 
 class InstantOutcomes:
-    """A cache of the possible results of simultaneous actions, which computes missing results."""
+    """A cache of the possible results of simultaneous actions. Missing results are computed."""
 
     def __init__(self, local: LocalStates, bounds: Bounds, *, every_order: bool = False) -> None:
         self._local = local
@@ -115,7 +118,7 @@ class InstantOutcomes:
         ]
 
     def name_of(self, other: int, place: int) -> int:
-        """Return the ID by which the agent at position `place` knows the agent at position `other`."""
+        """Return the ID that the agent at position `place` uses for the agent at position `other`."""
         return self._names[place][other]
 
     def order_matters(self, local: int, place: int, wave: MessageRound, heard: Sequence[int]) -> bool:
@@ -128,10 +131,10 @@ class InstantOutcomes:
     def outcomes(
         self, locals_: tuple[int, ...], actions: Sequence[AgentAction], most_lost: int, *, tell: bool
     ) -> dict[AgentStates, FinalMessageRound]:
-        """Return the possible results of these actions. Of several ways to the same result, keep the one with the
-        fewest lost messages.
+        """Return the possible results of these actions. If the same result can be reached in several ways, keep the one
+        with the fewest lost messages.
 
-        The rounds of messages are included if `tell` is true.
+        If `tell` is true, the result includes the rounds of messages.
         """
         agents, started = list(locals_), [()] * len(locals_)  # type: list[int], list[Started]
         air: list[tuple[int, int]] = []
@@ -218,7 +221,7 @@ class InstantOutcomes:
         return choices
 
     def _still(self, before: Started, step: AgentStep) -> Started:
-        """Return the timers that an agent started in the present instant and that are still running."""
+        """Return the timers that an agent started in the current instant and that are still running."""
         if not before and not step.started:
             return ()
         if step.local == DEAD:
@@ -230,7 +233,7 @@ class InstantOutcomes:
         return tuple([item for item in started if item[0] in running])
 
     def _outcomes_of(self, local: int, heard: ReceivedMessages, lossy: bool, answered: bool) -> list[_Outcome]:
-        """Return the possible steps of an agent that receives these messages. Each step comes with an order of messages
+        """Return the possible steps of an agent that receives these messages. Each step has an order of the messages
         that leads to it.
         """
         key = local, heard, lossy, answered
@@ -262,8 +265,8 @@ class InstantOutcomes:
         return outcomes
 
     def _when_counting(self, local: int, heard: ReceivedMessages, lossy: bool) -> list[_Outcome] | None:
-        """Return the possible steps if the agent only counts these messages, so that their order has no effect. Return
-        None otherwise.
+        """If the agent only counts these messages, so that their order has no effect, return the possible steps.
+        Otherwise return None.
 
         Whether an answer counts depends on the state without the vote counts, and on whether its sender is already in
         the vote count (docs/explanation/proof.md).
@@ -332,10 +335,10 @@ class InstantOutcomes:
             yield step, (*way, *others)
 
     def _that_matter(self, local: int, heard: ReceivedMessages) -> list[int]:
-        """Return the indices of the messages that may change the agent or cause an answer, possibly only after some of
-        the remaining messages.
+        """Return the indices of the messages that may change the agent or cause an answer, at once or after other
+        messages of this round.
 
-        Return all indices if a wrong agent reaches more and more states by the same messages.
+        Return all indices if a wrong agent reaches new states again and again by the same messages.
         """
         seen, waiting = {local}, [local]
         matter: set[int] = set()
@@ -354,16 +357,14 @@ class InstantOutcomes:
 
 
 def _keep(ways: dict[AgentStates, FinalMessageRound], there: AgentStates, way: FinalMessageRound) -> None:
-    """Store this way to a result if no way is stored yet, or if it loses fewer messages than the stored one."""
+    """Store this path to a result, unless a path with as few lost messages is already stored."""
     known = ways.get(there)
     if known is None or way.lost < known.lost:
         ways[there] = way
 
 
 def _keep_fullest(ways: dict[_Key, tuple[int, ...]], there: _Key, way: tuple[int, ...]) -> None:
-    """Store this way to a result if no way is stored yet, or if it contains more different messages than the stored
-    one.
-    """
+    """Store this path to a result, unless a path with as many different messages is already stored."""
     known = ways.get(there)
     if known is None or len(set(way)) > len(set(known)):
         ways[there] = way
@@ -383,8 +384,8 @@ def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[
 
 
 def _is_covered(step: AgentStep, outcomes: Sequence[_Outcome]) -> bool:
-    """Return true if a second possible step differs only by additional sent messages. The network may lose these
-    messages, so the second step covers this one.
+    """Return true if another possible step differs from this one only by additional sent messages. The network may lose
+    these messages, so the other step covers this one.
     """
     return any(
         other.local == step.local
@@ -396,6 +397,6 @@ def _is_covered(step: AgentStep, outcomes: Sequence[_Outcome]) -> bool:
 
 
 def _is_part(some: tuple[int, ...], of: tuple[int, ...]) -> bool:
-    """Return true if `of` contains the elements of `some` in the same order."""
+    """Return true if `of` contains all elements of `some` in the same order."""
     rest = iter(of)
     return all(message in rest for message in some)

@@ -1,6 +1,6 @@
-"""Number all known states of single agents. Each state is examined once, when it gets its number.
+"""Number all known states of single agents. Each state is checked for violations once, when it gets its number.
 
-A local state is the whole state of a `ucp.agent.Agent` (`_snapshot.py`).
+A local state is the complete state of a `ucp.agent.Agent` (`_snapshot.py`).
 """
 
 from collections.abc import Sequence
@@ -17,10 +17,12 @@ DEAD = -1
 """The local state of a dead agent."""
 
 FIRST, FIRST_OTHER = 1, 2
-"""The ID that an agent uses for itself, and the first ID of the other agents, if IDs make no difference."""
+"""The ID that an agent uses for itself, and the first ID that it uses for the other agents, if states are stored
+without agent IDs.
+"""
 
 Names = tuple[int, ...]
-"""The IDs that an agent uses for the other agents, in their order from `FIRST_OTHER` on."""
+"""The IDs that an agent uses for the other agents, in the order of these agents."""
 
 WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us": -1}
 """Parts of the state that no handler reads if no block is ever lost, with their initial values."""
@@ -30,8 +32,8 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 class KnownLocalState:
     """A known state of the agent with the ID `agent_id`.
 
-    `waits` is true if the agent reconciles. `chain` contains the numbers of the blocks in its chain. `deceived` is true
-    if the agent holds a block in the name of the captured vehicle that the captured vehicle never completed.
+    `waits` is true if the agent is in a reconcile. `chain` contains the numbers of the blocks in its chain. `deceived`
+    is true if the agent holds a block in the name of the captured vehicle that the captured vehicle never completed.
     """
 
     agent_id: int
@@ -44,7 +46,7 @@ class KnownLocalState:
     anonymous: int
     """A number that is equal for states that differ only in the identity of voters and responders.
 
-    It is equal on all machines.
+    The number is equal on all machines.
     """
     names_others: bool
     deceived: bool
@@ -70,9 +72,7 @@ class KnownStates:
         self._renamed: dict[tuple[int, Names], int] = {}
 
     def number(self, agent_id: int, state: AgentState, taken: Snapshot, flaw: PropertyViolation | None) -> int:
-        """Return the number of an agent's state. `taken` is the snapshot of the state, in which equal parts
-        are shared.
-        """
+        """Return the number of an agent's state. `taken` is the snapshot of the state."""
         snapshot = taken
         if self.bounds.reduced:
             forgotten = WHAT_ONLY_CHECKS_READ | dead(state)
@@ -129,7 +129,7 @@ class KnownStates:
         return number
 
     def renamed_back(self, local: int, names: Names) -> int:
-        """Return the number of the state that becomes this state when it is `renamed` with these IDs."""
+        """Return the number of the state whose renaming with these IDs (`renamed`) gives this state."""
         return self.renamed(local, _back(names))
 
     def names_in_order(self, local: int, sender: int) -> Names | None:
@@ -159,11 +159,11 @@ class KnownStates:
         return None if in_order == self.others else _back(in_order)
 
     def _names_others(self, snapshot: Snapshot) -> bool:
-        """Return true if a vote count in the state contains some, but not all, of the other agents."""
+        """Return true if a vote count in the state contains some of the other agents but not all."""
         return any(0 < len(snapshot[name]) < len(self.others) for name in NAMES_OF_OTHERS)
 
 
 def _back(names: Names) -> Names:
-    """Return the mapping of agent IDs that undoes a renaming of agents."""
+    """Return the renaming of agents that undoes this renaming."""
     before = {name: other for other, name in enumerate(names, FIRST_OTHER)}
     return tuple(before[name] for name in sorted(names))

@@ -1,6 +1,6 @@
 """Compute and cache the step that the real agent takes for each of its states and each input.
 
-To compute a step, the module puts the agent into the state, gives it the input, and takes a snapshot of its new state.
+To compute a step, the module sets the agent to the state, gives it the input, and takes a snapshot of the new state.
 This module contains no protocol logic.
 """
 
@@ -37,13 +37,13 @@ from ucp.state import AgentState
 from ucp.store import StoredState
 
 Content = tuple[int, Snapshot, "PropertyViolation | None", Ordinals]
-"""The definition of a local state, as another process needs it."""
+"""The definition of a local state in the form in which processes exchange it."""
 
 
 OTHER_COUNTS = ((1, 0.0), (2, 60.0), (1000, 10_000.0))
-"""Counts and mission seconds with which each step of an unreduced proof is repeated."""
+"""Values of the counters, and mission seconds, with which each step of an unreduced proof is repeated."""
 COUNTED = ("reconciles", "sent", "chain_changed_at")
-"""Attributes of the state that are only counted, with their names in error messages."""
+"""Attributes of the state that the agent only counts, with their names in error messages."""
 
 
 class LocalStates(KnownStates):
@@ -56,7 +56,7 @@ class LocalStates(KnownStates):
         self.steps = 0
         """Number of steps that the real agent has computed."""
         self._counting = {agent_id: self.agents.new(agent_id) for agent_id in self.agents.by_id}
-        """Agents that repeat steps with other counts."""
+        """Agents that repeat steps with other values of the counters."""
         self._reference = ReferenceComparison(bounds, self.agents.new) if bounds.steps else None
         self.timers = [timer.name for timer in first.timers]
         self.settings = settings = bounds.agent_settings()
@@ -131,13 +131,13 @@ class LocalStates(KnownStates):
         return counts
 
     def end_timer(self, local: int, timer: int, way: int = 0) -> AgentStep:
-        """Return the step of an agent whose timer expires. `way` selects one of the possible results."""
+        """Return the step of an agent whose timer expires. If several results are possible, `way` selects one."""
         return self.ends(local, timer)[way].step
 
     def ends(self, local: int, timer: int) -> list[TimerResult]:
         """Return the possible results when a timer expires.
 
-        There are several only if the agent compares the ages of blocks and any block may be the older one.
+        There are several results only if the agent compares the ages of blocks and any of them may be the oldest.
         """
         key = local, timer
         ends = self._ends.get(key)
@@ -153,10 +153,10 @@ class LocalStates(KnownStates):
         return ends
 
     def older(self, local: int, timer: int, way: int) -> tuple[int, frozenset[int]]:
-        """Return the block that must be the oldest candidate for this result of a timer, and the candidates that must
-        be newer.
+        """Return the block that must be the oldest candidate for this result of a timer expiry, and the candidates that
+        must be newer.
 
-        Block 0 is the inception block. The set is empty if the agent does not compare ages.
+        Block 0 is the inception block. The set of candidates is empty if the agent does not compare ages.
         """
         ends = self.ends(local, timer)
         oldest = ends[way].oldest
@@ -204,8 +204,8 @@ class LocalStates(KnownStates):
         return step
 
     def _got_in(self, local: int, message: int) -> PropertyViolation | None:
-        """Return a violation if the agent accepts a forged message: of an excluded vehicle, in the name of a third
-        vehicle, or with a block in the receiver's own name. Return None otherwise.
+        """Return a violation if the agent accepts a forged message: of a revoked vehicle, in the name of a third
+        vehicle, or with a block in the receiver's own name. Otherwise return None.
         """
         known, said = self.known[local], self.messages[message]
         revoked = self.agents.revoked[known.agent_id]
@@ -230,7 +230,7 @@ class LocalStates(KnownStates):
         return self._restored(local).state
 
     def inputs(self) -> Iterator[tuple[int, Message | str | None, AgentStep]]:
-        """Yield each known state with each input that was tried in it, and with the step that the input caused.
+        """Yield each known state with each input that was tried in it, and the step that the input caused.
 
         The input is a received message, the name of an expired timer, or None for a completed block.
         """
@@ -255,9 +255,9 @@ class LocalStates(KnownStates):
         flaw: PropertyViolation | None = None,
         to_reference: Give | None = None,
     ) -> AgentStep:
-        """Compute the step of the agent for the input that `give` gives.
+        """Compute the step of an agent. The function `give` gives the input to the agent.
 
-        `to_reference` gives the same input to the reference implementation, in decrypted form.
+        The function `to_reference` gives the same input, in decrypted form, to the reference implementation.
         """
         self.steps += 1
         before = self.known[local]
@@ -298,8 +298,8 @@ class LocalStates(KnownStates):
         return AgentStep(local, sent, started)
 
     def _results(self, agent: Agent) -> tuple[tuple[int, ...], Started]:
-        """Remove and return the messages that the agent sent in a step, and the timers that it started. The timers
-        continue.
+        """Return the messages that the agent sent in a step, and the timers that it started. The messages are removed
+        from the agent, and the timers continue.
         """
         sent = tuple(self.message(message) for _, message in agent.messages_to_send())
         started = tuple(
@@ -314,8 +314,9 @@ class LocalStates(KnownStates):
     def _check_counts(
         self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, results: tuple[tuple[int, ...], Started]
     ) -> None:
-        """Raise UncoveredError if the step depends on the time, on the number of earlier reconciles or messages, or on
-        the order of dictionaries.
+        """Repeat the step with other counters and another time. Repeat the step with other counters and another time.
+        Raise UncoveredError if the step depends on the time, on the number of earlier reconciles or messages, or on the
+        order of dictionaries.
         """
         for count, now_s in OTHER_COUNTS:
             agent = self._counting[agent_id]
@@ -342,7 +343,7 @@ class LocalStates(KnownStates):
     # Blocks
 
     def pattern(self, local: int) -> int:
-        """Return one state that represents all states that differ from it only in their blocks."""
+        """Return one state that represents all states that differ from this state only in their blocks."""
         if not self.bounds.blocks_alike or local == DEAD:
             return local
         pattern = self._patterns.get(local)
@@ -351,8 +352,8 @@ class LocalStates(KnownStates):
         return pattern
 
     def about(self, local: int) -> Ordinals:
-        """Return the numbers of the blocks in a state, each once. Two states that differ only in their blocks list them
-        in the same order.
+        """Return the numbers of the blocks in a state, each once. States that differ only in their blocks list them in
+        the same order.
         """
         about = self._about.get(local)
         if about is None:
@@ -381,7 +382,7 @@ class LocalStates(KnownStates):
     # States
 
     def settled(self, local: int) -> int:
-        """Return the state with simplified vote counts. Use it when all answers have arrived or are lost."""
+        """Return the state with simplified vote counts. This is correct when all answers have arrived or are lost."""
         return self._tallies.settled(local)
 
     def _intern(
@@ -405,14 +406,14 @@ class LocalStates(KnownStates):
         return self.number(agent_id, agent.state, snapshot, flaw)
 
     def content(self, local: int) -> Content:
-        """Return the definition of a state in a form that a different process can read."""
+        """Return the definition of a state in a form that another process can read."""
         known = self.known[local]
         flaw = known.flaw if known.flaw is not None and known.flaw.kind in FLAWS_OF_STEPS else None
         initiated = self.blocks.named(known.snapshot["top_chain_hash_at_initiation"])
         return known.agent_id, known.snapshot, flaw, initiated
 
     def adopt(self, content: Content) -> int:
-        """Return the number of a state that a different process found."""
+        """Return the number of a state that another process found."""
         agent_id, snapshot, flaw, initiated = content
         self.blocks.learn_chain_hash(snapshot["top_chain_hash_at_initiation"], initiated)
         agent = self.agents.put_into(agent_id, snapshot)

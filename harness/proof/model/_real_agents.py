@@ -1,4 +1,4 @@
-"""Put real agents into the explored states, and give them inputs."""
+"""Set real agents to explored states, and give them inputs."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,14 +19,15 @@ from ucp.quirks import wrong_handlers
 
 INITIAL_DATA = b"proof"
 AT_ONCE_S = 0.05
-"""A timer that is shorter expires before any answer can arrive (a message takes 2 to 50 ms)."""
+"""Seconds. A shorter timer expires before any answer can arrive, because a message takes 2 to 50 ms."""
 MOST_AT_ONCE = 100
 
 
 class RealAgents:
     """One real agent for each ID. If a vehicle is captured, the agents check signatures.
 
-    If agents are `nameless`, each agent has its own settings, but all of them have the ID of the first agent.
+    If states are stored without agent IDs (`nameless`), each agent has its own settings, but all agents have the ID of
+    the first one.
     """
 
     def __init__(self, bounds: Bounds) -> None:
@@ -35,11 +36,11 @@ class RealAgents:
         self._gate = None if bounds.captured is None else SecurityGate(self._roster, bounds.captured)
         self.by_id = {agent_id: self.new(agent_id) for agent_id in self._roster}
         self._left_in: dict[int, Snapshot] = {}
-        """Agent ID -> present state of the agent, if it is known."""
+        """Agent ID -> the current state of the agent, if it is known."""
         self.revoked = {
             agent_id: self.new(agent_id, revoked=True) for agent_id in self._roster if self._gate is not None
         }
-        """Further agents that know the revocation of the captured vehicle."""
+        """The same agents, but with knowledge of the revocation of the captured vehicle."""
 
     @property
     def gate(self) -> SecurityGate:
@@ -61,7 +62,7 @@ class RealAgents:
         return make(own_id, self._roster, INITIAL_DATA, settings, handlers=handlers, tracing=tracing)
 
     def put_into(self, agent_id: int, snapshot: Snapshot) -> Agent:
-        """Put the agent with this ID into a state, and return it."""
+        """Set the agent with this ID to a state, and return the agent."""
         agent = self.by_id[agent_id]
         put_back(agent, snapshot, self._left_in.pop(agent_id, None))
         return agent
@@ -73,7 +74,7 @@ class RealAgents:
         self._left_in[agent_id] = snapshot
 
     def made(self, ordinal: int) -> Block:
-        """Return the block that an agent completes as block number `ordinal`."""
+        """Return the block that an agent completes as the block with the number `ordinal`."""
         agent = self.new(FIRST)
         log(agent, ordinal)
         if agent.state.current_block:
@@ -104,9 +105,10 @@ def log(agent: Agent, ordinal: int) -> None:
 
 
 def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
-    """End a timer of an agent. If `oldest` is given, it becomes the oldest candidate of reconcile phase 2.
+    """Let a timer of an agent expire. If `oldest` is given, this block becomes the oldest candidate of reconcile phase
+    2.
 
-    The inception block always stays older.
+    The inception block is always older.
     """
     if oldest is not None:
         counted = agent.state.reconcile_response_dictionary[oldest]
@@ -115,8 +117,8 @@ def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
 
 
 def end_at_once(agent: Agent) -> str | None:
-    """End the timers that expire before any message can arrive. Return the text of an exception in a handler, or None
-    if there is none.
+    """Let the timers expire that expire before any message can arrive. If a handler raises an exception, return its
+    text. Otherwise return None.
     """
     now_s = agent.state.now
     try:

@@ -1,8 +1,8 @@
 """Compare one step of an agent with the same step of the independent reference implementation.
 
-The reference is put into the state of the agent and gets the same input. Each step is therefore judged separately, even
-a wrong step without consequences. For the installed agent core, this compares the core with the reference in every
-state within the bounds.
+The reference is set to the state of the agent and gets the same input. Each step is therefore judged separately, even
+if a mistake in it has no later consequences. For the installed agent core, this compares the core with the reference in
+every state within the bounds.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,9 +21,11 @@ from ucp.state import AgentState
 from ucp.trace import HandlerRun
 
 Give = Callable[[Any], None]
-"""Gives an input to an agent: a `ucp.agent.Agent` or a `ReferenceAgent`."""
+"""The type of a function that gives an input to an agent, which is a `ucp.agent.Agent` or a `ReferenceAgent`."""
 Make = Callable[[int, Callable[[], None]], Agent]
-"""Makes a new agent with this ID, which traces its handler runs and calls a function after each."""
+"""The type of a function that creates an agent with this ID. The agent traces its handler runs, and calls a function
+after each run.
+"""
 
 
 class _ReferenceRun(NamedTuple):
@@ -34,7 +36,7 @@ class _ReferenceRun(NamedTuple):
 
 
 class ReferenceComparison:
-    """The reference implementation, as the counterpart of each agent within the bounds."""
+    """A comparison of agent steps with the steps of the reference implementation."""
 
     def __init__(self, bounds: Bounds, make: Make) -> None:
         self._bounds = bounds
@@ -50,8 +52,8 @@ class ReferenceComparison:
         to_reference: Give,
         name_of: Callable[[str], str],
     ) -> tuple[str, str] | None:
-        """Return the handler and a sentence if the agent's step differs from the reference's step. Return None
-        otherwise.
+        """If the agent's step differs from the step of the reference, return the handler and a sentence. Otherwise
+        return None.
 
         `before` is the state in which the agent got the input. It is None if the agent had just been switched on.
         `give` gives the input to an agent, and `to_reference` gives it to the reference. `name_of` returns the name of
@@ -81,7 +83,7 @@ class ReferenceComparison:
     def _reference(
         self, agent_id: int, before: Snapshot | None, after_each: Callable[[], None] | None = None
     ) -> ReferenceAgent:
-        """Return the reference implementation, set to the agent's state."""
+        """Return a reference agent that is set to the state of the agent."""
         roster = range(1, self._bounds.agents + 1)
         own_id = FIRST if self._bounds.nameless else agent_id
         settings = Settings.of(self._bounds.agent_settings(agent_id))
@@ -119,7 +121,9 @@ COPIED = (
     "reconcile_responders",
     "majority_response_block_hash",
 )
-"""Attributes that the reference's state and an agent's state share, apart from chain, timers and the dictionary."""
+"""Attributes that are copied from an agent's state to the reference's state. Chain, timers and the dictionary of
+candidates are converted instead.
+"""
 
 
 def _put_into(state: ReferenceState, before: Snapshot) -> None:

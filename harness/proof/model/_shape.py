@@ -1,11 +1,11 @@
 """Compute the shape of an agent's state. States that differ only in the identity of blocks and agents have the same
 shape.
 
-A shape refers to blocks by their order among the blocks that the agent holds: by timestamp, then by hash. Blocks that
-the agent does not hold are only counted. Like the reductions of `_local_steps.py`, a shape omits parts that are written
-before they are read. Of a vote it keeps only whether more agents approve than disapprove. It also omits the block under
-construction, because within the bounds each event fills a block. Shapes can therefore compare the states of any run of
-any mission with the states that exist within bounds.
+A shape identifies a block by its position among the blocks that the agent holds, sorted by timestamp and then by hash.
+Blocks that the agent does not hold are only counted. Like the reductions of `_local_steps.py`, a shape omits parts that
+are written before they are read. A vote is reduced to the fact whether more agents approve than disapprove. The block
+under construction is omitted, because within the bounds of a proof each event fills a block. Shapes can therefore
+compare the states of any run of any mission with the states that exist within bounds.
 """
 
 from bisect import bisect_left
@@ -26,13 +26,13 @@ tallies.
 """
 
 ELSEWHERE = -1
-"""The ordinal of a hash that the agent does not hold."""
+"""The ordinal that stands for a block that the agent does not hold."""
 ON_TOP = "on top"
-"""The chain hash of the agent's chain with the message's block on top."""
+"""The name that stands for the chain hash of the agent's chain with the message's block on top."""
 
 
 class HeldBlockOrder:
-    """The chain of an agent and all blocks that it holds, in order. The object is immutable."""
+    """The chain of an agent, and all blocks that it holds, sorted. The object is immutable."""
 
     __slots__ = ("_blocks", "_heights", "_numbers", "_ordinals", "_shape", "_top")
 
@@ -58,8 +58,7 @@ class HeldBlockOrder:
     def number(self, shape: Shape) -> int:
         """Return a number for a shape: 64 bits of its hash, which are equal on all machines.
 
-        `shape` describes a state that holds these blocks, without the blocks. It can also describe such a state
-        together with an input.
+        `shape` describes the rest of a state with these blocks, or such a state together with an input.
         """
         number = self._numbers.get(shape)
         if number is None:
@@ -80,13 +79,16 @@ class HeldBlockOrder:
         return self._ordinals.get(block_hash, ELSEWHERE)
 
     def between(self, timestamp_us: int, block_hash: bytes = b"") -> int:
-        """Return the number of held blocks that are older than this timestamp."""
+        """Return the number of held blocks that are older than this timestamp. With equal timestamps, the block hash
+        decides.
+        """
         return bisect_left(self._blocks, (timestamp_us, block_hash))
 
     def input_shape(self, message: Message) -> Shape:
-        """Return the shape of a message, as this agent sees it.
+        """Return the shape of a message that this agent receives.
 
-        The shape refers to the blocks that the agent holds, and omits the sender.
+        The shape identifies blocks by their positions among the blocks that the agent holds. It does not contain the
+        sender.
         """
         values = [getattr(message, name) for name in type(message).__slots__]
         about = next((value for value in values if isinstance(value, bytes | Block)), b"")
@@ -111,8 +113,8 @@ class HeldBlockOrder:
 
 
 def shape_of(state: AgentState | ReferenceState, held: HeldBlockOrder) -> Shape:
-    """Return the shape of a state without the held blocks. Together with the shape of `held`, it identifies
-    the state.
+    """Return the shape of a state without the held blocks. It identifies the state together with the shape of
+    `held`.
     """
     shape: list[Any] = [state.reconcile_in_progress]
     for timer in state.timers:

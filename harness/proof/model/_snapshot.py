@@ -20,21 +20,21 @@ from ucp.state import AgentState
 from ucp.timers import Timer
 
 REPORTED = frozenset(("now", "sent", "reconciles", "chain_changed_at", "_sequence"))
-"""Counters and notes that only a trace or the sequence number of a datagram needs.
+"""Counters and notes that are needed only for a trace or for the sequence number of a datagram.
 
-They grow without limit, so they cannot be part of a state. Each step begins with the counters at zero, at `NOW_S`.
-`LocalStates` repeats each step of an unreduced proof with other counts and at other times, and refuses an agent whose
-step depends on them.
+They grow without limit, so they cannot be part of a state. Each step begins with the counters at zero, at `NOW_S`. An
+unreduced proof repeats each step with other counters and at other times, and refuses an agent whose step depends on
+them.
 """
 COUNTS = ("reconciles", "_sequence", "chain_changed_at")
-"""The counters among them that are numbers and that no input sets."""
+"""Those counters in `REPORTED` that are numbers and that no input sets."""
 FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing", "_seal", "sealed"))
-"""Attributes that never change (explored agents do not seal events), or that are other names of included parts."""
+"""Attributes that never change, or that are other names of included parts. Explored agents do not encrypt events."""
 HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
 LEFT_OUT = REPORTED | FIXED | HANDED_OVER
 
 NOW_S = 1000.0
-"""The mission second of each step. The zones contain the relevant times."""
+"""The mission second at which each step is computed. The zones contain the relevant times."""
 RUNNING_S = 1e15
 """The deadline of a timer that was running before the input."""
 
@@ -58,7 +58,7 @@ _DEAD_PHASE_3: Snapshot = {"majority_response_block_hash": None}
 
 
 def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
-    """Return a snapshot of the agent's state. Parts that are equal to parts of `like` are shared with it."""
+    """Return a snapshot of the agent's state. Parts that equal those of the snapshot `like` are shared with it."""
     state = vars(agent.state)
     if like is None:
         return {name: _copied(value) for name, value in state.items() if name not in LEFT_OUT}
@@ -70,8 +70,8 @@ def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
 
 
 def dead(state: AgentState) -> Snapshot:
-    """Return the irrelevant parts of the state with their initial values. Every handler of a correct agent writes these
-    parts before it reads them.
+    """Return the parts of the state that have no effect, with their initial values. Every handler of a correct agent
+    writes these parts before any handler reads them.
     """
     parts: Snapshot = {}
     if not state.voting_timer.active:
@@ -90,8 +90,8 @@ def dead(state: AgentState) -> Snapshot:
 def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) -> None:
     """Set the agent to the state of a snapshot. Each running timer of the agent gets the deadline RUNNING_S.
 
-    `since` is the agent's present state, if it is known. Parts that are the same in `since` and in the snapshot are not
-    changed.
+    `since` is the agent's current state if it is known. Parts that are the same objects in `since` and in the snapshot
+    are not changed.
     """
     state = vars(agent.state)
     set_counts(agent, 0, NOW_S)
@@ -117,7 +117,9 @@ def set_counts(agent: Agent, count: int, now_s: float) -> None:
 
 
 def reverse_dictionaries(agent: Agent) -> None:
-    """Reverse the order of each dictionary in the agent's state. The key of a state does not contain this order."""
+    """Reverse the order of each dictionary in the agent's state. The key of a state does not contain this order, so no
+    step may depend on it.
+    """
     state = vars(agent.state)
     state.update({name: dict(reversed(value.items())) for name, value in state.items() if type(value) is dict})
 
@@ -151,7 +153,7 @@ def keyed(value: Any, name_of: NameOf) -> Any:
 
 
 def key_of(snapshot: Snapshot, name_of: NameOf) -> tuple[Any, ...]:
-    """Return a key of a state. Different states have different keys."""
+    """Return a key of a state. Different states have different keys, and equal states have equal keys."""
     return tuple(keyed(value, name_of) for value in snapshot.values())
 
 
@@ -167,7 +169,7 @@ class _TimerState:
         return self.running or self.paused
 
     def is_of(self, timer: Timer) -> bool:
-        """Return true if the timer is unchanged. A timer that was restarted counts as changed."""
+        """Return true if the timer is unchanged. A timer that was started again counts as changed."""
         return (timer.deadline == RUNNING_S) == self.running and timer.active == (self.running or self.paused)
 
     def put_back(self, timer: Timer) -> None:
@@ -246,7 +248,9 @@ _KEYED: dict[type, Callable[[Any, NameOf], Any]] = {
 
 
 Started = tuple[tuple[int, int], ...]
-"""The running timers that an agent has started in this instant: (number, duration in microseconds)."""
+"""The timers that an agent has started in this instant and that are running, each as (number, duration in
+microseconds).
+"""
 
 
 class AgentStep(NamedTuple):
@@ -258,14 +262,14 @@ class AgentStep(NamedTuple):
 
 
 class TimerResult(NamedTuple):
-    """A possible result when a timer expires. For this result, `oldest` must be the oldest candidate of phase 2."""
+    """A possible result when a timer expires. This result occurs if `oldest` is the oldest candidate of phase 2."""
 
     step: AgentStep
     oldest: bytes | None
 
 
 NAMES_OF_OTHERS = ("voters", "reconcile_responders")
-"""Parts of the state that are sets of other agents."""
+"""Parts of the state that are sets of other agents' IDs."""
 
 
 class SnapshotParts:
@@ -289,8 +293,8 @@ class SnapshotParts:
         return part
 
     def of(self, snapshot: Snapshot, like: Snapshot) -> Snapshot:
-        """Return the state `snapshot` with its parts replaced by equal stored parts. All parts of `like` must already
-        be stored.
+        """Return the state `snapshot` with stored parts in place of equal parts. All parts of `like` must already be
+        stored.
         """
         return {
             name: value if like.get(name, self) is value else self.part(name, value) for name, value in snapshot.items()
@@ -302,8 +306,8 @@ class SnapshotParts:
         return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
 
     def anonymous(self, agent_id: int, flaw: PropertyViolation | None, snapshot: Snapshot) -> int:
-        """Return a number for a state that ignores which agents voted or answered. The number is the same on all
-        machines.
+        """Return a number for a state that does not depend on which agents voted or answered. The number is the same on
+        all machines.
         """
         parts = [
             len(value) if name in NAMES_OF_OTHERS else self._digests[id(value)] for name, value in snapshot.items()
@@ -328,7 +332,7 @@ class ReductionError(Exception):
 def check_that_nothing_is_lost(before: Snapshot, state: AgentState) -> None:
     """Raise ReductionError if the agent has lost a block.
 
-    If no agent loses a block, a state need not contain the list of completed blocks (characteristic 2).
+    If agents never lose a block, a state need not contain the list of completed blocks (characteristic 2).
     """
     held = {block.block_hash for name in ("blocks_to_be_committed", "reconcile_stack") for block in before[name]}
     held.update(before["chain"].parts["_block_of_hash"])

@@ -1,6 +1,6 @@
-"""Simplify the vote counts in an agent's state to the decision that they lead to.
+"""Simplify the vote counts in an agent's state to the decision that follows from them.
 
-Two agents with different vote counts that always lead to the same decision have the same local state. See
+States with different vote counts that always lead to the same decision count as the same local state. See
 docs/explanation/proof.md.
 """
 
@@ -11,15 +11,15 @@ from harness.proof.model._snapshot import NAMES_OF_OTHERS, AgentStep, ReductionE
 from ucp.reconcile import most_named
 
 TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))
-"""Parts of the state that count answers, and are otherwise read only when a timer expires."""
+"""Parts of the state that count answers. Only counting and timer expiries read them."""
 
 
 class VoteCounts:
     """The simplified vote counts of each agent state after all messages of an instant.
 
-    `ends` is a function of the number of a state and the index of a timer in `timers`. It returns the possible results
-    of the timer's expiry, which the real agent computes. If `every_count` is true, the vote counts of a reconcile are
-    not simplified.
+    The function `ends` takes the number of a state and the index of a timer in `timers`. It returns the possible
+    results of the timer's expiry, which the real agent computes. If `every_count` is true, the vote counts of a
+    reconcile are not simplified.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class VoteCounts:
         return number
 
     def _left(self, local: int) -> Snapshot:
-        """Return the vote counts of a state in simplified form."""
+        """Return the simplified vote counts of a state."""
         known = self._states.known[local]
         snapshot = known.snapshot
         left: Snapshot = {}
@@ -70,9 +70,9 @@ class VoteCounts:
         return left
 
     def _of_phase_1(self, local: int) -> Snapshot:
-        """Return the simplified vote count of phase 1, if the missing answers cannot change its result.
+        """Return the simplified vote count of phase 1 if missing answers cannot change its result.
 
-        Otherwise return an empty snapshot.
+        If they can, return an empty snapshot.
         """
         snapshot = self._states.known[local].snapshot
         yes, no = (snapshot["reconcile_vote_count"][answer] for answer in ("yes", "no"))
@@ -91,8 +91,8 @@ class VoteCounts:
         return self._ends(counted, self._phase_one)
 
     def _of_phase_2(self, snapshot: Snapshot) -> Snapshot:
-        """Return the candidates of phase 2 with the most votes. Return an empty snapshot if missing answers can change
-        which candidates these are.
+        """Return the candidates of phase 2 with the most votes. If missing answers can change these candidates, return
+        an empty snapshot.
         """
         candidates = snapshot["reconcile_response_dictionary"]
         most, next_most, *_ = sorted([*(count for count, _ in candidates.values()), 0, 0], reverse=True)
@@ -107,7 +107,7 @@ class VoteCounts:
         return len(self._states.others) - len(snapshot["reconcile_responders"])
 
     def _check_that_it_ends_alike(self, local: int, settled: int) -> None:
-        """Raise ReductionError if the simplification changes the result of a timer's expiry."""
+        """Raise ReductionError if the simplification changes the result of a timer expiry."""
         if settled != local and any(
             self._settled_ends(local, timer) != self._settled_ends(settled, timer)
             for timer in self._states.known[local].running

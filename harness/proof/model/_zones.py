@@ -2,9 +2,9 @@
 number.
 
 A zone is a set of possible remaining times of n timers: all times with x_i - x_j <= m[i][j], where x_0 = 0. The matrix
-is closed (no bound can be tightened), so equal sets have equal matrices. A stored zone covers any amount of time that
-may have passed: with each point it contains all earlier points, down to the first expiry. Bounds are whole microseconds
-between minus and plus the longest duration, so their number is finite.
+is closed (no bound can be tightened), so equal sets have equal matrices. In a stored zone, any amount of time may have
+passed: with each point it contains all later points until the first expiry. Bounds are whole microseconds between minus
+and plus the longest duration, so their number is finite.
 """
 
 from collections.abc import Sequence
@@ -42,12 +42,12 @@ class ZoneTable:
         return self._intern(matrix)
 
     def firsts(self, zone: int) -> list[int]:
-        """Return the timers that may expire next, as numbers from 1."""
+        """Return the timers that may expire next. Timers are numbered from 1."""
         least = self._matrices[zone][0]
         return [timer for timer in range(1, len(least)) if not least[timer]]
 
     def no_time_passes(self, zone: int) -> bool:
-        """Return true if a timer must expire at the same moment as the previous expiry."""
+        """Return true if the next timer must expire at the same moment as the previous expiry."""
         return any(row[0] == 0 for row in self._matrices[zone][1:])
 
     def tied(self, zone: int) -> list[tuple[int, ...]]:
@@ -76,11 +76,11 @@ class ZoneTable:
         return bounds
 
     def after(self, zone: int, ended: tuple[int, ...], running: tuple[int, ...]) -> int | None:
-        """Return the zone after all timers in `ended` expired at the same moment. Return None if they cannot expire
-        together.
+        """Return the zone after all timers in `ended` have expired at the same moment. Return None if they cannot
+        expire together.
 
-        `running` contains, for each timer that runs afterwards, its number before. For a timer that was just started,
-        it contains -1 minus its duration in microseconds.
+        For each timer that runs afterwards, `running` contains its previous number. For a timer that was just started,
+        it contains -1 minus the duration in microseconds.
         """
         key = zone, ended, running
         if key not in self._after:
@@ -96,9 +96,9 @@ class ZoneTable:
         return self._permuted[key]
 
     def adrift(self, zone: int) -> int:
-        """Return the zone with the same differences between timers, but with any remaining time until the first expiry.
+        """Return the zone with the same differences between timers and any remaining time until the first expiry.
 
-        If nothing can happen before the first expiry, the time until then makes no difference.
+        If no other event can happen before the first expiry, the time until then makes no difference.
         """
         if zone not in self._adrift:
             matrix = [list(row) for row in self._matrices[zone]]
@@ -112,8 +112,8 @@ class ZoneTable:
         """Return the number of independent events that must coincide so that these timers expire next and at the same
         moment.
 
-        This is the number of differences between timers that are open in the zone but fixed when these timers expire.
-        The timers must be able to expire at the same time.
+        This is the number of differences between timers that are variable in the zone but fixed when these timers
+        expire. The timers must be able to expire at the same time.
         """
         key = zone, ended
         if key not in self._coincidences:
@@ -125,7 +125,7 @@ class ZoneTable:
         return self._coincidences[key]
 
     def _ended(self, zone: int, ended: Sequence[int]) -> list[list[int]] | None:
-        """Return the bounds at the moment when these timers expire and no other timer has expired before.
+        """Return the bounds at the moment at which these timers expire, if no other timer has expired before.
 
         Return None if this moment is impossible.
         """
@@ -151,7 +151,7 @@ class ZoneTable:
         places = [0, *running]
 
         def bound(left: int, right: int) -> int:
-            """Return the upper bound of x_left - x_right. A newly started timer has its whole duration left."""
+            """Return the upper bound of x_left - x_right. A newly started timer has its complete duration left."""
             left_s, left_place = (0, left) if left >= 0 else (-left - 1, 0)
             right_s, right_place = (0, right) if right >= 0 else (-right - 1, 0)
             return left_s - right_s + matrix[left_place][right_place]
@@ -169,7 +169,7 @@ class ZoneTable:
 
 
 def _apart(matrix: Sequence[Sequence[int]], timers: range) -> int:
-    """Return the number of groups of timers, where all timers with fixed differences belong to one group."""
+    """Count the groups of timers. Timers whose differences are fixed belong to the same group."""
     return sum(
         not any(matrix[timer][other] + matrix[other][timer] == 0 for other in timers if other < timer)
         for timer in timers

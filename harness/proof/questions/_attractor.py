@@ -1,4 +1,4 @@
-"""Compute the states from which the swarm reaches a goal, whichever timer expires next."""
+"""Compute the states from which the swarm reaches a goal, regardless of which timer expires next."""
 
 from array import array
 from collections.abc import Callable, Iterable, Sequence
@@ -8,15 +8,17 @@ ByTimer = tuple[tuple[int, ...], ...]
 """The numbers of the possible successors of a state, for each timer that may expire next."""
 
 Check = Callable[[], object]
-"""A function that is called repeatedly, and raises LimitReachedError when the limit of memory or time is reached."""
+"""The type of a function that is called repeatedly. It raises LimitReachedError when the limit of memory or time is
+reached.
+"""
 
 
 class BackwardReachableStates:
-    """A growing set of states: the goals, and all states that lead to a goal.
+    """A growing set of states: the goals, and all states from which the swarm reaches a goal.
 
-    The durations of timers determine the next timer to expire, but a zone may leave several timers possible. All of
-    these must therefore lead to the goals, unless timers expire in `any_order`. If timers must expire at the same
-    moment, only the transit times of messages determine their order, so one order that leads to the goals is enough.
+    The durations of timers determine which timer expires next, but in a zone several timers may be possible. All of
+    these must lead to a goal, unless timers expire in `any_order`. If timers must expire at the same moment, only the
+    transit times of messages determine their order, so one order that leads to a goal is enough.
     """
 
     def __init__(self, by_timer: Sequence[ByTimer], any_order: bool, check: Check = lambda: None) -> None:
@@ -24,12 +26,14 @@ class BackwardReachableStates:
         self._any_order = any_order
         self._inside = bytearray(len(by_timer))
         self._open = array("q", map(len, by_timer))
-        """Number of timers of each state that do not lead to the goals yet."""
+        """The number of timers of each state that do not lead to a goal yet."""
         self._whose = array("q", (number for number, choices in enumerate(by_timer) for _ in choices))
-        """The state of each timer. The timers of all states are numbered consecutively."""
+        """The state to which each timer belongs. The timers of all states are numbered consecutively."""
         self._leads = bytearray(len(self._whose))
         self._ends = _ends(by_timer, check)
-        """The timers that may lead to state n are in `_before`, from `_ends[n]` up to `_ends[n + 1]`."""
+        """The predecessors of state n are in `_before`, from `_ends[n]` up to `_ends[n + 1]`. They are stored as
+        timers.
+        """
         self._before = array("q", bytes(8 * self._ends[-1]))
         filled = self._ends[:]
         timers = (after for choices in by_timer for after in choices)
@@ -48,11 +52,11 @@ class BackwardReachableStates:
 
     @property
     def first_left(self) -> int:
-        """The first state outside the set. It is -1 if there is none."""
+        """The first state outside the set. It is -1 if all states are in the set."""
         return self._inside.find(0)
 
     def add(self, goals: Iterable[int]) -> None:
-        """Add goals, and then all states that lead to them."""
+        """Add goals, and then all states that lead to a goal."""
         waiting = [number for number in goals if not self._inside[number]]
         for number in waiting:
             self._inside[number] = 1

@@ -1,6 +1,6 @@
 """Find states from which the swarm cannot become idle with one common chain, and cycles that never end.
 
-The search follows only successors that need no lost message and no new block, except the blocks of further votes.
+The search follows only successors without a lost message and without a new block, except the blocks of further votes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +16,7 @@ from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
 from harness.proof.questions._graph_cycles import cycles
 
 Watch = Callable[[str], None]
-"""A function that is called repeatedly with the present question.
+"""The type of a function that is called repeatedly with the question that is being answered.
 
 It raises LimitReachedError when the limit of memory or time is reached.
 """
@@ -26,11 +26,11 @@ It raises LimitReachedError when the limit of memory or time is reached.
 class ConvergenceResult:
     """The result of the search: endless cycles, and states from which the swarm does not reach one common chain.
 
-    - `forks`: number of idle states with several chains. `fork` is the nearest of them.
+    - `forks`: number of idle states with several different chains. `fork` is the nearest of them.
     - `cycles`: cycles as lists of their states, the nearest first.
-    - `astray`: numbers of states without a path to an idle swarm with one chain, after 0, 1, 2, ... further votes. The
-      list ends at 0 states, or at one vote for each agent.
-    - `lost`: the nearest state without a path to one chain even after one vote for each agent.
+    - `astray`: for 0, 1, 2, ... further votes, the number of states from which the swarm still cannot become idle with
+      one chain. The list ends at 0 states, or at one vote for each agent.
+    - `lost`: the nearest state from which one vote for each agent is not enough.
     - `reluctant`: the nearest state for which one vote is not enough.
     - `flaw`: a violation after further votes. It ended a path that might have led to one chain.
     """
@@ -43,13 +43,13 @@ class ConvergenceResult:
     reluctant: int | None = None
     flaw: PropertyViolation | None = None
     decided: bool = True
-    """True if all states after further votes were explored."""
+    """True if all states after further votes could be explored."""
 
 
 @cycles_left_alone()
 def look(graph: StateGraph, watch: Watch = lambda asked: None, workers: Workers | None = None) -> ConvergenceResult:
-    """Search a complete state graph for endless cycles and for states that do not lead to one chain. `workers` compute
-    how many votes diverged idle states need.
+    """Search a complete state graph for endless cycles and for states that do not lead to one chain. The `workers`
+    compute the number of votes that idle states with different chains need.
     """
     idle_states = dict(_idle_states(graph, partial(watch, "idle states")))
     forks = [number for number, chains in idle_states.items() if chains > 1]
@@ -77,7 +77,7 @@ def look(graph: StateGraph, watch: Watch = lambda asked: None, workers: Workers 
 
 
 def _idle_states(graph: StateGraph, check: Check) -> Iterator[tuple[int, int]]:
-    """Yield each idle state, with the number of different chains in it."""
+    """Yield each idle state, with the number of its different chains."""
     for number, by_timer in enumerate(graph.quiet):
         check()
         state = graph.states[number]
@@ -88,8 +88,8 @@ def _idle_states(graph: StateGraph, check: Check) -> Iterator[tuple[int, int]]:
 def _needed(
     graph: StateGraph, forks: Sequence[int], watch: Watch, workers: Workers | None
 ) -> dict[int, int | PropertyViolation | None]:
-    """Return the number of further votes that each state needs. If one vote per agent is not enough, return a violation
-    after further votes, or None without a violation.
+    """Return the number of further votes that each of these states needs. The number is None if one vote for each agent
+    is not enough.
     """
     needed: dict[int, int | PropertyViolation | None] = {}
 

@@ -1,7 +1,7 @@
 """Compute how many further votes an idle swarm with different chains needs until all chains are equal.
 
 A further vote is the vote on a block that an agent completes in the idle state. The search first explores single paths
-until one path leads to one chain. It explores all successors only if it finds no such path.
+until one leads to equal chains. It explores all successors only if it finds no such path.
 """
 
 from collections import Counter
@@ -17,16 +17,18 @@ from harness.proof.questions._attractor import BackwardReachableStates, ByTimer,
 MAX_EXPLORED = 50_000
 """Maximum number of states that are explored after the votes of one state.
 
-With wrong agents there can be infinitely many. Above the limit, the question is not decided.
+With wrong agents, the number of states can be infinite. Above the limit, the question remains undecided.
 """
 MAX_CACHED = 200_000
-"""Maximum number of states whose votes are cached."""
+"""Maximum number of states for which the number of votes is cached."""
 MAX_PATH_INSTANTS = 150
-"""Maximum number of instants of a single path, with those of all its votes, before all successors are explored."""
+"""Maximum number of instants on a single path, including those of all votes. Beyond it, all successors are explored
+instead.
+"""
 
 
 class UndecidedError(Exception):
-    """An error: there are more successors than the limit allows to explore."""
+    """An error: more successors would have to be explored than the limit allows."""
 
 
 class ExtraVotes:
@@ -36,7 +38,7 @@ class ExtraVotes:
         self._swarm = swarm
         self._check = check
         self._enough: dict[State, int] = {}
-        """State -> number of votes that is enough. `_too_few` has numbers that are not enough."""
+        """State -> a number of votes that is enough. `_too_few` contains numbers that are not enough."""
         self._too_few: dict[State, int] = {}
         self._explored = 0
         self._flaw: PropertyViolation | None = None
@@ -61,9 +63,9 @@ class ExtraVotes:
         return any(self._leads(after, votes - 1, instants + 1) for after in self._after_a_vote(fork))
 
     def _after_a_vote(self, fork: State) -> Iterator[State]:
-        """Yield the states after a vote of each agent. Of several agents in equal states, only one agent votes.
+        """Yield the possible states after a vote of one agent. Of several agents in equal states, only one is tried.
 
-        Agents with the rarest chain come first.
+        The agents with the rarest chain are tried first.
         """
         locals_, known = fork[AGENTS:], self._swarm.local.known
         alike = {
@@ -74,7 +76,9 @@ class ExtraVotes:
             yield from self._swarm.after(fork, (AgentAction(place, "complete", fork[BLOCKS] + 1),), lossy=False)
 
     def _leads(self, state: State, votes: int, instants: int) -> bool:
-        """Return true if the swarm becomes idle with equal chains from this state, whichever timer expires next."""
+        """Return true if the swarm becomes idle with equal chains from this state, regardless of which timer expires
+        next.
+        """
         if not self._find_path(state, votes, set(), instants) and self._too_few.get(state, -1) < votes:
             self._explore_all(state, votes, instants)
         return self._is_enough(state, votes)
@@ -84,8 +88,8 @@ class ExtraVotes:
         return enough is not None and enough <= votes
 
     def _find_path(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
-        """Return true if a path to equal chains was found. A path may exist even if none was found, because each state
-        is tried once.
+        """Search for a path to equal chains, and return true if one was found. A path may exist even if none was found,
+        because each state is tried only once.
         """
         if self._is_enough(state, votes):
             return True
@@ -102,9 +106,9 @@ class ExtraVotes:
         return leads
 
     def _timers_lead(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
-        """Return true if a path to equal chains was found for each timer that may expire next.
+        """Search for a path to equal chains for each timer that may expire next. Return true if all were found.
 
-        With timers in any order, a path for one timer is enough.
+        If timers may expire in any order, a path for one timer is enough.
         """
         any_order = self._swarm.bounds.timers_any
         leads = False
@@ -134,7 +138,7 @@ class ExtraVotes:
                 )
 
     def _explore_all(self, state: State, votes: int, instants: int) -> None:
-        """Explore all successors of a state, and record for each one whether this number of votes is enough."""
+        """Explore all successors of a state. Record for each one whether this number of votes is enough."""
         states, numbers = [state], {state: 0}
 
         def number_of(after: State) -> int:

@@ -1,4 +1,4 @@
-"""Find cycles in the state graph that need no lost messages and no new blocks."""
+"""Find cycles in the state graph without lost messages and without new blocks."""
 
 from array import array
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ def cycles(graph: StateGraph, check: Check = lambda: None) -> list[list[int]]:
 
 
 def _after(graph: StateGraph, number: int) -> set[int]:
-    """Return the successors of a state. If the graph is incomplete, leave out unexplored successors."""
+    """Return the successors of a state. In an incomplete graph, unexplored successors are omitted."""
     following = {state for after in graph.quiet[number] for state in after} | {*graph.crossing.get(number, ())}
     if graph.ended == "complete":
         return following
@@ -45,7 +45,7 @@ def _shortest_cycle(graph: StateGraph, start: int, part: set[int]) -> list[int]:
 def _after_a_cycle(graph: StateGraph, check: Check) -> list[int]:
     """Return all states that lie on a cycle or can be reached from a cycle.
 
-    The function repeatedly removes states that have no predecessor among the remaining states, until there are none.
+    The function removes states without a predecessor among the remaining states, until each remaining state has one.
     """
     ways_in = array("q", bytes(8 * len(graph.quiet)))
     for number in range(len(graph.quiet)):
@@ -64,7 +64,7 @@ def _after_a_cycle(graph: StateGraph, check: Check) -> list[int]:
 
 def _parts(graph: StateGraph, check: Check) -> Iterator[list[int]]:
     """Yield the strongly connected components (Tarjan's algorithm, without recursion). Most components with a single
-    state are left out.
+    state are omitted.
     """
     index: dict[int, int] = {}
     low: dict[int, int] = {}

@@ -1,6 +1,6 @@
-"""Describe the endless cycles of agents, with an example of each form: its conditions and a scenario that shows it.
+"""Describe the endless cycles of agents, and write an example of each form with its conditions.
 
-Two cycles have the same form if the same timers run in their states, for any agents and any chains.
+Two cycles have the same form if the same timers run in their states. The agents and the chains make no difference.
 """
 
 from collections import defaultdict
@@ -17,11 +17,13 @@ from harness.proof.model._global_states import AGENTS
 from harness.proof.model._known_states import DEAD
 
 MAX_FORMS = 12
-"""Maximum number of forms that are played. Forms that real clocks allow come first, then the nearest ones."""
+"""Maximum number of forms that are played. Forms that are possible with real clocks come first, then the forms nearest
+to the initial state.
+"""
 MAX_PLAYED = 5
-"""Maximum number of cycles of one form that are played, until the simulation confirms one."""
+"""Maximum number of cycles of one form that are played to find one that the simulation confirms."""
 ROUNDS = 3
-"""Number of rounds of the cycle over which the possible times of completions are computed."""
+"""Number of rounds of a cycle for which the possible completion times of blocks are computed."""
 
 _Form = tuple[tuple[tuple[tuple[int, ...], bool], ...], ...]
 
@@ -31,12 +33,12 @@ class Livelock:
     """All endless cycles of one form, with an example.
 
     - `ways`: number of components of the graph with a cycle of this form.
-    - `coincidences`: number of pairs of instants on the example's path that must be equal by chance, to within the
-      transit time of a message. A different path may need fewer. None if timers expire in any order.
+    - `coincidences`: number of pairs of instants on the example's path that must be equal by chance, up to the transit
+      time of a message. Another path may need fewer. None if timers expire in any order.
     - `completions`: the possible times of the blocks on the path.
     - `losses`: number of messages that receivers lose on the path.
     - `cycle`: the cycle that the simulation of the example showed. None if the simulation took a different path.
-    - `contradictory`: true if no clocks give all ties of the path the required results.
+    - `contradictory`: true if no clocks can give all ties the results that the path requires.
     """
 
     ways: int
@@ -59,7 +61,7 @@ class Livelock:
         }
 
     def in_words(self) -> str:
-        """Return a text that states the conditions of the endless cycle."""
+        """Describe the conditions of the endless cycle."""
         if not self.losses:
             return self._timings_in_words()
         return f"{self._timings_in_words()}; {self.losses} loss{'es lead' if self.losses > 1 else ' leads'} there"
@@ -86,7 +88,7 @@ def forms(graph: StateGraph, cycles: Sequence[list[int]]) -> list[list[list[int]
 
 
 def _form(graph: StateGraph, cycle: Sequence[int]) -> _Form:
-    """Return the form of a cycle. It does not depend on the state with which the list of the cycle's states begins."""
+    """Return the form of a cycle. It does not depend on the state at which the list of the cycle begins."""
     known = graph.swarm.local.known
     looks = [
         tuple(
@@ -100,7 +102,7 @@ def _form(graph: StateGraph, cycle: Sequence[int]) -> _Form:
 
 
 def in_timers(graph: StateGraph, cycles: Sequence[list[int]]) -> list[str]:
-    """Return the forms of the cycles as text: for each state of the cycle, the timers of each agent."""
+    """Return the forms of the cycles as text. The text lists the timers of each agent for each state of the cycle."""
     names = graph.swarm.local.timers
 
     def agent(running: tuple[int, ...], waits: bool) -> str:
@@ -131,10 +133,10 @@ def show(graph: StateGraph, cycles: Sequence[list[int]], path: Path, name: str) 
 
 
 def _nearest(graph: StateGraph, alike: Sequence[list[int]]) -> list[_CycleExample]:
-    """Return some example cycles of one form, with the best example first.
+    """Return some cycles of one form. The best example is first.
 
-    The order is: first cycles that real clocks allow, then the fewest coincidences, then the fewest blocks whose
-    completion time is fixed.
+    Cycles that are possible with real clocks come first, then those with the fewest coincidences, then those with the
+    fewest blocks whose completion time is fixed.
     """
     tried: list[tuple[bool, int, int, _CycleExample]] = []
     for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MAX_PLAYED]:
@@ -148,8 +150,8 @@ def _nearest(graph: StateGraph, alike: Sequence[list[int]]) -> list[_CycleExampl
 
 
 def _livelock_of(graph: StateGraph, ways: int, rounds: Sequence[_CycleExample], path: Path, name: str) -> Livelock:
-    """Return a livelock with the first cycle that the simulation confirms as its example. If the simulation confirms no
-    cycle, use the first one.
+    """Return a livelock whose example is the first cycle that the simulation confirms. If it confirms none, the example
+    is the first cycle.
     """
     bounds = graph.swarm.bounds
     chosen: tuple[_CycleExample, PlayedExample] | None = None

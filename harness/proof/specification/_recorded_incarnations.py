@@ -1,6 +1,6 @@
 """Encode the recorded steps of agents as numbers, so that the TLA+ module Recorded can read them.
 
-The specification knows no hash function and treats hashes as names. This module therefore computes the hashes of blocks
+The specification has no hash function and treats hashes as names. This module therefore computes the hashes of blocks
 and chains (eq. 3.1 and 3.2). It replaces each block hash by its position among all block hashes, each timestamp by its
 position among all timestamps, and each chain hash by the number of the chain.
 """
@@ -40,7 +40,7 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 INCEPTION = 1
 TOP_OF_CHAIN, NO_HASH, IMPOSSIBLE = 0, -1, -7
 LARGEST = 2**31 - 1
-"""No number in TLC is larger."""
+"""Largest integer that TLC supports."""
 HEARD, TIMER_ENDED, LOGGED, TRIGGERED, ASKED, BOOTED = range(1, 7)
 OPERATIONS = {"complete": 1, "chain+": 2, "chain-": 3, "deque+": 4, "deque-": 5, "stack+": 6, "stack-": 7}
 TIMERS = {name: number for number, name in enumerate(ON_TIMER, 1)}
@@ -50,7 +50,7 @@ NOT_TOLD = (0,)
 VOTES, ANSWERS, CANDIDATES, MAJORITY = range(1, 5)
 NO_TALLY = VOTES, IMPOSSIBLE
 NO_MESSAGE = TYPE_CODES[RequestForBlock], IMPOSSIBLE
-"""A message that no agent sends. It replaces messages that cannot be encoded."""
+"""A message that no agent sends. It stands for a message that cannot be encoded."""
 
 
 class UnreadableError(Exception):
@@ -62,7 +62,7 @@ class EncodedTimestamp(int):
 
 
 Item = Any
-"""A number, a block hash (bytes), a Stamp, or a tuple of items."""
+"""A number, a block hash (bytes), an `EncodedTimestamp`, or a tuple of such items."""
 
 
 @dataclass
@@ -83,15 +83,15 @@ class EncodedIncarnation:
 
 
 class ChainNumbers:
-    """A numbering of chains. The inception block alone is the first chain. Each extension of a numbered chain by a
-    block gets a further number.
+    """A numbering of chains. The inception block alone is the first chain. A chain that extends a numbered chain by a
+    block gets a new number.
     """
 
     def __init__(self) -> None:
         self.successors: dict[int, dict[bytes, int]] = {INCEPTION: {}}
 
     def new(self) -> int:
-        """Return the number of a new chain whose blocks are unknown."""
+        """Return a number for a chain whose blocks are unknown."""
         number = len(self.successors) + 1
         self.successors[number] = {}
         return number
@@ -107,7 +107,7 @@ def lives(trace: Trace, header: CheckedHeader, chains: ChainNumbers, *, ended: b
     """Yield the encoded steps of each incarnation of an agent, up to the first line of the incarnation that cannot be
     encoded.
 
-    `ended` is true if the agent reached the end of its mission, so that its last steps are recorded.
+    `ended` is true if the agent reached the end of its mission. Its last steps are then on record.
     """
     parts = OptionalTraceFields.of(trace)
     count = len(trace.starts) + 1
@@ -131,7 +131,7 @@ def lives(trace: Trace, header: CheckedHeader, chains: ChainNumbers, *, ended: b
 
 
 class _IncarnationEncoder:
-    """Encodes the steps of one agent between two restarts."""
+    """An encoder for the steps of one agent between two restarts."""
 
     def __init__(self, header: CheckedHeader, parts: OptionalTraceFields, chains: ChainNumbers) -> None:
         self._header = header
@@ -152,7 +152,7 @@ class _IncarnationEncoder:
         }
 
     def step(self, run: HandlerRun) -> Item:
-        """Return the encoded step. Raises UnreadableError if the step cannot be compared with the specification."""
+        """Encode a handler run. Raises UnreadableError if it cannot be compared with the specification."""
         unknown = {kind: word for kind, word in unknown_names([run]).items() if kind not in IGNORED_KINDS}
         if unknown:
             raise UnreadableError(next(iter(unknown.values())))
@@ -185,8 +185,8 @@ class _IncarnationEncoder:
         )
 
     def _came(self, run: HandlerRun) -> tuple[Item, bool]:
-        """Return the encoded input of a handler run, and true if the agent must drop the input. Raises ValueError if it
-        is invalid.
+        """Encode the input of a handler run. Also return true if the agent must drop the input. Raises ValueError if
+        the input is invalid.
         """
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger):
@@ -213,15 +213,15 @@ class _IncarnationEncoder:
         return (LOGGED, event.encoded_bytes, *_block(block))
 
     def _sealed(self, run: HandlerRun) -> bytes | None:
-        """Return the encrypted data of the completed block. Return None if the mission does not encrypt, or if the data
-        have the wrong length.
+        """Return the encrypted data of the completed block. Return None if the mission does not encrypt event data, or
+        if the data have a wrong length.
         """
         sealed = sealed_of(run.sealed)
         seals = sealed is not None and sealed_to(self._header.initial_data) is not None
         return sealed if seals and len(sealed or b"") == len(self._current) + SEAL_BYTES else None
 
     def _booted(self, run: HandlerRun, trigger: BootTrigger) -> Item:
-        """Return the encoded blocks that the agent loaded from its disk at a restart."""
+        """Encode the blocks that the agent loaded from its disk at a restart."""
         found: dict[str, list[bytes]] = {"complete": [], "chain+": [], "deque+": [], "stack+": []}
         for operation, block_hash in run.changes:
             if operation not in found or (len(found["chain+"]) == trigger.blocks and operation == "chain+"):
@@ -329,7 +329,7 @@ def _digest(text: str) -> bytes:
 
 
 def module(records: Sequence[EncodedIncarnation], chains: ChainNumbers) -> str:
-    """Return the text of the TLA+ module Lives with these encoded steps."""
+    """Return the text of the TLA+ module Lives, which contains these encoded steps."""
     items: list[Item] = [life.steps for life in records]
     hashes, stamps = set[bytes](), set[int]()
     for step in _leaves(items):

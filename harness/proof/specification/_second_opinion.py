@@ -1,4 +1,4 @@
-"""Explore the same bounds twice: with the real agent, and with the TLA+ specification in the program TLC."""
+"""Explore the same bounds twice: with the real agent, and with TLC and the TLA+ specification."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
@@ -19,15 +19,15 @@ from ucp.clock import MICROSECONDS
 
 MEGABYTE = 1e6
 AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
-"""Deliberate errors of agents that the specification also supports. The thesis prints them, presumably by mistake."""
+"""Deliberate mistakes (quirks) that the specification also supports. The thesis prints them, presumably by mistake."""
 INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
 """Name of an invariant in the specification -> key of the violation that `prove` reports."""
 
 
 @dataclass(frozen=True)
 class SecondOpinion:
-    """The results of both explorations: with the real agent, and with TLC. `states` and `specified` are None if one
-    exploration is incomplete.
+    """The results of both explorations: with the real agent, and with TLC. `states` and `specified` are the numbers of
+    states. They are None if an exploration is incomplete.
 
     States that differ only in remaining timer durations count as one state. `specified` is therefore at most the number
     of states that TLC counts. `only_real` and `only_specified` are the numbers of states that only one of the two
@@ -45,7 +45,7 @@ class SecondOpinion:
     only_specified: int | None = None
     livelock: bool | None = None
     specified_livelock: bool | None = None
-    """True if the state graph contains an endless cycle without losses. None if the network loses messages."""
+    """True if the specification has an endless cycle without losses. None if the network loses messages."""
 
     @property
     def decided(self) -> bool:
@@ -53,8 +53,8 @@ class SecondOpinion:
 
     @property
     def agrees(self) -> bool:
-        """True if both explorations led to a result, and found the same violation or none, the same states, and the
-        same answer about endless cycles.
+        """True if both explorations are complete or found a violation, and agree on the violation, the states, and
+        endless cycles.
         """
         same = not self.only_real and not self.only_specified and self.livelock == self.specified_livelock
         return self.decided and self.flaw == self.violated and same

@@ -21,7 +21,7 @@ from ucp.settings import CHOICES, DECLARED, Settings
 from ucp.state import AgentState
 
 Plain = tuple[Any, ...]
-"""An agent, or all of them."""
+"""An agent as nested tuples, or all agents."""
 
 TIMERS: dict[Staggered, tuple[str, str]] = {
     "vote_timeout_s": ("VoteTimeout", "VoteStagger"),
@@ -30,9 +30,9 @@ TIMERS: dict[Staggered, tuple[str, str]] = {
     "phase3_timeout_s": ("Phase3Timeout", "Phase3Stagger"),
     "finalize_gap_s": ("FinalizeGap", "FinalizeStagger"),
 }
-"""The constants of the specification for the duration of each timer, and for the stagger between agents."""
+"""Timer -> the constants of the specification for its duration and for the stagger between agents."""
 SIZES = {"max_block_bytes", "max_event_bytes"}
-"""Settings that the specification has as constants for the sizes of blocks and events."""
+"""Settings that the specification has as constants for sizes."""
 NO_HASH = -1
 TOP_OF_CHAIN = 0
 _SIGNS = str.maketrans({"{": "\1", "}": "\2", "[": "{", "]": "}", "(": "{", ")": "}"})
@@ -52,7 +52,7 @@ def specified(graph: Path) -> Iterator[Plain]:
 
 
 def goes_round(graph: Path) -> bool:
-    """Return true if the state graph that TLC wrote contains a cycle."""
+    """Return true if the state graph that TLC wrote has a cycle."""
     after: dict[str, set[str]] = defaultdict(set)
     with graph.open() as lines:
         for line in lines:
@@ -69,7 +69,7 @@ def goes_round(graph: Path) -> bool:
 
 
 def _value(text: str) -> Any:
-    """Return a TLA+ value as a Python value. Sets become lists."""
+    """Convert a TLA+ value to a Python value. Sets become lists."""
     text = text.translate(_SIGNS)
     for sign, other in _WORDS.items():
         text = text.replace(sign, other)
@@ -106,7 +106,7 @@ def real(graph: StateGraph) -> Iterator[Plain]:
 
 
 class _HashTranslator:
-    """Translates the hashes of real agents to the names that the specification uses."""
+    """A converter from the hashes of real agents to the names that the specification uses."""
 
     def __init__(self, local: LocalStates) -> None:
         self._local = local
@@ -153,8 +153,8 @@ class _HashTranslator:
 
 
 def unspecified(settings: Settings) -> str | None:
-    """Return the name of a setting that differs from its default and does not exist in the specification. Return None
-    if there is none.
+    """Return the name of a setting that does not have its default and that the specification does not support. Return
+    None if there is none.
     """
     constants = (MODULES / "Swarm.tla").read_text("utf-8")
     choices = {name for name, choice in CHOICES.items() if choice.constant is not None and choice.constant in constants}

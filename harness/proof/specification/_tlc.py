@@ -19,7 +19,7 @@ from harness.run.parallel import sigterm_as_ctrl_c
 
 MODULES = Path(ucp.__file__).parent / "contract" / "spec"
 JAVA = ("java", "-XX:+UseSerialGC", "-XX:TieredStopAtLevel=1", "-Xss64m")
-"""A compiler for short programs: TLC mostly runs for seconds."""
+"""The Java command. Its compiler options are those for short programs, because TLC usually runs for a few seconds."""
 TLC = ("tlc2.TLC", "-nowarning", "-deadlock", "-workers", "1", "-metadir", "states")
 MOST_SHOWN = 300
 
@@ -38,8 +38,8 @@ class CheckerError(MachineError):
 
 @dataclass(frozen=True)
 class TlcResult:
-    """The result of TLC. If `violated` names an invariant, the search is incomplete. `output` is the complete printed
-    output.
+    """The result of TLC. If `violated` names an invariant, TLC stopped there, and the search is incomplete. `output` is
+    the complete printed output.
 
     `states` is the file with all different states and transitions. It exists if `checked` was called with `dump`.
     """
@@ -72,8 +72,8 @@ def checked(
     memory_mb: int = 1024,
     most_s: float | None = None,
 ) -> Iterator[TlcResult]:
-    """Check a module of ucp/contract/spec with TLC, and yield the result. The files of TLC exist until the context
-    ends.
+    """Check a module of ucp/contract/spec with TLC, and yield the result. The files that TLC wrote exist until the
+    context ends.
 
     `others` contains the text of further modules by name. SIGTERM and Ctrl-C remove all files.
     Raises NoCheckerError, CheckerError, and TimeoutError after `most_s` seconds.
@@ -115,5 +115,5 @@ def _read(output: str, states: Path) -> TlcResult:
 
 
 def in_tla(value: object) -> str:
-    """Return a truth value or number in the notation of TLA+."""
+    """Return a boolean or number in the notation of TLA+."""
     return str(value).upper() if isinstance(value, bool) else str(value)

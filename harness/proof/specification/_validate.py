@@ -22,13 +22,13 @@ from harness.scenario import Scenario
 from ucp.agent import HANDLERS
 
 STEPS_AT_ONCE = 20_000
-"""Number of handler runs after which a batch is complete. The last trace of a batch may exceed it."""
+"""Number of handler runs after which a batch is complete. Its last trace may exceed this number."""
 MEMORY_MB = 2048
 
 Constants = tuple[tuple[str, object], ...]
 
 AT_END = "what it triggered has yet to run"
-"""The difference that TLC reports if handlers are still waiting after the last step."""
+"""The difference that TLC reports if triggered handlers have not run after the last step."""
 
 _REJECTED = re.compile(r'<<\s*"rejected",\s*(\d+),\s*(\d+),\s*\{([^}]*)\}\s*>>')
 _WHAT = re.compile(r'"([^"]*)"')
@@ -36,8 +36,8 @@ _WHAT = re.compile(r'"([^"]*)"')
 
 @dataclass(frozen=True)
 class RejectedStep:
-    """The first step of an agent that the specification does not allow. `what` lists the parts of the step
-    that differ.
+    """The first step of an agent that the specification does not allow. `what` lists the differing parts of the
+    step.
     """
 
     run: str
@@ -61,7 +61,7 @@ class TraceValidation:
     """The result of a validation: the numbers of runs and steps, the rejected steps, and the reasons why records could
     not be checked.
 
-    `interrupted` is true if the user stopped the validation. The remaining records were not checked.
+    `interrupted` is true if the user stopped the validation. The later records were then not checked.
     """
 
     runs: int = 0
@@ -183,7 +183,7 @@ def _batches(runs: Iterable[RunTraces], validation: TraceValidation) -> Iterator
 
 
 class _OutsideError(Exception):
-    """An error: a trace cannot be checked against the specification. The message is the reason."""
+    """An error: a trace cannot be checked, because the specification does not support it. The message is the reason."""
 
 
 def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
@@ -208,8 +208,8 @@ def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
 
 
 def _look(constants: Constants, batch: _EncodedStepBatch, validation: TraceValidation) -> None:
-    """Let TLC check a batch. If TLC fails, divide the batch and check its parts, until only the agents that TLC cannot
-    check are left out.
+    """Check a batch with TLC. If TLC fails, divide the batch and check its parts, until only the agents that TLC cannot
+    check are omitted.
     """
     try:
         rejected = _rejected(constants, batch)
@@ -239,8 +239,8 @@ def _config(constants: Constants) -> str:
 
 
 def _rejected(constants: Constants, batch: _EncodedStepBatch) -> dict[int, tuple[int, tuple[str, ...]]]:
-    """Return the rejected agents of a batch by number (from 1). Each has its first rejected step and the parts of the
-    step that differ. Raises CheckerError.
+    """Return the rejected agents of a batch by number, counted from 1. Each has its first rejected step and the
+    differing parts of this step. Raises CheckerError.
     """
     records = {"Lives": module(batch.lives, batch.chains)}
     with looked_at("Recorded", _config(constants), others=records, memory_mb=MEMORY_MB) as said:

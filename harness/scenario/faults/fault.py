@@ -1,8 +1,8 @@
 """The base class of all faults. A fault changes agents or their vehicles at one moment of the mission.
 
-The class of a fault holds everything about it: its name in YAML, in records and in pytest, the states of an agent
+The class of a fault defines all its properties: its name in YAML, in records and in pytest, the states of an agent
 before and after it, its effect on agents, vehicles and data, the calls to the backend, and the texts of the report.
-Other modules ask the class and do not compare names. To add a fault, add a class to a file in this directory.
+Other modules read these properties, and do not compare names. To add a fault, add a class to a file in this directory.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ AgentIds = Annotated[list[VehicleId], Field(min_length=1)]
 DiskState = Literal["kept", "lost"]
 
 RUNNING, PAUSED, KILLED, REBOOTING, SWITCHED_OFF = "running", "paused", "killed", "rebooting", "switched off"
-"""States of an agent. A fault may define a further one."""
+"""The states that an agent can have. A fault may define a further state."""
 
 CROSS = "M-5-5l10 10m0-10l-10 10"
 BARS = "M-3-5v10M3-5v10"
@@ -27,7 +27,7 @@ ARROW = "M-4-5l9 5-9 5z"
 DIAMOND = "M0-6l6 6-6 6-6-6z"
 SQUARE = "M-5-5h10v10h-10z"
 BAR = "M0-6v12"
-"""Marks: SVG paths around the origin."""
+"""Marks for the timeline of the report, each as an SVG path around the origin."""
 
 
 class AgentOperations(Protocol):
@@ -52,7 +52,7 @@ class AgentOperations(Protocol):
     async def resume(self, agent_id: int) -> None: ...
 
     async def stop_logging(self, agent_id: int) -> None:
-        """Stop the logging of events by the agent until its next start."""
+        """Make the agent log no further events until its next start."""
 
     async def switch_off(self, agent_id: int) -> None:
         """Let the agent export its chain, and then end it and its vehicle."""
@@ -75,8 +75,8 @@ class AgentOperations(Protocol):
 class Fault:
     """A fault of the agents `agents` at mission second `at_s`.
 
-    Further fields of a subclass are keys of its timeline entry. The entry needs all of them. Their annotations declare
-    the allowed values. `Fault` itself stands for an unknown fault and has no effect.
+    Further fields of a subclass are keys of its timeline entry. All of them are required. Their annotations declare the
+    allowed values. The class `Fault` itself represents an unknown fault, which has no effect.
     """
 
     at_s: float
@@ -85,30 +85,30 @@ class Fault:
     """True if a user requested the fault during the mission."""
 
     what: ClassVar[str] = ""
-    """The key of a timeline entry, the word in records, and the verb in pytest."""
+    """The name of the fault: the key of a timeline entry, the word in records, and the verb in pytest."""
     is_timeline_key: ClassVar[bool] = True
     """True if the fault is a key of a timeline entry. False if another fault causes it."""
     states_before: ClassVar[tuple[str, ...]] = ()
     """States of an agent in which the fault is possible."""
     state_after: ClassVar[str | None] = RUNNING
-    """State of the agent after the fault. None: unchanged."""
+    """State of the agent after the fault. None if the state does not change."""
     needs_keys: ClassVar[bool] = False
     """True if the fault needs the keys of a secured mission."""
     ends_incarnation: ClassVar[bool] = False
-    """The agent loses the data in its memory."""
+    """True if the agent loses the data in its memory."""
     begins_incarnation: ClassVar[bool] = False
     removes_vehicle: ClassVar[bool] = False
-    """The vehicle leaves the mission, with all data of the agent."""
+    """True if the vehicle leaves the mission, together with all data of the agent."""
     exports_chain: ClassVar[bool] = False
-    """The agent exports its data before it ends. The data is not lost."""
+    """True if the agent exports its data before it ends, so that the data is not lost."""
     adds_vehicle: ClassVar[bool] = False
-    """The agent gets a new vehicle."""
+    """True if the agent gets a new vehicle."""
     suspends_agent: ClassVar[bool] = False
-    """The agent stays alive but does nothing until the next fault."""
+    """True if the agent stays alive but does nothing until the next fault."""
     stops_events: ClassVar[bool] = False
-    """The agent logs no further events until it starts again."""
+    """True if the agent logs no further events until it starts again."""
     keys_in_words: ClassVar[str] = ""
-    """The further keys in words, for an error about a missing key."""
+    """The names of the further keys as text, for an error about a missing key."""
     key_descriptions: ClassVar[Mapping[str, str]] = {}
     """Further key -> its description for the scenario reference and the JSON Schema."""
     default_values: ClassVar[Mapping[str, Any]] = {}
@@ -119,18 +119,18 @@ class Fault:
     """Meaning of the mark. Faults with the same meaning share a mark."""
 
     async def apply(self, operations: AgentOperations, agent_id: int) -> None:
-        """Apply the fault to one of the agents."""
+        """Apply the fault to this agent."""
 
     def stages(self) -> "Sequence[Fault]":
         """Return all faults that this timeline entry causes, in order of time."""
         return [self]
 
     def check(self, vehicles: Vehicles) -> None:
-        """Raise ValueError if these vehicles cannot have the fault. The message names an alternative."""
+        """Raise ValueError if the fault is impossible for these vehicles. The message names an alternative."""
 
     @property
     def further_vehicles(self) -> Sequence[int]:
-        """The vehicle IDs in the additional keys of the fault."""
+        """The vehicle IDs that the further keys of the fault contain."""
         return ()
 
     @property
@@ -140,7 +140,7 @@ class Fault:
 
     @classmethod
     def loses_data(cls, disk: DiskState | None) -> bool:
-        """True if the agents lose all their data in this fault, given the present state of their disks."""
+        """True if the agents lose all their data in this fault. `disk` is the state of their disks before the fault."""
         return cls.ends_incarnation and not cls.exports_chain and disk != "kept"
 
     @classmethod
@@ -159,7 +159,7 @@ class Fault:
         return agents if self.disk_after is None else f"{agents}, disk {self.disk_after}"
 
     def to_json(self, at_s: float) -> dict[str, Any]:
-        """Return the record of this fault, made at mission second `at_s`."""
+        """Return the record of this fault. It happened at mission second `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
         hand = {"by_hand": True} if self.by_hand else {}
         disk = {} if self.disk_after is None else {"disk": self.disk_after}
@@ -167,11 +167,11 @@ class Fault:
 
 
 SAME_TIME_S = 0.001
-"""Records round times to milliseconds."""
+"""Two times that differ by at most this number of seconds count as equal, because records round to milliseconds."""
 
 
 def planned_key(planned_s: float, at_s: float) -> dict[str, float]:
-    """Return the key `planned_s` for the record of a change that was made after its planned time. Otherwise return no
-    key.
+    """Return the key `planned_s` for the record of a change that was made after its planned time. For a punctual
+    change, return no key.
     """
     return {} if abs(planned_s - at_s) < SAME_TIME_S else {"planned_s": planned_s}

@@ -1,4 +1,4 @@
-"""Orders from the ground to agents: reconcile, exclude a vehicle, or stop logging events."""
+"""Commands from the ground to agents: reconcile, revoke a vehicle, or stop logging events."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -10,7 +10,9 @@ from harness.scenario.strict_model import VehicleId
 
 
 class Reconcile(Fault):
-    """These agents start a reconcile, as an operator can request (Section 5.1). No effect during a reconcile."""
+    """These agents start a reconcile, as an operator can request (Section 5.1). The command has no effect on an agent
+    that is already in a reconcile.
+    """
 
     what = "reconcile"
     states_before = (RUNNING,)
@@ -48,7 +50,9 @@ class Revoke(Fault):
 
 
 class StopEvents(Fault):
-    """These agents log no further events, as a vehicle on the ground (Section 4.2). Votes and reconciles continue."""
+    """These agents log no further events, like the agents of vehicles on the ground (Section 4.2). Votes and reconciles
+    continue.
+    """
 
     what = "stop_events"
     states_before = (RUNNING,)

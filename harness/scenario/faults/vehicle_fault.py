@@ -28,13 +28,15 @@ from sitl.circumstances import wind as wind_circumstance
 from sitl.vehicle import VEHICLE_TYPES, VehicleType
 
 FALLING = "M-5-2l5 6 5-6M0-6v4"
-"""Marks of the faults in this module: the start of a problem of a vehicle, and its end."""
+"""Marks of the faults in this module: the start of a vehicle's problem, and its end."""
 RISING = "M-5 4l5-6 5 6"
 HAS_FAULT, RECOVERED = "its vehicle has a fault", "its vehicle has recovered"
 
 
 class VehicleFault(Fault):
-    """A fault of the vehicles of `agents`. A vehicle flies on, or its failsafe acts. The agents continue to run."""
+    """A fault of the vehicles of `agents`. The vehicle continues its flight, or its failsafe acts. The agents continue
+    to run.
+    """
 
     states_before = (RUNNING,)
     vehicle_types: ClassVar[tuple[VehicleType, ...]] = VEHICLE_TYPES
@@ -101,7 +103,7 @@ class BreachFence(VehicleFault):
 
 
 class LiftFence(VehicleFault):
-    """The fence of these vehicles no longer applies."""
+    """The fence of these vehicles is switched off again."""
 
     what = "lift_fence"
     mark = RISING
@@ -185,7 +187,7 @@ class RegainGps(VehicleFault):
 
 
 class LoseRc(VehicleFault):
-    """The receivers of these vehicles lose the remote control."""
+    """The receivers of these vehicles lose the signal of the remote control."""
 
     what = "lose_rc"
     mark = FALLING
@@ -197,7 +199,7 @@ class LoseRc(VehicleFault):
 
 
 class RegainRc(VehicleFault):
-    """The receivers of these vehicles have the remote control again."""
+    """The receivers of these vehicles get the signal of the remote control again."""
 
     what = "regain_rc"
     mark = RISING

@@ -13,7 +13,7 @@ from harness.sweep.explore._exploring import Explored, SearchProgress, Violating
 _WORDS = {**BAD_IN_WORDS, ENDED: "an agent crashed or hung"}
 
 _MAX_SEEDS = 10
-"""Maximum number of seeds that a sentence lists."""
+"""Maximum number of seeds that a sentence names."""
 LINE_EVERY_S = 10.0
 REDRAW_EVERY_S = 0.1
 CLEAR_LINE = "\r\x1b[2K"
@@ -23,7 +23,7 @@ CLEAR_LINE = "\r\x1b[2K"
 def watching(console: Console) -> Iterator[SearchProgress]:
     """Yield functions that print violations and the progress of the reduction.
 
-    On a terminal, the progress is one line that is redrawn. Elsewhere it is a line every ten seconds.
+    On a terminal, the progress is one line that changes. Other outputs get a line every ten seconds.
     """
     every_s = REDRAW_EVERY_S if console.is_terminal else LINE_EVERY_S
     last = 0.0

@@ -27,8 +27,8 @@ class ViolatingRun:
 class SearchResult:
     """The result of a search for a violation.
 
-    `failed` maps a seed to the reason why its run has no verdict. `unfinished` has the seeds of the runs that only
-    needed more time.
+    `failed` maps a seed to the reason why its run has no verdict. `unfinished` contains the seeds of runs in which the
+    swarm only needed more time.
     """
 
     played: int = 0
@@ -39,10 +39,10 @@ class SearchResult:
 
 
 def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> SearchResult:
-    """Play the seeds in order until a run violates a check. A run whose swarm only needs more time violates none.
+    """Play the seeds in order until a run violates a check. If a swarm only needs more time, this is no violation.
 
-    The result is the first such seed, for any number of `jobs`. Ctrl-C ends the search early. Raises HarnessError if
-    the scenario cannot be played.
+    The result is the first seed with a violation, regardless of the number of `jobs`. Ctrl-C ends the search early.
+    Raises HarnessError if the scenario cannot be played.
     """
     searched = SearchResult()
 
@@ -70,12 +70,12 @@ def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: 
 
 MAX_RUNS = 5000
 SEEDS = 1000
-"""Default number of seeds."""
+"""Default number of seeds that are played."""
 
 
 @dataclass(frozen=True)
 class ShrunkScenario:
-    """The smallest scenario found that still violates the check: its file, and the number of steps that led to it."""
+    """The smallest scenario found that still violates the check: its file, and the number of steps of the reduction."""
 
     path: Path
     seed: int
@@ -88,7 +88,7 @@ class ShrunkScenario:
 class Explored:
     """The result of the command `explore`.
 
-    `shrunk` is the smallest scenario found; it is None if no run violated anything. `interrupted` is true if Ctrl-C
+    `shrunk` is the smallest scenario found. It is None if no run violated a check. `interrupted` is true if Ctrl-C
     ended the search or the shrinking.
     """
 
@@ -107,8 +107,8 @@ class Explored:
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """Functions that report progress. `on_step` is called with the number of runs so far, and the size of the present
-    scenario as text.
+    """Functions that report the progress. `on_step` is called with the number of runs so far, and the size of the
+    current scenario as text.
     """
 
     on_violation: Callable[[ViolatingRun], None] = field(default=lambda violation: None)
@@ -127,7 +127,7 @@ def explore(
     max_runs: int = MAX_RUNS,
     watcher: SearchProgress | None = None,
 ) -> Explored:
-    """Play a scenario in virtual time with one seed after another, and reduce the first run that violates a check.
+    """Play a scenario in virtual time with one seed after another. Reduce the first run that violates a check.
 
     - `out`: the new file of the smallest scenario. Without it, a new file under `runs/`.
     - `source`: the name of the scenario in that file. Without it, the scenario's `name`.
@@ -172,8 +172,8 @@ def smallest_of(
     max_runs: int,
     on_step: Callable[[int, str], None],
 ) -> tuple[Document, str, bool]:
-    """Return the smallest document found for which `still` is true, a description of the steps, and true if the user
-    interrupted the search.
+    """Return the smallest document found for which `still` returns true, a description of the reduction steps, and true
+    if the user interrupted the search.
     """
     interrupted = False
     shrinker = Shrinker(

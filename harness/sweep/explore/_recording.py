@@ -1,9 +1,9 @@
 """Record the random parts of a run: the events that agents logged, and the messages that were lost.
 
-A scenario that scripts these parts plays the same run again. This works because the random draws for the latency of a
-sender come from a stream of their own, and are made for every broadcast, even for a lost one. It does not work for
-networks that duplicate messages. Netem also draws a latency for the second copy, whereas a scripted fate drops either
-all copies or none. `_smaller.shrink` therefore checks that a recording reproduces the violation.
+A scenario that contains these parts as a script plays the same run again. This works because the latencies of each
+sender come from a separate random stream, and a latency is drawn for every broadcast, even for a lost one. It does not
+work for networks that duplicate messages. There the network also draws a latency for the second copy, but a scripted
+fate drops either all copies or none. `_smaller.shrink` therefore checks that a recording reproduces the violation.
 """
 
 from collections import Counter
@@ -38,7 +38,7 @@ class RecordedEvent:
 class LostMessage:
     """A message that `receiver` did not receive. `sender` sent it at `at_s`, as message number `count` of its type.
 
-    `by_quirk` is true if the message arrived and the receiver ignored it.
+    `by_quirk` is true if the message arrived but the receiver ignored it.
     """
 
     at_s: float
@@ -75,7 +75,9 @@ class _EventRecorder(MemoryRecorder):
         self.events: list[RecordedEvent] = []
         self.lost: list[LostMessage] = []
         self.sent: dict[tuple[int, int], LostMessage] = {}
-        """(sender, sequence) of each Commit Block -> its entry in `lost`, should a receiver ignore it."""
+        """(sender, sequence number) of each Commit Block -> its entry in `lost`, which is used if a receiver ignores
+        the message.
+        """
         self._last_of: dict[int, int] = {}
         self._counts: Counter[int] = Counter()
 
@@ -105,7 +107,7 @@ class _EventRecorder(MemoryRecorder):
 
 
 class _RecordingScript(FateScript):
-    """Delivery rules that record each message that they or chance lose."""
+    """A fate script that records each message that is lost, by the script or by chance."""
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _EventRecorder) -> None:
         super().__init__(fates, roster, name_of)

@@ -1,7 +1,7 @@
 """Represent a scenario as a document that can be reduced: its YAML keys without default values.
 
 Each function returns a new document, and leaves the old one unchanged. The result may be an invalid scenario. The
-caller finds out by playing it.
+caller detects this when it plays the scenario.
 """
 
 from collections.abc import Callable, Collection
@@ -18,9 +18,9 @@ Document = dict[str, Any]
 UNPLAYED = ("about", "speedup", "expect")
 """Keys that have no effect in virtual time, or that only fit the original run."""
 FLIGHT = ("vehicles", "flight", "network.radio")
-"""Keys that determine which messages are lost by distance, and have no other effect in virtual time."""
+"""Keys that only determine which messages are lost because of distance. They have no other effect in virtual time."""
 NEVER_IN_BURSTS = {"p": 0.0, "r": 1.0}
-"""A burst model that never loses a message. It makes the same random draws as one that does."""
+"""A model of loss in bursts that never loses a message. It draws the same random numbers as a model with losses."""
 
 
 def document_of(scenario: Scenario) -> Document:
@@ -32,7 +32,7 @@ def document_of(scenario: Scenario) -> Document:
 
 
 def with_key(document: Document, key: str, value: Any) -> Document:
-    """Return the document with a new value for the key, which is a path with dots. An empty value removes the key."""
+    """Return the document with a new value for the key, which is a path with dots. An empty value removes it."""
     first, _, rest = key.partition(".")
     if rest:
         value = with_key(document.get(first, {}), rest, value)
@@ -65,7 +65,7 @@ def with_script(document: Document, logged: list[RecordedEvent], drops: list[Doc
 
 
 def with_drops(document: Document, drops: list[Document]) -> Document:
-    """Replace the delivery rules of the document that lose messages. Its rules with another effect stay."""
+    """Replace the delivery rules of the document that lose messages. Rules with another effect remain."""
     others = [fate for fate in document.get("fates", []) if "drop" not in fate]
     return with_key(document, "fates", [*drops, *others])
 
@@ -86,9 +86,9 @@ def fate_by_count(lost: LostMessage) -> Document:
 
 
 def fate_by_time(lost: LostMessage, slack_s: float) -> Document:
-    """Return a delivery rule that loses all messages of this type from this sender to this receiver at about this time.
+    """Return a fate that loses all messages of this type from this sender to this receiver at about this time.
 
-    It stays valid when other messages disappear from the run.
+    The fate still matches this message when other messages disappear from the run.
     """
     window = {"from_s": max(0.0, round(lost.at_s - slack_s, 3)), "until_s": round(lost.at_s + slack_s, 3)}
     return {"message": lost.message, "sender": lost.sender, "receiver": lost.receiver, **window, "drop": True}
@@ -118,7 +118,9 @@ def _silent(layer: Document) -> Document:
 
 
 def _silent_change(change: Document) -> Document:
-    """Return a change without its message loss. It is a timeline entry or the repeated part of a schedule."""
+    """Return a change of the network without its message loss. The change is a timeline entry or the repeated part of a
+    schedule.
+    """
     silent = {**change, **_silent(change)}
     return {**silent, "network": _without_loss(change["network"])} if "network" in change else silent
 
@@ -137,7 +139,7 @@ def _with_networks(ramp: Document, change: Callable[[Document], Document]) -> Do
 
 
 def keep_agents(document: Document, kept: Collection[int]) -> Document:
-    """Return the document with only these agents. Everything that refers to other agents is removed."""
+    """Return the document with only these agents. All parts that refer to other agents are removed."""
     document = {**document, "agents": sorted(kept)}
     document = with_key(document, "events.script", [event for event in script(document) if event["agent"] in kept])
     document = with_key(document, "fates", [fate for fate in document.get("fates", []) if _agents_in(fate) <= {*kept}])
@@ -159,7 +161,7 @@ def keep_agents(document: Document, kept: Collection[int]) -> Document:
 
 
 def _network(network: Document, kept: Collection[int]) -> Document:
-    """Return the network section without the conditions of single receivers and links that are not among the kept
+    """Return the network section with the conditions of only those receivers and links that are among the kept
     agents.
     """
     receivers = {name: value for name, value in network.get("receivers", {}).items() if int(name) in kept}
@@ -206,14 +208,14 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
 
 
 def _datagram(datagram: Document, kept: Collection[int]) -> Document:
-    """Return the datagram with those receivers that are kept. If its source is removed, return it without receivers."""
+    """Return the datagram with only the kept receivers. If its source is not kept, return it without receivers."""
     from_kept = datagram["source"] in kept
     reaches = {agent: at_s for agent, at_s in datagram["reaches"].items() if from_kept and int(agent) in kept}
     return {**datagram, "reaches": reaches}
 
 
 def _of_kept(quirk: Any, kept: Collection[int]) -> Any:
-    """Reduce a deliberate error (quirk) to the kept agents. Return None if none remains."""
+    """Return a quirk for the kept agents only. Return None if none of its agents is kept."""
     if not isinstance(quirk, dict):
         return quirk
     quirk = _filter_lists(quirk, ("agents",), kept)
@@ -236,7 +238,7 @@ def timeline(document: Document) -> list[Document]:
 
 
 def event_times(document: Document) -> list[float]:
-    """Return, in order, the times of all events and timeline entries, and the times at which temporary changes end."""
+    """Return the times of all events and timeline entries, and the times at which temporary changes end, in order."""
     passes = {entry["at_s"] + entry["for_s"] for entry in timeline(document) if "for_s" in entry}
     return sorted({entry["at_s"] for entry in (*script(document), *timeline(document))} | passes)
 
@@ -262,7 +264,7 @@ def _limit_duration(entry: Document, last_s: float) -> Document:
 
 
 def move_times(document: Document, to: Callable[[float], float]) -> Document:
-    """Return the scenario document with each time replaced by the result of the function `to`."""
+    """Return the document with each time replaced by the result of `to` for this time."""
     for key in ("events.script", "timeline"):
         document = with_key(document, key, [_move_entry_times(entry, to) for entry in at(document, key) or []])
     document = with_key(document, "fates", [_move_fate_times(fate, to) for fate in document.get("fates", [])])
@@ -273,7 +275,7 @@ def move_times(document: Document, to: Callable[[float], float]) -> Document:
 
 
 def _move_fate_times(fate: Document, to: Callable[[float], float]) -> Document:
-    """Change the arrival times in a delivery rule. A rule without arrival times keeps its time limits."""
+    """Change the arrival times in a delivery rule. A rule without arrival times keeps the times at which it applies."""
     if "arrivals" not in fate:
         return fate
     return {

@@ -1,7 +1,7 @@
 """Reduce a document step by step (delta debugging), and write the smallest scenario that still violates a check.
 
-The result does not depend on the number of processes. Candidates count in their order: results for candidates after the
-first success are discarded.
+The result does not depend on the number of processes. Candidates are considered in their order. If a candidate
+succeeds, the results of later candidates are discarded.
 """
 
 import json
@@ -21,7 +21,9 @@ from harness.sweep.explore._scenario_document import Document, at
 T = TypeVar("T")
 
 WORTH_FORKING_S = 0.03
-"""Minimum duration of a run for parallel play. For shorter runs, starting processes takes longer than the runs."""
+"""Minimum duration of a run in seconds for playing runs in parallel. For shorter runs, starting processes takes longer
+than the runs.
+"""
 
 
 class BudgetSpentError(Exception):
@@ -29,9 +31,10 @@ class BudgetSpentError(Exception):
 
 
 class Shrinker:
-    """Searches for smaller documents that still violate a check.
+    """A search for smaller documents that still violate a check.
 
-    `best` is the smallest document so far for which `violates` is true. `adopted` is called for each new one.
+    `best` is the smallest document so far for which `violates` returns true. `adopted` is called for each new smallest
+    document.
     """
 
     def __init__(
@@ -53,8 +56,8 @@ class Shrinker:
         self._pace_s = 1.0
 
     def first(self, candidates: Iterable[Document]) -> int | None:
-        """Play candidate scenarios, and adopt the first that still violates the check. Return its index. Return None if
-        none does. Raises BudgetSpentError.
+        """Play candidate scenarios, and adopt the first that still violates the check. Return its index, or None if no
+        candidate violates the check. Raises BudgetSpentError.
         """
         if self.runs >= self._max_runs:
             raise BudgetSpentError
@@ -90,9 +93,7 @@ class Shrinker:
                 continue
 
     def fewest(self, items: Sequence[T], with_items: Callable[[Sequence[T]], Document]) -> None:
-        """Remove ever smaller parts of `items`, until each further removal would lose the violation (ddmin, Zeller
-        2002).
-        """
+        """Remove ever smaller parts of `items`, until the violation needs each remaining item (ddmin, Zeller 2002)."""
         kept = list(items)
         if not kept or self.first([with_items([])]) is not None:
             return
@@ -111,7 +112,7 @@ class Shrinker:
 def _leaving_out(items: Sequence[T], parts: int) -> Iterator[list[T]]:
     """Divide `items` into `parts` parts. For each part, yield all items outside it.
 
-    The last part comes first, because least depends on it.
+    The last part comes first, because fewer other items depend on later ones.
     """
     bounds = [len(items) * part // parts for part in range(parts + 1)]
     for part in reversed(range(parts)):
@@ -125,7 +126,7 @@ def _key(document: Document) -> str:
 def file_of(document: Document, header: list[str], recording: Recording) -> str:
     """Return the text of a scenario file.
 
-    `recording` belongs to this document, and supplies sending times for comments.
+    `recording` is the recorded run of this document. Comments in the file contain its sending times.
     """
     sent: dict[Any, LostMessage] = {
         (lost.message, lost.sender, lost.receiver, lost.count): lost for lost in recording.lost

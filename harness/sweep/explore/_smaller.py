@@ -1,8 +1,8 @@
 """Define the steps that reduce a scenario. Steps that shorten runs come first, and then steps that simplify the
 scenario.
 
-Fates have two forms. A fate by time still hits the same message when other messages disappear. A fate by count still
-hits the same message when everything happens earlier. After each change of form, all steps are tried again.
+Fates have two forms. A fate with a time still matches the same message if other messages disappear. A fate with a count
+still matches the same message if everything happens earlier. After each change of the form, all steps are tried again.
 """
 
 import math
@@ -38,13 +38,13 @@ MAX_PAIRED = 12
 DELAY_S = 0.02
 SLACKS_S = (0.3, 0.03)
 GAPS_S = (1, 2, 5, 10, 11, 15, 20, 30, 60)
-"""Whole seconds between two successive events, the smallest first."""
+"""Times in seconds that are tried between two successive events, the shortest first."""
 
 Record = Callable[[Document], Recording]
 
 
 def shrink(shrinker: Shrinker, record: Record) -> None:
-    """Reduce the scenario until nothing more can be removed. Raises BudgetSpentError."""
+    """Reduce the scenario until no step makes it smaller. Raises BudgetSpentError."""
     for _ in range(MAX_ROUNDS):
         before = shrinker.best
         for express in (_fates_by_time, _fates_by_count):
@@ -87,7 +87,7 @@ def _fates_by_count(shrinker: Shrinker, record: Record) -> None:
 
 
 def _shorten_mission(shrinker: Shrinker) -> None:
-    """End the mission as early as possible, and soon after the last event."""
+    """End the mission as early as possible, soon after the last event."""
     moments = event_times(shrinker.best)
     low, high = -1, len(moments) - 1  # a violation is known up to `high`, none up to `low`
     while high - low > 1:
@@ -118,7 +118,7 @@ def _fewer_agents(shrinker: Shrinker) -> None:
 
 
 def _two_agents_fewer(shrinker: Shrinker, delay: Any) -> bool:
-    """Remove two agents at once, so that an even number of voters stays even. Return true on success."""
+    """Remove two agents at once, because an even number of voters may have to stay even. Return true on success."""
     base = with_key(shrinker.best, "network.delay", delay)
     agents = set(base["agents"])
     if len(agents) > MAX_PAIRED:
@@ -140,7 +140,9 @@ def _fewer_of_each(shrinker: Shrinker) -> None:
 
 
 def _use_defaults(shrinker: Shrinker) -> None:
-    """Replace values by their defaults, or at least use the same latency for all messages."""
+    """Replace values by their defaults. If this fails for the network, at least use the same latency for all
+    messages.
+    """
     for key in (
         "initial_data",
         "lateness",
@@ -161,7 +163,9 @@ def _use_defaults(shrinker: Shrinker) -> None:
 
 
 def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
-    """Change the scenario so that a single event completes each block, at the same time as in the recorded run."""
+    """Change the scenario so that one event completes each block, at the time at which it was completed in the recorded
+    run.
+    """
     document = shrinker.best
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes
     if at(document, "settings.max_block_bytes") == largest or not script(document):
@@ -197,7 +201,7 @@ def _reduce_gaps(shrinker: Shrinker) -> None:
 
 
 def _time_shift(moment: float, earlier: float) -> Callable[[float], float]:
-    """Return a function that moves `moment` to the time `earlier`, and all later times by the same amount."""
+    """Return a function that moves the time `moment` to `earlier`, and all later times by the same amount."""
     return lambda at_s: round(at_s - moment + earlier, 6) if at_s >= moment else at_s
 
 

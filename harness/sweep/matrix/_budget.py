@@ -1,9 +1,9 @@
-"""Choose the order of runs when the time does not suffice for all of them: the most informative cell first.
+"""Choose the order of runs if the time is not sufficient for all of them.
 
-A further run helps most in the cell whose figures are least certain. Every cell therefore begins with two runs. From
-then on, the next run belongs to the cell with the widest interval: that of the share of runs with one chain, or that of
-the messages per block relative to their mean. Cells whose runs agree stay at a few runs, and the time goes to the cells
-whose runs differ.
+A further run is most useful in the cell whose results are least certain. Every cell begins with two runs. After that,
+the next run belongs to the cell with the widest confidence interval. Two intervals are considered: that of the share of
+runs with one chain, and that of the messages per block relative to their mean. Cells with similar runs therefore get
+few runs, and cells with different runs get most of the time.
 """
 
 import time
@@ -40,7 +40,9 @@ def informative(
 
 
 def _information(point: MatrixPoint, runs: Mapping[MatrixTask, Run], begun: int) -> float:
-    """Return the expected width of the cell's widest confidence interval after all runs that have begun so far."""
+    """Return the width that the widest confidence interval of the cell will probably have after all runs that have
+    begun.
+    """
     if begun < _FIRST_RUNS:
         return float(2 * _FIRST_RUNS - begun)
     ended = [run.figures for task, run in runs.items() if task.point == point and run.judged]

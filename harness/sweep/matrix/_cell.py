@@ -31,18 +31,20 @@ class CellRecord(BaseModel):
 class Run(CellRecord):
     """The result of one run: its numeric results, and its verdicts by number or key.
 
-    A run without a verdict has a reason: in `failed` for an error, or in `unsupported` if an agent lacks a feature.
+    If a run has no verdict, `failed` or `unsupported` contains the reason: an error, or a feature that an agent lacks.
     """
 
     seed: int
     figures: dict[str, float | int | None] = {}
     verdicts: dict[str, Verdict] = {}
     steps: str = ""
-    """The fingerprint of its handler runs, in virtual time with traces. See `_run_steps`."""
+    """The fingerprint of the run's handler runs. It exists in virtual time with traces. See `_run_steps`."""
     failed: str | None = None
     unsupported: str | None = None
     reached: Annotated[Any, Field(exclude=True)] = None
-    """A `harness.proof.coverage.ReachedStates` if coverage of this run was measured. It is not written to files."""
+    """A `harness.proof.coverage.ReachedStates` if coverage of this run was measured. The field is not written to
+    files.
+    """
 
     @property
     def judged(self) -> bool:
@@ -57,8 +59,9 @@ class Cell(CellRecord):
     """The summary of the runs with one combination of values. `failed` and `unsupported` count runs without numeric
     results.
 
-    `estimates` has an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` has the seeds
-    of the runs with a bad verdict, by check. `unfinished` has the seeds of the runs that only needed more time.
+    `estimates` contains an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` contains
+    the seeds of the runs with a bad verdict, by check. `unfinished` contains the seeds of the runs in which the swarm
+    only needed more time.
     """
 
     runs: int
@@ -71,7 +74,7 @@ class Cell(CellRecord):
 
     @property
     def finished(self) -> Estimate:
-        """The share of runs in which the swarm became idle, among the runs with a verdict about it."""
+        """The share of runs in which the swarm became idle, among all runs with a verdict on liveness."""
         counts = self.verdicts.get("liveness", {})
         finished = counts.get("finished", 0)
         return estimate_share(finished, finished + counts.get("not finished", 0) + counts.get("never finishes", 0))
@@ -83,7 +86,7 @@ def is_wrong(verdict: Verdict) -> bool:
 
 
 def sum_up(point: MatrixPoint, runs: Sequence[Run], *, grows: bool = False) -> Cell:
-    """Return the summary of these runs. With `grows`, also estimate the numeric results for laws of growth."""
+    """Return the summary of these runs. If `grows` is true, also estimate the numeric results that power laws need."""
     failed = sum(run.failed is not None for run in runs)
     unsupported = sum(run.unsupported is not None for run in runs)
     judged = [run for run in runs if run.judged]

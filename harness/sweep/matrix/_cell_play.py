@@ -32,7 +32,7 @@ class JudgedRun(NamedTuple):
 
 
 Judge = Callable[[Scenario, int], JudgedRun]
-"""Plays a scenario with a seed and judges the run."""
+"""A function that plays a scenario with a seed and judges the run."""
 
 
 class RunFailedError(HarnessError):
@@ -67,15 +67,15 @@ def _same_twice(scenario: Scenario, seed: int) -> None:
 
 @dataclass(frozen=True)
 class RunPlayer:
-    """Plays any run of `matrix`. Runs with real programs leave directories in `directory`. `judge` plays simulated
-    runs.
+    """A player for all runs of a matrix. Runs with real programs leave directories in `directory`. `judge` plays
+    simulated runs.
     """
 
     matrix: Matrix
     directory: Path
     judge: Judge = simulated
     covers: bool = False
-    """True to measure the coverage of each run. In virtual time, `judge` is not used then."""
+    """True if the coverage of each run is measured. In virtual time, `judge` is not used then."""
 
     def __call__(self, task: MatrixTask) -> Run:
         scenario = self.matrix.scenario_at(task.point)
@@ -106,7 +106,7 @@ class RunPlayer:
         )
 
     def refuse(self, points: Iterable[MatrixPoint]) -> None:
-        """Check, before the first run, that all combinations of values can be played.
+        """Before the first run, check that all combinations of values can be played.
 
         Raises HarnessError if a backend or this machine cannot play one of them.
         """

@@ -21,7 +21,7 @@ R = TypeVar("R")
 
 CONNECT_S = 10.0
 SAME_VERSIONS = ("dask", "distributed", "ucp-harness")
-"""Packages whose versions must be equal here, on the scheduler and on each worker."""
+"""Packages that must have the same version on this machine, on the scheduler and on each worker."""
 
 
 @contextlib.contextmanager
@@ -30,11 +30,11 @@ def cluster(
 ) -> Iterator[Iterator[tuple[T, R | FailedTask]]]:
     """Yield (task, result) for each task in order of completion. `address` is the Dask scheduler (tcp://host:port).
 
-    Outcomes, errors and interrupts are as in `harness.run.parallel.sweep`. The workers must be able to import `work`.
-    At the end of the block, unfinished tasks are cancelled.
+    Results, errors and interrupts are treated as in `harness.run.parallel.sweep`. The workers must be able to import
+    `work`. At the end of the context, unfinished tasks are cancelled.
 
     Raises HarnessError for an invalid address. Raises MachineError if no scheduler answers, if it has no workers or
-    other versions, or if the connection is lost.
+    different versions, or if the connection is lost.
     """
     with sigterm_as_ctrl_c(), progress_bar(what, len(tasks)) as count, _connected(address) as client:
         yield _outcomes(client, tasks, work, address, count)
@@ -67,7 +67,7 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 async def _versions(address: str) -> dict[str, dict[str, str | None]]:
-    """Return the versions of the packages in SAME_VERSIONS: here, on the scheduler, and on each worker."""
+    """Return the versions of the packages in SAME_VERSIONS on this machine, on the scheduler, and on each worker."""
     from distributed import rpc
     from distributed.versions import get_versions
 

@@ -1,14 +1,15 @@
 """Compare the results of a matrix with those of an earlier night.
 
 In virtual time, equal code gives equal runs, so two nights differ only where the code differs. The runs of a cell are
-therefore compared in pairs with the same seed. A figure changed if the interval of the mean difference of the pairs
-does not contain 0. The intervals are wide enough that, without a real change, 95 % of the nights have no changed figure
-at all: each of m compared figures has an interval of 1 - 0.05 / m (Bonferroni).
+therefore compared in pairs with the same seed. A numeric result counts as changed if the confidence interval of the
+mean difference of the pairs does not contain 0. The intervals are so wide that without a real change, 95 % of the
+nights have no changed result: if m results are compared, the confidence level of each interval is 1 - 0.05 / m
+(Bonferroni).
 
-With processes, each run differs, so pairs mean nothing. There a figure changed if its two 95 % intervals do not
-overlap.
+Runs of processes always differ, so a comparison in pairs is impossible. For them, a result counts as changed if its two
+95 % intervals do not overlap.
 
-The metric states which direction is worse.
+The metric defines which direction is worse.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +24,7 @@ from harness.sweep.matrix._run_steps import FirstChange
 
 
 class Change(CellRecord):
-    """A numeric result that has changed. `metric` is its name. Its value was `before`, and is now `now`.
+    """A numeric result that has changed. `metric` is its name. Its old value is `before`, and its new value is `now`.
 
     `difference` is the mean difference of the runs with the same seed, with its corrected interval. It is null if the
     runs are not compared in pairs.
@@ -39,7 +40,7 @@ class Change(CellRecord):
 class ChangedRuns(CellRecord):
     """The seeds of the simulated runs that differ from the same runs of the earlier night, among `pairs` compared runs.
 
-    `first` has the first changed handler run of the first `MAX_NAMED` of them.
+    `first` contains the first changed handler run for at most `MAX_NAMED` of these runs.
     """
 
     pairs: int
@@ -48,7 +49,7 @@ class ChangedRuns(CellRecord):
 
 
 class CulpritCommit(BaseModel):
-    """A commit, and the numeric result of the run before and after this commit."""
+    """A commit, and the numeric result of a run before and after this commit."""
 
     hash: str
     date: str
@@ -59,8 +60,7 @@ class CulpritCommit(BaseModel):
 
 
 class Culprit(CellRecord):
-    """The commits that changed a numeric result that became worse, in the run with this seed. The oldest commit is
-    first.
+    """The commits that made a numeric result worse, in the run with this seed. The oldest commit is first.
 
     `problem` is the reason why the search did not find all of them, or null.
     """
@@ -72,10 +72,10 @@ class Culprit(CellRecord):
 
 
 class Comparison(BaseModel):
-    """The comparison with an earlier night. `baseline` is the file of that night, and `cells` the number of compared
+    """The comparison with an earlier night. `baseline` is the file of that night, and `cells` is the number of compared
     summaries.
 
-    `started_at` is its start, and null if this version of the harness cannot read the file.
+    `started_at` is the start of that night. It is null if this version of the harness cannot read the file.
     """
 
     baseline: str
@@ -86,9 +86,9 @@ class Comparison(BaseModel):
     changes: list[Change]
     changed_runs: list[ChangedRuns] = []
     culprits: list[Culprit] = []
-    """The commits of worse figures, if a search was requested."""
+    """The commits that made numeric results worse, if a search for them was requested."""
     not_compared: list[str] = []
-    """A sentence for each difference of the two matrices because of which cells are not compared."""
+    """A sentence for each difference between the two matrices that prevents the comparison of some cells."""
 
     @property
     def regressions(self) -> list[Change]:
@@ -96,7 +96,7 @@ class Comparison(BaseModel):
 
 
 def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
-    """Yield the changes in the order of `now`. Leave out combinations of values that only one matrix has."""
+    """Yield the changes in the order of `now`. Combinations of values that only one matrix has are omitted."""
     earlier = {cell.point: cell for cell in before}
     for cell in now:
         if cell.point not in earlier:
@@ -111,7 +111,7 @@ def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
 def compare_pairs(
     before: Sequence[Cell], now: Sequence[Cell], runs_before: Sequence[Run], runs_now: Sequence[Run]
 ) -> tuple[list[Change], list[ChangedRuns]]:
-    """Compare each pair of runs with equal seeds, for all combinations of values that both matrices have."""
+    """Compare each pair of runs with the same seed, for all combinations of values that both matrices have."""
     earlier = {cell.point: cell for cell in before}
     runs = {run.task: run for run in runs_before}
     pairs: dict[MatrixPoint, list[tuple[Run, Run]]] = {}
@@ -153,7 +153,7 @@ def _differ(was: Run, run: Run) -> bool:
 
 
 def is_paired(point: MatrixPoint) -> bool:
-    """Return true if equal code always gives equal runs here, so that single runs can be compared."""
+    """Return true if equal code always gives equal runs for this combination, so that single runs can be compared."""
     return BACKENDS[point.backend].plays_in_memory
 
 
@@ -169,7 +169,7 @@ def _differences(metric: Metric, pairs: Sequence[tuple[Run, Run]]) -> list[float
 
 
 def _moved(before: Estimate, now: Estimate) -> str | None:
-    """Return the direction of a change if the confidence intervals do not overlap. Return None if they overlap."""
+    """Return the direction of the change if the confidence intervals do not overlap. Otherwise return None."""
     if before.low is None or before.high is None or now.low is None or now.high is None:
         return None
     if now.high < before.low:

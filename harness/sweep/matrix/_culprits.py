@@ -1,10 +1,10 @@
-"""Find the commits that made a numeric result worse. The search plays one run at commits between the baseline and
-tonight.
+"""Find the commits that made a numeric result worse. The search plays one run with the code of commits between the
+earlier night and this one.
 
-A run in virtual time is the same each time, so one run is enough: the one whose figure changed most. A search by halves
-finds the first commit with another figure. If that figure is not yet the one of tonight, the search goes on after this
-commit. A commit that changes the run without making the figure worse is therefore named too, with the figure that it
-leaves.
+A run in virtual time is always the same, so one run is enough: the run whose result changed most. A binary search finds
+the first commit with a different result. If this result is not the final one yet, the search continues after this
+commit. The search therefore also names commits that change the result without making it worse, with the result after
+the commit.
 """
 
 import time
@@ -22,7 +22,7 @@ from harness.sweep.matrix._estimate import BY_NAME, Metric
 from harness.sweep.matrix.matrix_record import MatrixRecord
 
 LIMIT_S = 600.0
-"""Maximum time for one run at one commit."""
+"""Maximum number of seconds for one run at one commit."""
 
 
 class _TimeIsUpError(Exception):
@@ -32,10 +32,10 @@ class _TimeIsUpError(Exception):
 def find_culprits(
     tonight: MatrixRecord, baseline: MatrixRecord, budget_s: float, report_progress: Callable[[str], None]
 ) -> list[Culprit]:
-    """Search for commits until the budget is used up: for each cell in virtual time with a numeric result that became
-    worse.
+    """Search for the commits that made numeric results worse, for each such cell in virtual time, until the time budget
+    is used up.
 
-    The repository is the clone from which the harness runs. Ctrl-C ends the search.
+    The search uses the clone from which the harness runs. Ctrl-C ends the search.
     """
     regressions = {change.point: change for change in reversed(_paired_regressions(tonight))}
     deadline, culprits = time.monotonic() + budget_s, []
@@ -70,7 +70,7 @@ def _worst_seed(tonight: MatrixRecord, baseline: MatrixRecord, change: Change) -
 
 
 class _CulpritSearch:
-    """The search for the commits that changed one run. It appends them to the commits of `culprit`."""
+    """A search for the commits that changed one run. It appends them to the commits of `culprit`."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class _CulpritSearch:
             raise HarnessError("the run has the same figure at both commits, so no commit is named")
 
     def _first_after(self, good: str, bad: str, figure: float | None) -> str:
-        """Return the first commit after `good` at which the numeric result differs from `figure`."""
+        """Return the first commit after `good` at which the numeric result of the run differs from `figure`."""
         step = self._history.begin(good, bad)
         while not isinstance(step, SuspectCommits):
             try:

@@ -1,7 +1,7 @@
 """Estimate the means and shares of numeric results over several runs, with 95 % confidence intervals.
 
-A share of runs has Wilson's interval, which is also valid near 0 and 100 %. A mean has Student's interval. A single run
-has no interval, because it contains no information about the spread.
+The interval of a share of runs is Wilson's, which is also valid near 0 and 100 %. The interval of a mean is Student's.
+A single run has no interval, because it says nothing about the spread.
 """
 
 import math
@@ -19,7 +19,8 @@ CONFIDENCE = 0.95
 class Estimate(BaseModel):
     """The mean of a numeric result over `n` runs, with its confidence interval.
 
-    `low` and `high` are the limits of its 95 % interval, null for a single run. Without runs, all are null.
+    `low` and `high` are the limits of its 95 % interval. They are null for a single run. Without runs, all values are
+    null.
     """
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
@@ -67,7 +68,9 @@ def student_quantile(probability: float, degrees: int) -> float:
 
 
 def _within(angle: float, degrees: int) -> float:
-    """Return the probability that Student's t lies between -t and t (Abramowitz and Stegun, 26.7.3 and 26.7.4)."""
+    """Return the probability that a variable with Student's t distribution lies between -t and t (Abramowitz and
+    Stegun, 26.7.3 and 26.7.4).
+    """
     cosine = math.cos(angle)
     first = degrees % 2
     term, total = (cosine if first else 1.0), 0.0
@@ -86,7 +89,8 @@ Figures = Mapping[str, float | int | None]
 class Metric:
     """A kind of numeric result of a run. `of` returns its value, or None if the run does not determine it.
 
-    `unit` is a share of the runs, a share in each run, or a number. `worse` is the worse direction, None if neither is.
+    `unit` is a share of the runs, a share in each run, or a number. `worse` is the direction that counts as worse. It
+    is None if neither direction does.
     """
 
     name: str
@@ -145,5 +149,7 @@ BEFORE_FINAL_RECONCILE = (
         worse="lower",
     ),
 )
-"""Metrics for scenarios with a final reconcile. After it, the other metrics depend little on the network."""
+"""Metrics for scenarios with a final reconcile. After the final reconcile, the other metrics depend little on the
+network.
+"""
 BY_NAME = {metric.name: metric for metric in METRICS + BEFORE_FINAL_RECONCILE}

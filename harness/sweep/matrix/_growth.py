@@ -1,7 +1,7 @@
-"""Fit laws for the growth of numeric results with the number of agents and the number of blocks.
+"""Fit power laws for the growth of numeric results with the number of agents and the number of blocks.
 
-The mission's length is no variable of its own, because a longer mission costs more only through its larger number of
-blocks. The laws "over blocks" therefore compare missions of several lengths.
+The length of the mission is not a variable, because it has an effect only through the number of blocks. The laws "over
+blocks" therefore compare missions of several lengths.
 """
 
 from collections.abc import Iterable, Sequence
@@ -21,8 +21,8 @@ Load = Literal["any", "below 1", "from 1"]
 class Growth(BaseModel):
     """A power law for the growth of the numeric result `metric`. It is fitted to single runs.
 
-    The runs have this `backend` and `loss`. They also have this `duration_s`, this number of `agents`, and a cell with
-    this `load`; null stands for all of them.
+    `backend`, `loss`, `duration_s`, `agents` and `load` (of the cell) describe these runs. A value of null stands for
+    all values.
     """
 
     metric: str
@@ -36,7 +36,7 @@ class Growth(BaseModel):
 
 
 def overloaded(cell: Cell) -> bool:
-    """Return true if agents complete blocks faster than the swarm can commit them."""
+    """Return true if the agents of this cell complete blocks faster than the swarm can commit them."""
     load = cell.estimates["load"].mean if "load" in cell.estimates else None
     return load is not None and load >= 1
 
@@ -44,8 +44,9 @@ def overloaded(cell: Cell) -> bool:
 def growths(matrix: Matrix, cells: Sequence[Cell], runs: Sequence[Run]) -> list[Growth]:
     """Fit laws of growth for each backend and loss rate.
 
-    Laws over agents hold for one mission length, laws over blocks for one number of agents. Laws over both use all
-    sizes. If some cells have a load below 1 and others have not, laws over agents are also fitted to each side alone.
+    Laws over agents are fitted for one mission length, and laws over blocks for one number of agents. Laws over both
+    use all sizes. If the load is below 1 in only some cells, laws over agents are also fitted separately to the cells
+    with a load below 1 and to the others.
     """
     load_of = {cell.point: "from 1" if overloaded(cell) else "below 1" for cell in cells}
     found: list[Growth] = []
@@ -78,8 +79,8 @@ def growths(matrix: Matrix, cells: Sequence[Cell], runs: Sequence[Run]) -> list[
 
 
 def _points(over: tuple[Variable, ...], metric: str, runs: Iterable[Run]) -> Iterable[tuple[list[float], float]]:
-    """Yield a point for each run, for the fit of a power law. An unknown value becomes 0, so that `fit` excludes and
-    counts the run.
+    """Yield a point for each run, to which a power law is fitted. An unknown value becomes 0, so that `fit` excludes
+    and counts the run.
     """
     for run in runs:
         values = {"agents": run.agents, "blocks": run.figures.get("blocks") or 0.0}

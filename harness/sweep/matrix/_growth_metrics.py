@@ -1,4 +1,4 @@
-"""Compute the numeric results that only a matrix with several swarm sizes or mission lengths needs."""
+"""Compute the numeric results that are needed only for a matrix with several swarm sizes or mission lengths."""
 
 from harness.scenario import Scenario
 from harness.sweep.matrix._estimate import BY_NAME as BY_NAME_IN_EVERY_MATRIX
@@ -21,13 +21,14 @@ BY_NAME = BY_NAME_IN_EVERY_MATRIX | {metric.name: metric for metric in METRICS}
 
 
 def growth_figures(scenario: Scenario, mission_s: float, figures: Figures) -> Figures:
-    """Return the numeric results of a run for laws of growth, derived from those of the checker.
+    """Return the numeric results of a run to which power laws are fitted. They are computed from the results of the
+    checker.
 
-    `mission_s`: the length of the run with the time to settle. Rates per minute are rates over that time.
-    `load`: the number of blocks that are completed while one vote lasts. Only one vote at a time can succeed. At load 1
-    and above, agents therefore complete blocks faster than they can commit them.
-    `uniform_after_s`: seconds from the end of the mission until all chains were equal. It is negative if they became
-    equal before the end, and None if they never did.
+    `mission_s` is the length of the run, including the time to settle. Rates per minute refer to this time. `load` is
+    the number of blocks that are completed during one vote. Only one vote at a time can succeed, so at load 1 and
+    above, agents complete blocks faster than they can commit them. `uniform_after_s` is the number of seconds from the
+    end of the mission until all chains were equal. It is negative if they became equal before the end, and None if they
+    never did.
     """
     blocks, longest, reconciles, uniform_at_s = (
         figures.get(name) for name in ("blocks", "longest_chain", "reconciles", "uniform_at_s")

@@ -1,7 +1,8 @@
 """Draw growth.svg: small charts with logarithmic axes, on which a power law is a straight line.
 
-A dot is the mean of a cell. A line is the law fitted to the cells' runs, with its exponent beside it. Lines differ by
-colour and dashes. The legend names the lines over agents, and each exponent over blocks names its line.
+A dot is the mean of a cell. A line is a power law that is fitted to the runs of these cells, with its exponent beside
+it. Lines differ by colour and dashes. The legend names the lines over agents, and each exponent over blocks names its
+line.
 """
 
 import math
@@ -26,7 +27,7 @@ from harness.sweep.matrix.matrix_record import MatrixRecord
 COLUMNS = 3
 HEAD, PANEL_HEIGHT, FOOT = 96, 236, 26
 MAX_LINES = 4
-"""Maximum number of lines in a panel. Of more lines, the panel shows an even selection."""
+"""Maximum number of lines in a chart. If there are more, the chart shows an even selection."""
 TICK_WIDTH = 24.0
 
 
@@ -157,8 +158,8 @@ def _legend(record: MatrixRecord) -> Markup:
 def _lines(record: MatrixRecord, panel: GrowthPanel) -> list[PanelLine]:
     """Return the lines of a chart.
 
-    A line over agents has one mission length. A line over blocks has one number of agents; beside lines over agents,
-    lines over blocks are drawn at the highest loss alone.
+    A line over agents has one mission length, and a line over blocks has one number of agents. If the chart has lines
+    over agents, lines over blocks are drawn only for the highest loss rate.
     """
     matrix, over_agents = record.matrix, panel.over == "agents"
     losses = matrix.loss if over_agents or not matrix.grows_with_agents else [max(matrix.loss)]
@@ -190,7 +191,7 @@ def _place_of(item: Cell | Growth, panel: GrowthPanel) -> ChartLineKey:
 
 
 def _name(matrix: Matrix, losses: Sequence[float], place: ChartLineKey) -> str:
-    """Return a name for a line: the values, such as the loss rate, by which it differs from the other lines."""
+    """Return the name of a line: the values, such as the loss rate, by which it differs from the other lines."""
     return ", ".join(
         [
             *([f"{words.percent(place.loss)} loss"] if len(losses) > 1 else []),
@@ -221,7 +222,9 @@ def _panel(record: MatrixRecord, panel: GrowthPanel, area: ChartArea) -> Markup:
 
 
 def _line(panel: GrowthPanel, line: PanelLine, across: Axis, up: Axis) -> Markup:
-    """Draw the points of a line with tooltips, and the fitted law. Without a law, join the points by straight lines."""
+    """Draw the points of a line with tooltips, and the fitted power law. Without a law, connect the points by straight
+    lines.
+    """
     points = [(x, y, cell) for cell in line.cells if (x := _x(panel, cell)) and (y := _y(panel, cell)) is not None]
     ends = _ends(panel, line) or [(x, y) for x, y, _ in points]
     parts = [svg.line([(across(x), up(y)) for x, y in ends], line.number)] if ends else []
@@ -232,7 +235,7 @@ def _line(panel: GrowthPanel, line: PanelLine, across: Axis, up: Axis) -> Markup
 
 
 def _power(panel: GrowthPanel, line: PanelLine, law: Law, prefix: str, x: float, y: float) -> Markup:
-    """Write the exponent of a law into an empty corner of the chart."""
+    """Write the exponent of a power law into an empty corner of the chart."""
     value, margin = say_exponent(law.exponents[panel.over]).split("\u00b1")
     text = Markup('{}{}<tspan dy="-4" font-size="10">{}</tspan><tspan dy="4" font-size="10"> \u00b1{}</tspan>').format(
         prefix, SYMBOLS[panel.over], value, margin
@@ -243,7 +246,7 @@ def _power(panel: GrowthPanel, line: PanelLine, law: Law, prefix: str, x: float,
 
 
 def _ends(panel: GrowthPanel, line: PanelLine) -> list[tuple[float, float]]:
-    """Return the two end points of the law's line: at the first and the last point of the data."""
+    """Return the two end points of the power law's line: at the first and the last point of the data."""
     xs = [x for cell in line.cells if (x := _x(panel, cell)) and _y(panel, cell)]
     if not line.law or not xs:
         return []

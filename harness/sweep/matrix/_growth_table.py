@@ -1,4 +1,6 @@
-"""Write tables of growth for the terminal, the page and Markdown: means for each size, and exponents of the laws."""
+"""Write tables of growth for the terminal, the page and Markdown: means for each size, and exponents of the power
+laws.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -32,8 +34,8 @@ EXPLANATION = (
 
 @dataclass(frozen=True, slots=True)
 class GrowthTables:
-    """The tables for one loss rate and backend: a table of means, and a table of laws. The laws have a row for each
-    group of runs and each variable.
+    """The tables for one loss rate and backend: a table of means, and a table of power laws. The second has a row for
+    each group of runs and each variable.
     """
 
     name: str
@@ -42,8 +44,8 @@ class GrowthTables:
 
 
 def growth_tables(record: MatrixRecord) -> Iterator[GrowthTables]:
-    """Yield the tables for each backend and loss rate with a finished run. There are none if the matrix has only one
-    size.
+    """Yield the tables for each backend and loss rate with a finished run. If the matrix has only one size, yield
+    nothing.
     """
     for backend in record.matrix.backend if record.matrix.grows else ():
         for loss in record.matrix.loss:
@@ -55,7 +57,7 @@ def growth_tables(record: MatrixRecord) -> Iterator[GrowthTables]:
 
 
 def _rows(growths: Iterable[Growth]) -> list[tuple[str, Variable, dict[str, Law]]]:
-    """Group the laws of growth by the runs to which they are fitted: over agents, then over blocks, then over both."""
+    """Group the power laws by the runs to which they are fitted: over agents, then over blocks, then over both."""
     by_row: dict[tuple[float, str, Variable], dict[str, Law]] = {}
     for growth in growths:
         for variable in growth.over:
@@ -65,7 +67,7 @@ def _rows(growths: Iterable[Growth]) -> list[tuple[str, Variable, dict[str, Law]
 
 
 def runs_of(growth: Growth) -> str:
-    """Return a name for the runs to which a law is fitted, such as "600 s, load < 1" or "both"."""
+    """Return a name for the runs to which a power law is fitted, such as "600 s, load < 1" or "both"."""
     names = []
     if growth.over == ("agents", "blocks"):
         names.append("both")
@@ -79,7 +81,7 @@ def runs_of(growth: Growth) -> str:
 
 
 def label(name: str) -> str:
-    """Return the title of a column, with a hyphen where a narrow column may break it."""
+    """Return the title of a column. A hyphen marks where a narrow column may break it."""
     return "idle at end" if name == "finished" else BY_NAME[name].label
 
 
@@ -97,7 +99,7 @@ def size_row(cell: Cell) -> list[str]:
 
 
 def law_row(variable: Variable, laws: dict[str, Law]) -> list[tuple[str, str]]:
-    """Return the exponents of `variable` in the order of `LAW_METRICS`, each with the quality of its law."""
+    """Return the exponents of `variable` in the order of `LAW_METRICS`, each with the quality of its power law."""
     return [
         (say_exponent(law.exponents[variable]), say_quality(law)) if (law := laws.get(name)) else (UNKNOWN, "")
         for name in LAW_METRICS
@@ -130,13 +132,15 @@ def place(record: MatrixRecord, cell: Cell) -> list[str]:
 
 
 def say_exponent(exponent: Exponent) -> str:
-    """Return an exponent with half the width of its confidence interval, as text."""
+    """Format an exponent as text, with half the width of its confidence interval."""
     margin = (exponent.high - exponent.low) / 2
     return f"{exponent.value:.2f}\u00b1" + (f"{margin:.2f}".lstrip("0") if margin < 0.995 else f"{margin:.2g}")
 
 
 def say_quality(law: Law) -> str:
-    """Return the explained share of the variance as text, with the number of points if runs were left out."""
+    """Format the explained share of the variance as text. If runs were omitted, the text includes the number of
+    points.
+    """
     explained = "" if law.r_squared is None else f"R\u00b2\u00a0{law.r_squared:.2f}".replace("0.", ".")
     return explained + (f" n\u00a0{law.n}" if law.left_out else "")
 
@@ -148,7 +152,7 @@ def say(metric: Metric, estimate: Estimate) -> str:
 
 
 def say_number(value: float) -> str:
-    """Return a number with three significant digits as text: 0.012, 7.3, 482, 40.4k, 225M."""
+    """Format a number with three significant digits: 0.012, 7.3, 482, 40.4k, 225M."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     for factor, unit in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):

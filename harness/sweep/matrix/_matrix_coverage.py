@@ -12,11 +12,11 @@ from harness.sweep.matrix._cell import CellRecord
 from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 
 MOST_AGENTS, MOST_BLOCKS = 3, 3
-"""Bounds of the states that coverage is compared with: numbers of agents and blocks."""
+"""Numbers of agents and blocks of the proof with whose states the coverage is compared."""
 
 
 class CellCoverage(CellRecord):
-    """The coverage by the runs with one combination of values, as far as this command played them."""
+    """The coverage by the runs with one combination of values, as far as this command has played these runs."""
 
     local_states: int
     pairs: int
@@ -32,7 +32,7 @@ class MatrixCoverage(BaseModel):
 
 
 class CoverageTally:
-    """Adds up the coverage of runs."""
+    """A sum of the coverage of all runs."""
 
     def __init__(self) -> None:
         self._runs = 0

@@ -18,11 +18,11 @@ from ucp.short_value import shown
 MAX_SEEDS = 10_000
 MAX_SEED = 2**32 - 1
 SIZES_FOR_GROWTH = 3
-"""Numbers of agents, or mission lengths, from which on a matrix fits growth: two points fit any law."""
+"""Number of swarm sizes or mission lengths from which on power laws are fitted. Two points would match any law."""
 
 
 class MatrixPoint(NamedTuple):
-    """A combination of values in the matrix. `duration_s` is None if the mission length is not varied."""
+    """A combination of values in the matrix. `duration_s` is None if all runs have the same mission length."""
 
     loss: float
     agents: int
@@ -47,40 +47,45 @@ class Matrix(StrictModel):
     """A scenario and the values to vary: `backend`, `duration_s`, `agents`, `loss` and `seeds`.
 
     Each combination of values is one run. `loss` replaces the scenario's `network.loss`. `agents` and `duration_s`, if
-    given, replace the scenario's keys of the same name. The scenario must leave a replaced key unset, because two
-    values for one thing could differ. Everything else in the scenario (receivers that differ, its timeline) applies to
-    every cell. Every cell has the same seeds, so the same blocks are built at the same times at every loss (common
-    random numbers). A difference between two such cells is therefore an effect of the loss.
+    given, replace the scenario's keys of the same name. The scenario must not set a key that is replaced, because the
+    two values could differ. All other parts of the scenario, such as its timeline, apply to every cell. Every cell has
+    the same seeds, so the same blocks are built at the same times at every loss (common random numbers). A difference
+    between two such cells is therefore an effect of the loss.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
     about: Annotated[str, Field(max_length=2000)] = ""
     scenario: Scenario
-    """Keys of a scenario, or the path of a scenario file relative to the matrix file. Default of its `name`: that of
-    the matrix."""
+    """Keys of a scenario, or the path of a scenario file relative to the matrix file. By default, its `name` is the
+    name of the matrix.
+    """
     loss: Annotated[list[Probability], Field(min_length=1, max_length=100)]
     seeds: int | list[int] = 200
-    """Number of seeds, counted from 1, or a list of seeds."""
+    """Number of seeds, which are then 1, 2 and so on, or a list of seeds."""
     agents: (
         Annotated[list[Annotated[int, Field(ge=1, le=MAX_AGENTS, strict=True)]], Field(min_length=1, max_length=100)]
         | None
     ) = None
-    """Numbers of agents. Default: that of the scenario."""
+    """Numbers of agents. By default, the number of the scenario."""
     duration_s: (
         Annotated[list[Annotated[Seconds, Field(le=MAX_DURATION_S)]], Field(min_length=1, max_length=100)] | None
     ) = None
-    """Mission lengths in mission seconds. Default: that of the scenario."""
+    """Mission lengths in mission seconds. By default, the length of the scenario."""
     backend: Annotated[list[BackendName], Field(min_length=1, default_factory=lambda: ["sim"])]
     """Backends, by default `sim`."""
     keep: Literal["violated", "all"] = "violated"
-    """Run directories to keep, of runs that do not play in memory: of those with a violation or failure, or of all."""
+    """Run directories to keep: those of runs with a violation or failure, or those of all runs. Only runs that are not
+    played in memory have a directory.
+    """
     traces: bool = True
-    """True if agents write traces in virtual time. Without traces, large swarms take a fifth of the time and far less
-    memory, but the checker judges neither characteristic 1 nor steps and records. Processes always write traces."""
+    """True if agents write traces in virtual time. Without traces, a run of a large swarm takes a fifth of the time and
+    far less memory, but the checker cannot judge characteristic 1, the steps and the records. Processes always write
+    traces.
+    """
 
     @property
     def needs_processes(self) -> bool:
-        """True if any run needs real processes, whether in containers or not."""
+        """True if any run needs real processes, inside or outside of containers."""
         return any(not BACKENDS[backend].plays_in_memory for backend in self.backend)
 
     @property
@@ -107,7 +112,7 @@ class Matrix(StrictModel):
 
     @property
     def duration_axis(self) -> Sequence[float | None]:
-        """The mission lengths of the combinations. It contains only None if the mission length is not varied."""
+        """The mission lengths of the combinations. It contains only None if all runs have the same mission length."""
         return self.duration_s or [None]
 
     @property
@@ -134,7 +139,7 @@ class Matrix(StrictModel):
     def _scenario_takes_from_the_matrix(cls, document: Any) -> Any:
         """Set the scenario's name, number of agents and mission length to the first values of the matrix.
 
-        The keys of the scenario that name single agents or times are checked with these values.
+        These values are used to check the keys of the scenario that contain agent IDs or times.
         """
         if not isinstance(document, dict):
             return document
@@ -201,7 +206,7 @@ class Matrix(StrictModel):
 
 
 def load_matrix(path: Path | str, backend: BackendName | None = None) -> Matrix:
-    """Load a matrix from a YAML file. If `backend` is given, it replaces the one in the file.
+    """Load a matrix from a YAML file. If `backend` is given, it replaces the backend in the file.
 
     Raises ScenarioError. Its message names the file, the key, the value and the allowed values.
     """

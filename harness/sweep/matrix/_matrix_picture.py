@@ -1,8 +1,8 @@
 """Draw matrix.svg: six charts side by side, with the loss rate as horizontal axis.
 
-Each number of agents, mission length and backend has six panels, one series below the other. Lines are means, bands are
-95 % intervals, and dots are the measured losses. Two lines in one panel also have different dashes, and their names
-beside them.
+There is a row of six charts for each number of agents, mission length and backend. Lines are means, bands are 95 %
+intervals, and dots mark the loss rates that were measured. Two lines in one chart also have different dashes, and their
+names beside them.
 """
 
 import math
@@ -65,7 +65,7 @@ class PlacedPanel:
 
 @dataclass(frozen=True, slots=True)
 class PanelRow:
-    """A row of charts with its name above them. `name` is empty if there is only one row."""
+    """A row of charts with its name above it. `name` is empty if the picture has only one row."""
 
     name: str
     cells: list[Cell]
@@ -111,7 +111,7 @@ def _series(record: MatrixRecord) -> list[list[Cell]]:
 
 
 def _name(record: MatrixRecord, cells: Sequence[Cell]) -> str:
-    """Return a name for a row: the values by which it differs from the other rows."""
+    """Return the name of a row: the values by which it differs from the other rows."""
     return ", ".join(series_name(record.matrix, cells[0].point)) if cells else ""
 
 
@@ -181,7 +181,7 @@ def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axi
 def curve(number: int, dots: Sequence[LinePoint], across: Axis, up: Axis) -> tuple[Markup, list[tuple[float, float]]]:
     """Draw line `number` of a chart with its band of confidence intervals. Return the drawing and the points.
 
-    Unknown means are left out.
+    Unknown means are omitted.
     """
     known = [dot for dot in dots if dot.estimate.mean is not None]
     bounded = [(dot.x, dot.estimate.low, dot.estimate.high) for dot in known]

@@ -1,8 +1,8 @@
 """Fit power laws y = a * x^b by least squares of the logarithms, to describe how one quantity grows with others.
 
-Only a value above 0 has a logarithm. Other points are left out and counted. The interval of an exponent is Student's,
-which assumes that the points scatter around the line independently and equally. Where the growth is no power law, the
-assumption is false. Then R^2 is low, or parts of the range have different exponents.
+Only values above 0 have a logarithm. Other points are omitted and counted. The confidence interval of an exponent is
+Student's. It assumes that the points scatter around the line independently and equally. If the growth is not a power
+law, this assumption is false. In this case R^2 is low, or parts of the range have different exponents.
 """
 
 import math
@@ -16,8 +16,9 @@ from harness.sweep.matrix._estimate import CONFIDENCE, student_quantile
 
 Variable = Literal["agents", "blocks"]
 MAX_INFLATION = 100.0
-"""Largest factor by which a second variable may inflate the variance of an exponent, 1 / (1 - r^2). Above it the two
-variables cannot be separated."""
+"""Maximum variance inflation factor, 1 / (1 - r^2), which a second variable causes for an exponent. Above it, the
+effects of the two variables cannot be separated.
+"""
 
 
 class Exponent(BaseModel):
@@ -33,8 +34,8 @@ class Exponent(BaseModel):
 class Law(BaseModel):
     """A power law: y = factor * product of the variables, each raised to its exponent.
 
-    The law is fitted to `n` points. `left_out` more points have a value that is not above 0. `r_squared` is the share
-    of the variance of log y that the law explains, or null if y does not vary.
+    The law is fitted to `n` points. `left_out` is the number of omitted points, whose value is not above 0. `r_squared`
+    is the share of the variance of log y that the law explains, or null if y does not vary.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -49,8 +50,8 @@ class Law(BaseModel):
 def fit(names: Sequence[Variable], points: Iterable[tuple[Sequence[float], float]]) -> Law | None:
     """Fit a law of one or two variables to points (values of the variables, y).
 
-    Return None if there are no more points than unknowns, if a variable does not vary, or if two variables cannot be
-    separated (`MAX_INFLATION`).
+    Return None if there are not more points than unknowns, if a variable is constant, or if the effects of two
+    variables cannot be separated (`MAX_INFLATION`).
     """
     everything = list(points)
     usable = [([*map(math.log, xs)], math.log(y)) for xs, y in everything if y > 0 and min(xs) > 0]
@@ -96,8 +97,8 @@ def _centred(values: Sequence[float]) -> list[float]:
 
 
 def _unexplained(values: Sequence[float], by: Sequence[float]) -> list[float]:
-    """Return the part of `values` that a regression on another variable, which may be constant, does not explain (the
-    residuals).
+    """Return the residuals of `values`: the part that a regression on another variable, which may be constant, does not
+    explain.
     """
     if max(by) - min(by) < 1e-12:
         return _centred(values)
@@ -106,5 +107,5 @@ def _unexplained(values: Sequence[float], by: Sequence[float]) -> list[float]:
 
 
 def _rounded(number: float) -> float:
-    """Round to six digits, because further digits mean nothing and differ between machines."""
+    """Round to six digits. Further digits have no meaning and differ between machines."""
     return float(f"{number:.6g}")

@@ -49,7 +49,7 @@ class MatrixResults:
 def opened(directory: Path, matrix: Matrix) -> Iterator[MatrixResults]:
     """Open the results of `matrix` in `directory`, which may be new or empty.
 
-    Raises RunDirectoryError if the directory holds other files, or if another command uses it.
+    Raises RunDirectoryError if the directory contains other files, or if another command uses it.
     """
     path = directory / FILE
     with contextlib.ExitStack() as stack:

@@ -1,11 +1,11 @@
 """Fingerprints of the steps of a run, which find the first handler run at which a run differs from an earlier night.
 
-A night keeps two bytes for each handler run, in the order of mission time. The first two bytes that differ give the
-position of the first changed handler run. To name it, the run is played again with the code of tonight. The code of the
-earlier night is therefore not needed.
+The fingerprint of a run has two bytes for each handler run, in the order of mission time. The first two bytes that
+differ between two nights give the position of the first changed handler run. To find its name, the run is played again
+with the current code. The code of the earlier night is therefore not needed.
 
-Handler runs that only received a message are left out. With an edited core, the simulation delivers more messages
-without effect, and they would hide the first real change.
+Handler runs that only received a message are omitted. With an edited core, the simulation delivers more messages
+without effect, which would hide the first real change.
 """
 
 import base64
@@ -25,7 +25,7 @@ _BYTES = 2
 
 
 class HandlerStep(NamedTuple):
-    """One run of a handler, with the agent that ran it."""
+    """A handler run together with the agent that ran it."""
 
     t: float
     agent_id: int
@@ -33,9 +33,9 @@ class HandlerStep(NamedTuple):
 
 
 class FirstChange(BaseModel):
-    """The first handler run in which tonight's run with this seed differs from the run of the earlier night.
+    """The first handler run at which the run with this seed differs from the same run of the earlier night.
 
-    `handler` is null if it is not among the handler runs of the fingerprint, or if tonight's run ended before.
+    `handler` is null if the fingerprint does not include this handler run, or if the new run ended before it.
     """
 
     seed: int
@@ -46,7 +46,7 @@ class FirstChange(BaseModel):
 
 
 def fingerprint(traces: Mapping[int, Trace]) -> str:
-    """Return the fingerprint of a run in base64. It is empty without traces."""
+    """Return the fingerprint of a run in base64. The result is empty without traces."""
     digests = [_digest(step).to_bytes(_BYTES) for step in _steps(traces)[:MAX_STEPS]]
     return base64.b64encode(b"".join(digests)).decode("ascii")
 
@@ -75,7 +75,7 @@ def name_change(scenario: Scenario, seed: int, position: int) -> FirstChange:
 
 
 def _steps(traces: Mapping[int, Trace]) -> list[HandlerStep]:
-    """Return those handler runs of all agents that had an effect, in the order of mission time."""
+    """Return the handler runs of all agents that had an effect, in the order of mission time."""
     steps = (HandlerStep(run.t, agent_id, run) for agent_id, trace in sorted(traces.items()) for run in trace.runs)
     return sorted((step for step in steps if step.run.sent or not only_receives(step.run)), key=lambda step: step.t)
 

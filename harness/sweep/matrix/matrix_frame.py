@@ -14,15 +14,17 @@ _TYPES = {
     "failed": pl.String,
     "unsupported": pl.String,
 }
-"""Types of the columns that are not figures."""
+"""Types of the table columns other than the numeric results."""
 
 
 def matrix_frame(finished: Finished) -> pl.DataFrame:
     """Return a table with one row for each run of a matrix. The columns of the table are those of `runs.csv`.
 
-    - `loss` (0 to 1), `agents`, `backend` and `seed` identify the run, and `duration_s` if it is an axis of the matrix.
-    - The figures of run.json follow, such as `mutual_chain`, `distinct_chains` and `messages`. Unknown figures are
-      null.
+    - `loss` (0 to 1), `agents`, `backend` and `seed` identify the run. So does `duration_s` if the matrix has several
+      mission lengths.
+
+    - The numeric results of run.json follow, such as `mutual_chain`, `distinct_chains` and `messages`. Unknown figures
+      are null.
     - `characteristic_1` to `characteristic_6`, `steps`, `records` and `liveness` are verdicts.
     - `failed` or `unsupported` is the reason why a run has no verdict.
 

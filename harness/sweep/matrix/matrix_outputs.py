@@ -40,8 +40,8 @@ from ucp.agent_files import write_atomically, write_json_atomically
 def to_junit(record: MatrixRecord) -> str:
     """Return the results of a matrix as JUnit XML.
 
-    A cell fails if one of its runs failed or has a bad verdict, or if it is worse than the baseline. A cell with
-    missing or unsupported runs is skipped.
+    The test case of a cell fails if one of its runs failed or has a bad verdict, or if the cell is worse than in the
+    earlier night. A cell with missing or unsupported runs is skipped.
     """
     return to_xml(record.matrix.name, "matrix", record.started_at, record.wall_s, _cases(record))
 
@@ -63,8 +63,8 @@ def _cases(record: MatrixRecord) -> Iterator[JunitCase]:
 
 
 def write(finished: Finished, directory: Path, nights: StoredNights | None = None) -> None:
-    """Write all output files. `nights` are earlier results, drawn as a trend. Raises MachineError if a file cannot be
-    written.
+    """Write all output files. `nights` contains earlier results, which are drawn as a trend. Raises MachineError if a
+    file cannot be written.
     """
     record = finished.record
     try:
@@ -96,13 +96,15 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
 
 
 def _place(point: MatrixPoint) -> dict[str, Any]:
-    """Return the table columns that name a combination of values. A constant mission length has no column."""
+    """Return the table columns that name a combination of values. If all runs have the same mission length, it has no
+    column.
+    """
     return {axis: value for axis, value in point._asdict().items() if value is not None}
 
 
 def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
     """Yield a row of `runs.csv` for each run: its values and seed, then its numeric results and verdicts, or the reason
-    why they are missing.
+    why it has none.
     """
     figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
     for run in runs:

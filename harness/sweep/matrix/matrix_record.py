@@ -26,11 +26,12 @@ class RunWithoutResult(CellRecord):
 
 
 class MatrixRecord(BaseModel):
-    """The results of a matrix. `matrix` is the resolved matrix file. `cells` has a cell for each point with at least
-    one ended run.
+    """The results of a matrix. `matrix` is the resolved matrix file. `cells` has a cell for each combination with at
+    least one run that has ended.
 
-    `started_at` is the start of the first command. `wall_s` is the wall time of the last command in seconds, if an
-    interrupted matrix was continued. `against` has the changes since the matrix to compare with.
+    `started_at` is the start of the matrix. `wall_s` is the wall time of the command in seconds. If an interrupted
+    matrix was continued, this is the last command. `against` contains the changes since the earlier night to compare
+    with.
     """
 
     model_config = ConfigDict(populate_by_name=True)
@@ -43,16 +44,16 @@ class MatrixRecord(BaseModel):
     wall_s: float
     outcome: Literal["completed", "interrupted"]
     budget_s: float | None = None
-    """Seconds after which the command began no further run, or null without a limit."""
+    """Seconds after which the command began no further run. Null if the time was not limited."""
     cells: list[Cell]
     failed: list[RunWithoutResult] = []
     unsupported: list[RunWithoutResult] = []
-    """Runs in which an agent did not support a needed feature."""
+    """Runs in which an agent did not support a required feature."""
     against: Comparison | None = None
     results: list[Run] = []
-    """The judged runs in virtual time. A later night compares its runs with them, in pairs with the same seed."""
+    """The judged runs in virtual time. A later night can compare its runs with these, in pairs with the same seed."""
     tried: MatrixCoverage | None = None
-    """Coverage of the protocol by the runs, if requested."""
+    """The share of the protocol that the runs covered, if requested."""
     growths: list[Growth] = []
     """Power laws, if the matrix has several sizes of swarm or mission."""
 

@@ -29,16 +29,18 @@ from harness.sweep.matrix.nights import BaselineNight
 
 Outcomes = Iterator[tuple[MatrixTask, Run | FailedTask]]
 Spread = Callable[[Iterable[MatrixTask], Callable[[MatrixTask], Run]], AbstractContextManager[Outcomes]]
-"""Distributes tasks, and yields their outcomes in order of completion."""
+"""A function that distributes tasks, and yields their results in order of completion."""
 
 
 MAX_NAMED = 50
-"""Number of changed runs in a cell whose first changed handler run is named."""
+"""Maximum number of changed runs in a cell for which the first changed handler run is named."""
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished or interrupted matrix: its results, and its runs, which are sorted by their values and seeds."""
+    """A matrix whose runs have ended or were interrupted: its results, and its runs, sorted by their values and
+    seeds.
+    """
 
     record: MatrixRecord
     runs: list[Run]
@@ -54,7 +56,7 @@ def on_cores(matrix: Matrix, jobs: int, *, shown: bool = False) -> Spread:
 def on_cluster(matrix: Matrix, address: str, *, shown: bool = False) -> Spread:
     """Return a function that distributes the runs over the workers of the Dask scheduler at `address`.
 
-    Raises ScenarioError for runs of processes.
+    Raises ScenarioError if a run needs processes.
     """
     if matrix.needs_processes:
         raise ScenarioError(
@@ -75,12 +77,12 @@ def run_matrix(
 ) -> Finished:
     """Play every run of a matrix, and summarise the runs for each combination of values.
 
-    - `out`: the directory of `results.jsonl`. It is new or empty, or holds earlier results of the same matrix; runs in
-      it are not played again. Without it, a new directory under `runs/`.
-    - `spread`: how runs are distributed. Without it, they use all cores of this machine.
-    - `judge`: plays and checks one run in virtual time. Without it, the simulation.
+    - `out`: the directory of `results.jsonl`. It is new or empty, or contains earlier results of the same matrix. Runs
+      with a result are not played again. Without it, a new directory under `runs/`.
+    - `spread`: the function that distributes runs. Without it, the runs use all cores of this machine.
+    - `judge`: the function that plays and checks one run in virtual time. Without it, the simulation is used.
     - `budget_s`: no run begins after this time. The most uncertain cells come first. Without it, all runs are played.
-    - `covers`: also measure which share of the protocol's states the runs reach, which takes longer.
+    - `covers`: if true, also measure the share of the protocol's states that the runs reach. This takes longer.
 
     Ctrl-C ends the matrix early, with the runs that have ended. Raises HarnessError if it cannot be played.
     """
@@ -132,7 +134,7 @@ def _run_missing(
 
 
 def compare_with(finished: Finished, baseline: BaselineNight) -> Finished:
-    """Return the results of a matrix together with the changes since an earlier night."""
+    """Return the results of a matrix with the changes since an earlier night."""
     if baseline.record is None:
         comparison = Comparison(baseline=str(baseline.path), changes=[], not_compared=baseline.not_compared)
         return Finished(finished.record.model_copy(update={"against": comparison}), finished.runs)
@@ -159,10 +161,10 @@ def compare_with(finished: Finished, baseline: BaselineNight) -> Finished:
 
 
 def name_changes(finished: Finished, baseline: BaselineNight, jobs: int) -> Finished:
-    """Return the results of a matrix. For each changed run, at most MAX_NAMED per cell, they name the first changed
-    handler run.
+    """Find the first changed handler run for each changed run, but for at most MAX_NAMED runs in a cell. Return the
+    results of the matrix with these names.
 
-    The runs are played again. Ctrl-C ends this search; the remaining changes then have no name.
+    The runs are played again. Ctrl-C ends the search, and the remaining changes have no name.
     """
     comparison, earlier = finished.record.against, baseline.record
     if comparison is None or earlier is None:
@@ -192,7 +194,7 @@ def name_changes(finished: Finished, baseline: BaselineNight, jobs: int) -> Fini
 def name_culprits(
     finished: Finished, baseline: BaselineNight, budget_s: float, report_progress: Callable[[str], None]
 ) -> Finished:
-    """Return the results of a matrix together with the commits that made numeric results worse."""
+    """Return the results of a matrix with the commits that made numeric results worse."""
     if finished.record.against is None or baseline.record is None:
         return finished
     culprits = find_culprits(finished.record, baseline.record, budget_s, report_progress)
@@ -201,7 +203,9 @@ def name_culprits(
 
 
 def _effort(scenario: Scenario) -> float:
-    """Estimate the relative time that a run takes. It grows with the number of messages, and with the swarm size."""
+    """Estimate the relative time that a run takes. The time grows with the number of messages and with the number of
+    agents.
+    """
     agents = len(scenario.roster)
     return agents**2 * (scenario.duration_s + min(scenario.settle.limit_s, 30 * agents))
 

@@ -17,7 +17,7 @@ from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 from harness.sweep.matrix.matrix_record import MatrixRecord
 
 NAMED = 5
-"""Maximum number of runs of a cell that are named. Further runs are only counted here; matrix.json names all."""
+"""Maximum number of runs of a cell that the table names. It only counts further runs. matrix.json names all."""
 
 
 def render(record: MatrixRecord) -> RenderableType:
@@ -50,7 +50,7 @@ def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
 
 
 def series(record: MatrixRecord) -> list[list[Cell]]:
-    """Return groups of summaries. The summaries of one group differ only by their loss rate."""
+    """Group the summaries. The summaries of one group differ only by their loss rate."""
     groups: dict[tuple[object, ...], list[Cell]] = {}
     for cell in record.cells:
         groups.setdefault((cell.backend, cell.duration_s, cell.agents), []).append(cell)
@@ -58,9 +58,9 @@ def series(record: MatrixRecord) -> list[list[Cell]]:
 
 
 def axes(matrix: Matrix) -> dict[str, Callable[[MatrixPoint], str]]:
-    """Return the loss rate and all other values that vary in the matrix, by name.
+    """Return the values that vary in the matrix, by name, with the loss rate first.
 
-    Each axis comes with a function that formats the value of a point.
+    Each name has a function that formats the value of a combination.
     """
     named: dict[str, Callable[[MatrixPoint], str]] = {"loss": lambda point: words.percent(point.loss)}
     if len(matrix.agents or ()) > 1:
@@ -87,12 +87,12 @@ def series_name(matrix: Matrix, point: MatrixPoint) -> list[str]:
 
 
 def say_lengths(matrix: Matrix) -> str:
-    """Return the mission lengths as text, such as "600 s, 1200 s"."""
+    """Format the mission lengths as text, such as "600 s, 1200 s"."""
     return ", ".join(map(words.duration, matrix.lengths))
 
 
 def say(metric: Metric, estimate: Estimate) -> str:
-    """Return a mean and its confidence interval as one line of text."""
+    """Format a mean and its confidence interval as one line of text."""
     interval = say_interval(metric, estimate)
     return f"{say_mean(metric, estimate)} ({interval})" if interval else say_mean(metric, estimate)
 
@@ -104,7 +104,7 @@ def say_mean(metric: Metric, estimate: Estimate) -> str:
 
 
 def say_interval(metric: Metric, estimate: Estimate) -> str:
-    """Return a confidence interval as text: both limits for a share, otherwise half its width."""
+    """Format a confidence interval as text: both limits for a share, otherwise half its width."""
     if estimate.low is None or estimate.high is None:
         return ""
     if metric.unit == "share of runs":
@@ -162,7 +162,7 @@ def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
 
 
 def unsupported(record: MatrixRecord, cell: Cell) -> Iterable[str]:
-    """Return the features that agents lack for these runs, without repetitions."""
+    """Return the features that agents lack for these runs, each once."""
     return dict.fromkeys(run.reason for run in record.unsupported if run.point == cell.point)
 
 
@@ -232,7 +232,7 @@ def _say_change(change: Change) -> str:
 
 
 def _say_difference(change: Change) -> str:
-    """Return the mean difference of paired runs with its confidence interval as text, in percent if possible."""
+    """Format the mean difference of paired runs with its confidence interval as text, in percent if possible."""
     metric, difference, before = BY_NAME[change.metric], change.difference, change.before.mean
     assert difference is not None, "the change is one of pairs"
     factor, unit = (1.0, "") if metric.unit == "number" else (100.0, "\u00a0points")
@@ -243,7 +243,7 @@ def _say_difference(change: Change) -> str:
 
 
 def say_finished(cell: Cell) -> str:
-    """Return the share of runs in which the swarm became idle, as text."""
+    """Format the share of runs in which the swarm became idle as text."""
     share = cell.finished.mean
     return "\u2013" if share is None else f"{round(100 * share)}\u00a0%"
 
@@ -262,7 +262,7 @@ def _violated(cell: Cell) -> Text:
 
 
 def _number(number: float) -> str:
-    """Return a number with about three significant digits as text."""
+    """Format a number with about three significant digits."""
     digits = 2 if abs(number) < 10 else 1 if abs(number) < 100 else 0
     text = f"{number:.{digits}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text

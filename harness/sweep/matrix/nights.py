@@ -16,7 +16,7 @@ from ucp.plain_file import json_problem, read_json
 from ucp.short_value import shown
 
 MAX_REASONS = 10
-"""Maximum number of differences of two matrices that are named."""
+"""Maximum number of differences between two matrices that are listed."""
 _IRRELEVANT_KEYS: Any = {"name": True, "about": True, "keep": True, "scenario": {"name", "about"}}
 
 
@@ -26,8 +26,8 @@ class OtherVersionError(ScenarioError):
 
 @dataclass(frozen=True, slots=True)
 class BaselineNight:
-    """An earlier night, with which results are compared. `not_compared` is the reason why some combinations of values
-    are left out.
+    """An earlier night, with which results are compared. `not_compared` contains the reasons why some combinations of
+    values are not compared.
 
     `record` is None if another version of the harness wrote the file and this version cannot read it.
     """
@@ -41,7 +41,8 @@ class BaselineNight:
 def load_baseline(path: Path, matrix: Matrix) -> BaselineNight:
     """Load a night for a comparison. If its matrix differs, some combinations of values are not compared.
 
-    Raises ScenarioError if the file is no finished record of a matrix, or if the matrix has only one seed.
+    Raises ScenarioError if the file does not contain the results of a finished matrix, or if the matrix has only one
+    seed.
     """
     if len(matrix.seed_list) < 2:
         raise ScenarioError("--against compares 95 % intervals, which one seed has not: give the matrix more `seeds`")
@@ -96,7 +97,7 @@ MAX_BYTES = 64 * 1024 * 1024
 def _load(path: Path) -> MatrixRecord:
     """Load matrix.json. Raises ScenarioError unless it contains finished results of a matrix.
 
-    Raises OtherVersionError if it has the schema, but not its keys.
+    Raises OtherVersionError if the file names the schema but does not match it.
     """
     try:
         document = read_json(path, MAX_BYTES)
@@ -119,7 +120,7 @@ def _load(path: Path) -> MatrixRecord:
 
 
 LAST = 60
-"""Maximum number of nights that are read: the last file names in order. The names start with the date."""
+"""Maximum number of nights that are read. File names begin with the date, and the last files in order are read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +135,7 @@ class StoredNights:
 
     @property
     def said_left_out(self) -> str:
-        """Return a phrase with the number of unusable files, or an empty text."""
+        """Return a phrase with the number of unusable files. Return an empty text if all files are usable."""
         if not self.left_out:
             return ""
         number = len(self.left_out)
@@ -143,7 +144,7 @@ class StoredNights:
 
 
 def opened(directory: Path) -> Path:
-    """Create the directory if it does not exist. Raises RunDirectoryError if that is impossible."""
+    """Create the directory if it does not exist. Raises RunDirectoryError if this is impossible."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -152,9 +153,7 @@ def opened(directory: Path) -> Path:
 
 
 def keep(record: MatrixRecord, directory: Path) -> None:
-    """Store a finished night. Nothing changes if it is stored already. Raises MachineError if the file cannot be
-    written.
-    """
+    """Store a finished night. Do nothing if it is already stored. Raises MachineError if the file cannot be written."""
     if record.outcome != "completed":
         return
     path = directory / f"{re.sub('[^0-9TZ]', '', record.started_at)}.json"

@@ -2,7 +2,8 @@
 differences.
 
 A run of the variant and a run of the original with the same seed have the same blocks, losses and faults. The page
-therefore shows means of differences between pairs, whose intervals are narrower than those of two independent means.
+therefore shows the mean differences of these pairs. Their confidence intervals are narrower than those of two
+independent means.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +25,7 @@ SIGNIFICANT_DIGITS = 4
 
 @dataclass(frozen=True)
 class ComparedValue:
-    """A kind of value that is compared for each pair of runs. `of` returns None if a run does not determine it."""
+    """A kind of value that is compared for each pair of runs. `of` returns None if the value of a run is unknown."""
 
     label: str
     of: Callable[[Run], float | None]
@@ -77,7 +78,7 @@ class ComparisonRow:
     variant: float | None
     difference: Estimate
     differing: list[int]
-    """Seeds whose pair differs."""
+    """Seeds whose two runs differ."""
 
     def to_json(self) -> dict[str, Any]:
         return {

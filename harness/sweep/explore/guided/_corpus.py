@@ -7,8 +7,8 @@ findings/      the smallest scenario of each finding
 nights/        the results of each night, as JSON
 report.html    the last night
 
-Any user may have written these files. A file that does not fit the corpus is reported and left out. No file can choose
-the program of an agent.
+The files may come from any user. A file that does not match the corpus is reported and omitted. No file can choose the
+program of an agent.
 """
 
 import fcntl
@@ -35,7 +35,7 @@ from ucp.plain_file import open_plain_file, parse_json, read_plain_file
 
 SCHEMA = "ucp-corpus/1"
 MOST_BYTES = 256 * 1024
-"""Maximum size of a file of a kept run."""
+"""Maximum size in bytes of the file of a stored run."""
 MOST_FINDINGS = 500
 MOST_NIGHTS = 400
 MOST_STATES = 10**12
@@ -58,7 +58,7 @@ CHANGED = frozenset(
         "name",
     )
 )
-"""Keys in which a run may differ from the scenario of the corpus. None of them affects this machine."""
+"""Scenario keys in which a stored run may differ from the scenario of the corpus. None of them affects this machine."""
 LONGEST_S = 3600.0
 _NAME = re.compile(r"[0-9a-f]{12}-seed-(\d{1,10})\.yaml")
 Text = Annotated[str, Field(max_length=500)]
@@ -80,7 +80,7 @@ class Finding(BaseModel):
     first: NightName
     last: NightName
     words: Annotated[list[Text], Field(max_length=20)] = []
-    """Evidence lines."""
+    """Lines of text with the evidence for the finding."""
 
     @property
     def identity(self) -> FindingIdentity:
@@ -88,7 +88,7 @@ class Finding(BaseModel):
 
     @property
     def file(self) -> str:
-        """The name of the file with its scenario."""
+        """The name of the file with the scenario of the finding."""
         digest = sha256(repr((self.key, self.verdict, self.handler, self.shape)).encode()).hexdigest()[:8]
         slug = re.sub(r"[^a-z0-9]+", "_", f"{self.key} {self.verdict} {self.handler}".lower()).strip("_")[:60]
         return f"{slug}_{digest}.yaml"
@@ -103,7 +103,7 @@ class _FindingsFile(BaseModel):
 
 @dataclass
 class Corpus:
-    """An open corpus directory (stored scenarios and findings), locked against other commands. `left_out` has a
+    """An open corpus directory (stored scenarios and findings), locked against other commands. `left_out` contains a
     sentence for each unused file.
     """
 
@@ -175,7 +175,7 @@ class Corpus:
         return path
 
     def write_night(self, began: str, document: dict[str, Any], page: Callable[[list[dict[str, Any]]], str]) -> Path:
-        """Store the results of a night, and write the page about all nights."""
+        """Store the results of this night, and write the page about all nights."""
         name = re.sub("[^0-9TZ]", "", began)
         path = self.directory / "nights" / f"{name}.json"
         self._checked_write(lambda path: write_json_atomically(path, document), path)
@@ -225,7 +225,8 @@ class Corpus:
 def opened(directory: Path, scenario: Scenario, limits: MutationLimits) -> Corpus:
     """Open a directory of stored scenarios and findings (corpus). Create it if it does not exist.
 
-    Raises RunDirectoryError if it is no corpus, is the corpus of another scenario, or is used by another command.
+    Raises RunDirectoryError if the directory is no corpus, is the corpus of another scenario, or is in use by another
+    command.
     """
     base, path = document_of(scenario), directory / "corpus.json"
     try:
@@ -253,7 +254,7 @@ def opened(directory: Path, scenario: Scenario, limits: MutationLimits) -> Corpu
 
 
 def check_fits(document: Any, base: Document, limits: MutationLimits) -> Document:
-    """Return the document if changes of the base scenario can produce it. Raises ScenarioError if they cannot."""
+    """Return the document if changes of the base scenario can produce it. Otherwise raise ScenarioError."""
     if not isinstance(document, dict):
         raise ScenarioError("it is no scenario")
     document = {"agents": base["agents"], **document}
@@ -272,8 +273,8 @@ def check_fits(document: Any, base: Document, limits: MutationLimits) -> Documen
 
 
 def _is_part(value: Any, whole: Any) -> bool:
-    """Return true if `value` equals `whole`, or is a mapping that contains only entries of `whole`. A scenario with
-    fewer agents has fewer entries.
+    """Return true if `value` equals `whole`, or is a mapping that contains only entries of `whole`. For example, a
+    scenario with fewer agents has fewer entries.
     """
     if isinstance(value, dict) and isinstance(whole, dict):
         return all(_is_part(part, whole.get(key)) for key, part in value.items())

@@ -1,4 +1,4 @@
-"""Identify a finding independently of the run: by verdict, handler, and form of the endless cycle."""
+"""Identify a finding independently of the run: by its verdict, its handler, and the form of its endless cycle."""
 
 import dataclasses
 from collections import Counter, defaultdict
@@ -15,18 +15,20 @@ from ucp.agent import ON_TIMER
 from ucp.settings import Settings
 
 CAUSED_BY_LIVELOCK = frozenset(("5", "6"))
-"""Characteristics that every livelock violates, because agents in a livelock commit no more blocks."""
+"""Characteristics that every livelock violates, because agents in a livelock commit no further blocks."""
 TIMERS = {ON_TIMER[timer].name: timer for timer in ("voting", "phase one", "phase two", "phase three")}
-"""Handler that runs at the end of a timer -> the timer."""
+"""Handler of a timer expiry -> the timer."""
 ORDER = [*TIMERS.values()]
 MAX_FORM = 250
-"""Maximum number of characters of a described cycle. A longer description is left out."""
+"""Maximum number of characters in the description of a cycle. A longer description is omitted."""
 SIZE_SETTINGS = frozenset(("max_block_bytes", "max_event_bytes"))
 
 
 @dataclass(frozen=True, order=True)
 class FindingIdentity:
-    """The identity of a finding. `key` is the key of a check. `handler` is empty if the evidence names no handler."""
+    """The identity of a finding. `key` is the key of the check with a bad verdict. `handler` is empty if the evidence
+    names no handler.
+    """
 
     key: str
     verdict: str
@@ -41,7 +43,7 @@ class FindingIdentity:
 def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple[FindingIdentity, ...]:
     """Return the identity of the finding that each bad verdict shows.
 
-    Settings that differ from the thesis are part of the shape.
+    The identity includes the settings that differ from the thesis.
     """
     settings = _changed_settings(scenario.settings)
     return tuple(
@@ -79,8 +81,7 @@ def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) 
 
 
 def _form(cycle: Cycle) -> list[str]:
-    """Return the sequences of timers that agents repeat in the endless cycle. Each different sequence occurs once in
-    the result.
+    """Return the sequences of timers that agents repeat in the endless cycle. Equal sequences occur once in the result.
 
     `prove` compares livelocks in the same way.
     """
@@ -92,7 +93,7 @@ def _form(cycle: Cycle) -> list[str]:
 
 
 def _one_repetition(pattern: Sequence[str]) -> Sequence[str]:
-    """Return one repetition of a sequence of timers. The repetition starts with the vote if there is one."""
+    """Return one repetition of a sequence of timers. It starts with the vote timer if the sequence contains it."""
     length = len(pattern)
     divisors = (part for part in range(1, length + 1) if length % part == 0)
     once = next(part for part in divisors if [*pattern[:part]] * (length // part) == pattern)

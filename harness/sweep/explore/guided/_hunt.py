@@ -1,7 +1,7 @@
-"""Search for new behaviour: change scenarios at random, play them, and keep those whose runs reach something new.
+"""Search for new behaviour: change scenarios at random, play them, and keep those whose runs reach new states.
 
-The hunt proceeds in rounds. A round depends only on the documents that were kept before it and on the random draws. It
-does not depend on speed, so any number of processes gives the same result.
+The hunt proceeds in rounds. A round depends only on the documents that were stored before it and on the random draws,
+and not on the speed of the machine. Any number of processes therefore gives the same result.
 """
 
 from collections import Counter
@@ -30,11 +30,13 @@ from harness.sweep.explore.guided._hunt_trial import (
 from harness.sweep.explore.guided._mutation import MutationLimits, mutate
 
 BITS = 1 << 28
-"""Size of the bit field (32 MiB). With ten million numbers, one new number in about 30 counts as known."""
+"""Size of the bit field in bits (32 MiB). With ten million numbers in it, about one new number in 30 is mistaken for a
+known one.
+"""
 
 
 class DigestSet:
-    """A set of numbers as a bit field. `count` is a lower limit for the number of its members."""
+    """A set of numbers, stored as a bit field. `count` is a lower limit for the number of its members."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -54,12 +56,12 @@ class DigestSet:
 ROUND = 64
 """Number of runs in a round."""
 MOST_KEPT = 3000
-"""Maximum number of kept documents. The least worthwhile ones are dropped first."""
+"""Maximum number of stored documents. Above it, the documents with the lowest expected benefit are removed."""
 MOST_FAILED = 100
 MAX_PATTERNS = 100_000
-"""Maximum number of stored patterns of failed votes (50 MB). Further patterns do not count as new."""
+"""Maximum number of stored patterns of failed votes, which take 50 MB. Further patterns do not count as new."""
 WORTH_OF_PATTERN = 100
-"""Number of local states that a new pattern of failed votes counts for."""
+"""Number of new local states that a new pattern of failed votes is worth."""
 NEWEST = 24
 NEAR_LIVELOCK = 0.6
 SEEDS = 1 << 16
@@ -81,14 +83,14 @@ class CandidateRun(NamedTuple):
 @dataclass
 class KeptRun:
     """A stored scenario document. Its run has `steps` handler runs and reached `new_states` new agent states. A new
-    pattern of failed votes counts as several new states.
+    pattern of failed votes counts as WORTH_OF_PATTERN new states.
     """
 
     candidate: CandidateRun
     new_states: int
     steps: int
     failed: int
-    """Number of successive failed votes in a new pattern."""
+    """Number of successive failed votes in the run's pattern, if the pattern was new."""
     timers_ended_s: tuple[float, ...]
     picked: int = 0
 
@@ -137,23 +139,25 @@ class Hunt:
     reached: ReachedStates = field(default_factory=ReachedStates)
     states_overflow: DigestSet = field(default_factory=DigestSet)
     pairs_overflow: DigestSet = field(default_factory=DigestSet)
-    """Digests of further coverage after `reached` is full."""
+    """Digests of the pairs (state, input) that were reached after `reached` was full."""
     kept: list[KeptRun] = field(default_factory=list)
     runs: int = 0
     found: dict[FindingIdentity, CandidateRun] = field(default_factory=dict)
-    """Findings, with the first run that showed each."""
+    """Findings, each with the first run that showed it."""
     shown: Counter[FindingIdentity] = field(default_factory=Counter)
     """Number of runs that showed each finding."""
     unfinished: int = 0
-    """Number of runs in which nothing is wrong, and the swarm only needed more time."""
+    """Number of runs without a bad result in which the swarm only needed more time."""
     failures: int = 0
     failed: list[tuple[CandidateRun, str]] = field(default_factory=list)
-    """The first runs without a verdict, with the reason. `failures` counts all of them."""
+    """The first runs without a verdict, each with the reason. `failures` counts all such runs."""
     _dropped: list[CandidateRun] = field(default_factory=list)
     _known_divergences: set[Divergence] = field(default_factory=set)
-    """Known differences of chains at rest. The first run of each is played again with a final reconcile."""
+    """Known differences between the chains of an idle swarm. The first run with each difference is played again with a
+    final reconcile.
+    """
     _known_patterns: set[TimerPatterns] = field(default_factory=set)
-    """Known patterns of failed votes. The first run of each is kept."""
+    """Known patterns of failed votes. The first run with each pattern is stored."""
     _to_reconcile: list[CandidateRun] = field(default_factory=list)
 
     def begin(self, candidates: Iterable[CandidateRun], jobs: int) -> Iterator[tuple[CandidateRun, bool]]:
@@ -194,8 +198,8 @@ class Hunt:
                     yield candidate, self._learn(candidate, outcome)
 
     def _learn(self, candidate: CandidateRun, news: NewCoverage) -> bool:
-        """Add the results of a run. Return true if the run reached a new agent state, a new input in a state, a new
-        branch, or a new pattern of failed votes.
+        """Add the results of a run to the coverage. Return true if the run reached a new agent state, a new input in a
+        state, a new branch, or a new pattern of failed votes.
         """
         self.unfinished += news.unfinished
         for identity in news.found:
@@ -249,7 +253,7 @@ class Hunt:
         """Choose a stored document. Half of the choices are among the newest documents, and the others prefer a high
         expected benefit.
 
-        `worth` holds cumulative sums.
+        `worth` contains cumulative sums of the expected benefits.
         """
         if self.rng.random() < 0.5:
             return self.rng.choice(self.kept[-NEWEST:])
@@ -261,7 +265,7 @@ class Hunt:
 
 
 def _count_new(numbers: Iterable[int], exact: Collection[int], overflow: DigestSet) -> int:
-    """Return how many of the numbers are in neither collection. If `exact` is full, add these new numbers to
+    """Return how many of the numbers are in neither collection. If `exact` is full, add the new numbers to
     `overflow`.
     """
     new = [number for number in numbers if number not in exact and number not in overflow]

@@ -1,7 +1,8 @@
 """Play one run of a search, and return its coverage, its findings and the timers that expired in it.
 
-The liveness phase clears all conditions and logs no more events. The swarm must then become idle. If it has several
-chains at that time, the run may be played again with a final reconcile, after which there must be one chain.
+In the liveness phase at the end of the run, all network conditions are removed and agents log no more events. The swarm
+must then become idle. If it has several different chains, the run may be played again with a final reconcile, after
+which all chains must be equal.
 
 In a livelock, agents repeat a pattern of failed votes forever. The hunt prefers runs with long patterns of failed
 votes, because they are close to a livelock.
@@ -35,10 +36,10 @@ from ucp.trigger import TimerTrigger
 
 APPROVED = (ON_TIMER["voting"].name, "approved")
 MOST = 16
-"""Maximum number of timers in a pattern. Only the last ones are kept."""
+"""Maximum number of timers in a pattern. Only the last timers are kept."""
 
 TimerPatterns = tuple[tuple[str, ...], ...]
-"""The timers that ended, in order, for each agent."""
+"""The timers of each agent that expired, in order."""
 
 
 class TimerEnd(NamedTuple):
@@ -52,7 +53,7 @@ class TimerEnd(NamedTuple):
 
 
 def timers_ended(evidence: Evidence) -> list[TimerEnd]:
-    """Return the timer expiries of all agents in order of time."""
+    """Return the timer expiries of all agents, in order of time."""
     return sorted(
         TimerEnd(run.t, agent_id, run.trigger.timer, run.handler, run.branch)
         for agent_id, trace in evidence.traces.items()
@@ -62,8 +63,8 @@ def timers_ended(evidence: Evidence) -> list[TimerEnd]:
 
 
 def failed_votes(timer_ends: Iterable[TimerEnd]) -> TimerPatterns:
-    """Return the longest sequence of expired timers without an approved vote, divided by agent. Return none if fewer
-    than two votes failed in it.
+    """Return the longest sequence of timer expiries without an approved vote, divided by agent. The result is empty if
+    fewer than two votes failed in it.
     """
     longest: Sequence[TimerEnd] = ()
     for approved, stretch in groupby(timer_ends, lambda each: (each.handler, each.branch) == APPROVED):
@@ -78,17 +79,21 @@ def failed_votes(timer_ends: Iterable[TimerEnd]) -> TimerPatterns:
 
 
 MOST_BLOCKS = 12
-"""Maximum number of blocks of a run. With many blocks, the states of every run are new, so novelty means nothing."""
+"""Maximum number of blocks of a run. With more blocks, nearly every run reaches new states, so new states would say
+nothing about the value of a run.
+"""
 LAST_S = 240.0
-"""Minimum of the mission second up to which blocks are completed."""
+"""Lower limit for the mission second up to which blocks are completed."""
 CLEARED_S = 0.001
-"""Seconds before the end of the mission at which conditions are cleared."""
+"""Number of seconds before the end of the mission at which network conditions are removed."""
 LONGEST_GAP_S = 40.0
-"""Maximum seconds between two events. A round of votes and reconciles ends within this time."""
+"""Maximum number of seconds between two events. A vote and a reconcile end within this time."""
 
 
 Divergence = tuple[tuple[int, int], ...]
-"""Pairs for each chain, sorted: number of agents that hold it, and number of its blocks outside the mutual chain."""
+"""The differences between chains. For each different chain: the number of agents that hold it, and the number of its
+blocks after the mutual chain. The pairs are sorted.
+"""
 
 
 @dataclass(frozen=True)
@@ -98,13 +103,13 @@ class PlayedRun:
     reached: ReachedStates
     found: tuple[FindingIdentity, ...]
     divergence: Divergence | None = None
-    """The difference of the chains at rest, in a run without a final reconcile."""
+    """The differences between the chains of the idle swarm, for a run without a final reconcile."""
     timers_ended_s: tuple[float, ...] = ()
-    """Times at which timers ended before the liveness phase, in order."""
+    """Times of the timer expiries before the liveness phase, in order."""
     failed_votes: TimerPatterns = ()
     """The longest pattern of failed votes in the liveness phase."""
     unfinished: bool = False
-    """True if nothing is wrong in the run, and the swarm only needed more time."""
+    """True if the run has no bad result but the swarm needed more time."""
 
 
 @gc_paused()
@@ -186,7 +191,7 @@ def _until(fate: Document, ends_s: float) -> Document:
 
 
 def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[MutationLimits, list[tuple[Document, int]]]:
-    """Return the limits for changes, and short documents with which the search can begin."""
+    """Return the limits for changes, and short documents with which the search begins."""
     initial, last_s = [], LAST_S
     for seed in seeds:
         completing = [event for event in record(scenario, seed).logged if event.completes]
@@ -197,15 +202,17 @@ def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[Mutatio
 
 
 def _as_json(document: Document) -> Document:
-    """Return the document as it is after writing and reading a JSON file. Keys that are numbers become text."""
+    """Return the document in the form that it has after it was written to a JSON file and read again. Keys that are
+    numbers become text.
+    """
     copy: Document = json.loads(json.dumps(document))
     return copy
 
 
 def _initial_document(scenario: Scenario, completing: Sequence[RecordedEvent]) -> Document:
-    """Return a document in which one event completes each of these blocks.
+    """Return a document in which each of these blocks is completed by a single event.
 
-    Everything else is as in the scenario up to then. Losses and latencies are still random.
+    All other parts come from the scenario. Losses and latencies stay random.
     """
     document = document_of(scenario)
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes

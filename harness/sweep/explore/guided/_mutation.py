@@ -1,7 +1,7 @@
 """Change a scenario at random: times, agents, network, single messages and settings.
 
-A change takes a document and returns another, which may be an invalid scenario. The caller finds out by playing it. All
-random draws come from `rng`, so equal generators make equal changes.
+A change takes a document and returns a new document. The result may be an invalid scenario, which the caller detects
+when it plays the scenario. All random numbers come from `rng`, so equal generators make equal changes.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,29 +15,39 @@ from ucp.settings import CHOICES, Settings
 
 MOST_FATES = 12
 MOST_ENTRIES = 6
-"""Maximum number of entries in the timeline."""
+"""Maximum number of entries in the timeline of a changed scenario."""
 ALIGN_PROBABILITY = 0.6
 AFTER_LAST_S = 30.0
-"""Seconds between the last event and the end of a changed scenario. A vote and a reconcile end within this time."""
+"""Number of seconds between the last event and the end of a changed scenario. A vote and a reconcile end within this
+time.
+"""
 FEW_BLOCKS = 4
 MESSAGES = get_args(MessageName)
 READINGS = {name: choice.values[1:] for name, choice in CHOICES.items() if choice.is_reading}
-"""Settings that choose a reading of the thesis -> their values except the default."""
+"""Settings that choose an interpretation of the thesis -> their values other than the default."""
 TIMERS_S = tuple(
     getattr(Settings(), name) for name in ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s")
 )
 NEAR_S = 0.03
-"""Maximum distance between two moments at which a message of the first can arrive after the second."""
+"""Maximum number of seconds between two moments at which a message that was sent at the first can arrive after the
+second.
+"""
 DELAYS_S = (0.0, 0.06, 0.2, 1.0, 4.99, 5.02, 9.99, 10.02, 15.0, 20.0)
-"""Delays of single messages: longer than the next message, than a timer, or than a round."""
+"""Delays of single messages in seconds. They let the message arrive after the next message, after a timer expiry, or
+after a whole round.
+"""
 LATE_S = (0.001, 0.01, 0.03, 0.06, 0.2, 0.5)
-"""Delays of timers: longer than a message or another timer. The largest is within the limits of a correct machine."""
+"""Delays of timers in seconds. They let the timer expire after a message or another timer. The longest one is within
+the limits for a correct machine.
+"""
 
 Change = Callable[[Document, Random], Document]
 
 
 class MutationLimits(NamedTuple):
-    """The agents that may take part, the maximum number of blocks, and the latest time of a block."""
+    """The limits of changes: the agents that may take part, the maximum number of blocks, and the latest time of a
+    block.
+    """
 
     roster: Sequence[int]
     blocks: int
@@ -47,9 +57,9 @@ class MutationLimits(NamedTuple):
 def mutate(
     document: Document, other: Document, limits: MutationLimits, rng: Random, timers_ended_s: Sequence[float] = ()
 ) -> Document:
-    """Return a document with one to eight random changes, sometimes combined with parts of `other`.
+    """Return the document with one to eight random changes. Some changes take parts of `other`.
 
-    `timers_ended_s` are times at which timers ended in the document's run.
+    `timers_ended_s` contains the times of timer expiries in the document's run.
     """
     if timers_ended_s and rng.random() < ALIGN_PROBABILITY:
         document = _align_with_timer(document, timers_ended_s, rng)
@@ -120,7 +130,7 @@ def _align_two_events(document: Document, rng: Random) -> Document:
 
 
 def _align_with_timer(document: Document, timers_ended_s: Sequence[float], rng: Random) -> Document:
-    """Move events to the expiry of a timer: new events of some agents, one event, or all later events."""
+    """Move events to the time of a timer expiry: new events of some agents, one event, or all later events."""
     moment = rng.choice(timers_ended_s)
 
     def near() -> float:
@@ -181,7 +191,7 @@ def _retarget_fate(document: Document, rng: Random) -> Document:
 
 
 def _with_target(fate: Document, which: Document) -> Document:
-    """Return a delivery rule that has the effect of `fate`, but on randomly chosen messages."""
+    """Return a delivery rule with the effect of `fate` that applies to randomly chosen messages."""
     return {**which, **{key: fate[key] for key in ("drop", "delay_s") if key in fate}}
 
 
@@ -299,7 +309,7 @@ def _change_duplication(document: Document, rng: Random) -> Document:
 
 
 def _change_clock(document: Document, rng: Random) -> Document:
-    """Set an agent's clock to a time that differs from the other clocks, so that its blocks look older or younger."""
+    """Set an agent's clock to a time that differs from the other clocks, so that its blocks seem older or younger."""
     clocks = dict(document.get("clocks", {}))
     agent = str(rng.choice(document["agents"]))
     clocks.pop(agent, None)
@@ -323,8 +333,8 @@ def _change_agents(document: Document, roster: Sequence[int], rng: Random) -> Do
 
 
 def _splice(document: Document, other: Document, rng: Random) -> Document:
-    """Replace randomly chosen parts of a document by those of another one: delivery rules, timeline, lateness, network,
-    clocks, settings or events.
+    """Replace randomly chosen parts of a document by those of another document: delivery rules, timeline, lateness,
+    network, clocks, settings or events.
     """
     if document["agents"] != other["agents"]:
         return document

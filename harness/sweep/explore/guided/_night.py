@@ -1,6 +1,6 @@
-"""Spend a night on the search: replay known findings, then continue from the stored runs until the time is over.
+"""Spend a night on the search: play known findings again, then continue from the stored runs until the time is over.
 
-An interruption loses only the runs in progress, because new coverage and findings are written at once.
+New coverage and findings are written at once, so an interruption loses only the runs in progress.
 """
 
 import resource
@@ -36,21 +36,21 @@ Status = Literal["new", "resolved", "rare", "ongoing"]
 
 SCHEMA = "ucp-exploration/1"
 INITIAL_RUNS = 4
-"""Number of runs of the scenario from which the first documents are made."""
+"""Number of runs of the scenario from which the first documents are created."""
 SEEDS = 20
-"""Number of seeds with which a finding is played, to measure how often it appears."""
+"""Number of seeds with which a finding is played, to measure how often it occurs."""
 RARE = 0.5
-"""A finding that appears with a smaller share of the seeds is rare."""
+"""Limit for rare findings. A finding that occurs with a smaller share of the seeds is rare."""
 SHRINKING_RUNS = 400
 MOST_AGENTS, MOST_BLOCKS = 3, 3
-"""Bounds of the states that coverage is compared with: numbers of agents and blocks."""
+"""Numbers of agents and blocks of the proof with whose states the coverage is compared."""
 SAMPLES = 200
 
 
 @dataclass(frozen=True)
 class NightProgress:
-    """Functions that report progress. `on_progress` gets the numbers of runs, agent states and findings, and `on_event`
-    a text.
+    """Functions that report the progress. `on_progress` receives the numbers of runs, agent states and findings.
+    `on_event` receives a text.
     """
 
     on_progress: Callable[[int, int, int], None] = lambda runs, states, findings: None
@@ -59,7 +59,7 @@ class NightProgress:
 
 @dataclass
 class NightFinding:
-    """A finding and its status in this night. `shown` of `of` seeds showed the finding."""
+    """A finding and its status in this night. The finding occurred with `shown` of `of` seeds."""
 
     finding: Finding
     status: Status
@@ -69,7 +69,7 @@ class NightFinding:
 
     @property
     def replay(self) -> str | None:
-        """The command that plays the finding again. None if there is no such command."""
+        """The command that plays the finding again. None if no command can."""
         return None if self.path is None else f"ucp-harness run {self.path} --backend sim --seed {self.finding.seed}"
 
     def to_json(self) -> dict[str, Any]:
@@ -86,7 +86,7 @@ class NightFinding:
 
 @dataclass
 class NightResult:
-    """The results of a night. `growth` contains pairs of a number of runs and the number of agent states known after
+    """The results of a night. Each element of `growth` is a number of runs, and the number of agent states known after
     them.
     """
 
@@ -104,7 +104,7 @@ class NightResult:
     report: Path | None = None
 
     def grow(self) -> None:
-        """Add a pair to `growth`. In a long night, only every second, fourth or eighth run is stored."""
+        """Add an element to `growth`. In a long night, only every second, fourth or eighth one is stored."""
         self.growth.append((self.hunt.runs, self.hunt.local_states))
         if len(self.growth) > 2 * SAMPLES:
             del self.growth[1::2]
@@ -167,7 +167,7 @@ def spend(
 
 
 class _NightRun:
-    """Carries out the search of one night."""
+    """The execution of the search in one night."""
 
     def __init__(
         self,
@@ -204,7 +204,7 @@ class _NightRun:
         return night
 
     def _replay(self) -> None:
-        """Replay known findings, and count the seeds with which they appear."""
+        """Play known findings again, and count the seeds with which they occur."""
         for identity, finding in self._known.items():
             document = self._corpus.scenario_of(finding)
             if document is None:
@@ -223,9 +223,9 @@ class _NightRun:
             return sum(outcome is True for _, outcome in outcomes), len(seeds)
 
     def _hunt(self, initial: list[CandidateRun]) -> None:
-        """Continue the search from the runs that the corpus contains.
+        """Continue the search from the runs in the corpus.
 
-        Runs that reach nothing new any more are dropped, if there was time to play all of them.
+        If there was time to play all of them, runs that reach no new states any more are removed.
         """
         hunt, before = self._night.hunt, self._corpus.runs()
         kept = set(map(id, self._kept_runs(hunt.begin([*initial, *before], self._jobs))))
@@ -246,7 +246,7 @@ class _NightRun:
         return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
 
     def _kept_runs(self, runs: Iterator[tuple[CandidateRun, bool]]) -> Iterator[CandidateRun]:
-        """Yield the runs to store. Each of these runs and each new finding is written at once."""
+        """Yield the runs to store. The method writes each of these runs and each new finding at once."""
         night, hunt = self._night, self._night.hunt
         for candidate, is_kept in runs:
             night.grow()

@@ -20,7 +20,7 @@ MOST_BRANCHES = 100
 def to_html(night: dict[str, Any], nights: Sequence[dict[str, Any]]) -> str:
     """Return the page about a night as HTML.
 
-    `night` is the night's JSON, and `nights` holds that of all stored nights, including this one.
+    `night` is the JSON of this night. `nights` contains the JSON of all stored nights, including this one.
     """
     last = list(nights)[-MOST_NIGHTS:]
     return html.render(
@@ -52,7 +52,7 @@ def unfinished_in_words(runs: int) -> str:
 
 
 def headline(night: dict[str, Any]) -> str:
-    """Return the headline: numbers of findings by status, of runs, and of agent states."""
+    """Return the headline of the page: the numbers of findings by status, of runs, and of agent states."""
     counts = dict.fromkeys(("new", "ongoing", "rare", "resolved"), 0)
     for finding in night["findings"]:
         counts[finding["status"]] += 1

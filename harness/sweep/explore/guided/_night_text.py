@@ -12,7 +12,9 @@ from harness.sweep.explore.guided._night_page import unfinished_in_words
 
 REDRAW_EVERY_S = 0.1
 FIRST_LINE_S, LINES_GROW, LONGEST_S = 10.0, 1.5, 600.0
-"""Without a terminal, the seconds before the first line, the growth of this interval, and its maximum."""
+"""Intervals of progress lines without a terminal: seconds before the first line, the factor by which the interval
+grows, and its maximum in seconds.
+"""
 CLEAR_LINE = "\r\x1b[2K"
 
 
@@ -20,7 +22,7 @@ CLEAR_LINE = "\r\x1b[2K"
 def watching(console: Console) -> Iterator[NightProgress]:
     """Yield functions that print the progress of a night.
 
-    On a terminal, the progress is one line that is redrawn. Elsewhere it is a line at growing intervals.
+    On a terminal, the progress is one line that changes. Other outputs get lines at growing intervals.
     """
     began = last = time.monotonic()
     every_s = REDRAW_EVERY_S if console.is_terminal else FIRST_LINE_S

@@ -1,7 +1,7 @@
 """Write the report of a matrix: one HTML file that loads no other files and runs no script.
 
-`_matrix_page` lays it out. It shows a heatmap of a figure, the trend over the nights, and the runs of each cell with
-the command that plays one of them again.
+`_matrix_page` lays it out. The report shows a heatmap of a numeric result, its trend over the nights, and the runs of
+each cell with a command that plays one of them again.
 """
 
 from harness.sweep.matrix.report._matrix_page import to_html

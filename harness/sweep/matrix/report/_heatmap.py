@@ -1,8 +1,8 @@
 """Draw heatmaps of numeric results over the values of a matrix, and the menu from which a reader chooses a numeric
 result.
 
-The shade grows with the figure. All shades have one hue, so they can be distinguished with any colour vision. Each cell
-also shows its number. Violations, failures and changes have a sign and a text.
+Larger values have darker or lighter shades of one hue, which can be distinguished with any colour vision. Each cell
+also shows its value. Violations, failures and changes have a sign and a text.
 """
 
 from collections.abc import Iterable
@@ -52,7 +52,7 @@ class HeatmapFigure:
 
 
 def known_figures(cells: Iterable[Cell]) -> list[HeatmapFigure]:
-    """Return the numeric results that at least one run determined. Those from before the final reconcile come first.
+    """Return the numeric results that are known for at least one run. Those from before the final reconcile come first.
 
     "violated" is always included.
     """
@@ -91,7 +91,7 @@ class TileMark:
 
 @dataclass(frozen=True, slots=True)
 class HeatmapTile:
-    """A tile of the heatmap. `shade` is None for an unknown value, and `href` is None without runs."""
+    """A tile of the heatmap. `shade` is None for an unknown value, and `href` is None for a cell without runs."""
 
     shade: int | None
     mean: str

@@ -38,7 +38,7 @@ _STYLE, _GROWTH_STYLE = (_TEMPLATE.with_name(f"{name}.css").read_text(encoding="
 def to_html(finished: Finished, directory: Path, nights: StoredNights | None = None) -> str:
     """Return the page as HTML.
 
-    `directory` will contain the page and the kept runs. `nights` includes this one, if it is finished.
+    `directory` will contain the page and the kept runs. `nights` includes this night if it is finished.
     """
     record = finished.record
     shown = _heatmap.known_figures(record.cells)
@@ -85,7 +85,9 @@ def to_html(finished: Finished, directory: Path, nights: StoredNights | None = N
 
 
 def _changed(record: MatrixRecord) -> Iterator[tuple[str, ChangedRuns, str]]:
-    """Yield, for each cell with changed runs, its name, these runs, and a command that compares one in detail."""
+    """Yield an entry for each cell with changed runs: its name, these runs, and a command that compares one of them in
+    detail.
+    """
     against = record.against
     for changed in against.changed_runs if against else ():
         before = against.baseline_commit if against else None
@@ -95,8 +97,8 @@ def _changed(record: MatrixRecord) -> Iterator[tuple[str, ChangedRuns, str]]:
 
 
 def _choosing(shown: list[_heatmap.HeatmapFigure]) -> str:
-    """Return the CSS that hides, on a screen, the heatmaps of all numeric results except the chosen one. On paper, all
-    heatmaps are shown.
+    """Return the CSS that shows only the heatmaps of the chosen numeric result on a screen. On paper, all heatmaps are
+    shown.
     """
     others = [
         f"main:has(#show-{figure.metric.name}:checked) {{}} .figure:not(.of-{figure.metric.name})" for figure in shown

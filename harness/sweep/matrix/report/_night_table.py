@@ -1,4 +1,4 @@
-"""The table of cells and nights. Each field shows whether that night had violations or changes in that cell."""
+"""Create the table of cells and nights. Each field shows whether the cell had violations or changes in this night."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from harness.sweep.matrix.matrix_table import name_of, violated
 
 @dataclass(frozen=True, slots=True)
 class NightColumn:
-    """The heading of a night: its date, and the commit of the code."""
+    """The heading of the column of a night: its date, and the commit of the code."""
 
     date: str
     commit: str
@@ -20,7 +20,7 @@ class NightColumn:
 
 @dataclass(frozen=True, slots=True)
 class NightCell:
-    """The state of a cell in a night: a short sign, all facts in words, and a CSS class."""
+    """The state of a cell in one night: a short sign, all facts as text, and a CSS class."""
 
     sign: str
     in_words: str

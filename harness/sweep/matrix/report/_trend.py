@@ -1,7 +1,7 @@
 """Draw a numeric result over several nights, in a small chart for each loss rate, number of agents and backend.
 
-Dots and lines are means, and bands are 95 % intervals. Each panel has its own scale, because only changes matter here.
-Each step to the right is one night.
+Dots and lines are means, and bands are 95 % intervals. Each chart has its own scale, because the trend shows changes
+and not absolute values. Each step to the right is one night.
 """
 
 import math
@@ -20,18 +20,20 @@ from harness.sweep.matrix.report._heatmap import HeatmapFigure
 
 COLUMNS, PANEL_HEIGHT, FOOT = 4, 158, 4
 MAX_DOTS = 12_000
-"""Maximum number of dots on a page. If there would be more, fewer nights are drawn."""
+"""Maximum number of dots on a page. If there were more, fewer nights would be drawn."""
 LARGEST = 1e12
-"""Upper limit of a plausible figure. Larger values in a file are ignored."""
+"""Upper limit of a plausible value. Larger values in a file are ignored."""
 
 
 def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures: int) -> Sequence[MatrixRecord]:
-    """Return the latest nights: at most as many as have `MAX_DOTS` dots together, but at least two."""
+    """Return the latest nights. Their number is limited so that all dots together are at most `MAX_DOTS`, but it is at
+    least two.
+    """
     return nights[-max(2, MAX_DOTS // max(1, len(tonight.cells) * figures)) :]
 
 
 def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: HeatmapFigure) -> list[tuple[str, Markup]]:
-    """Return a drawing for each number of agents and backend, with a name if there are several."""
+    """Return a drawing for each number of agents and backend. The drawings have names if there are several."""
     of_night = [{cell.point: figure.of(cell) for cell in night.cells} for night in nights]
     begun = [text.started(night.started_at)[:16] for night in nights]
     commits = [f"commit {night.versions.get('commit', 'unknown')}" for night in nights]
@@ -79,7 +81,9 @@ def _panel(
 
 
 def _value_axis(figure: HeatmapFigure, estimates: Sequence[Estimate], area: ChartArea) -> Axis:
-    """Return a vertical axis for all confidence intervals. Its minimum length makes small changes look small."""
+    """Return a vertical axis for all confidence intervals. The axis has a minimum length, so that small changes look
+    small.
+    """
     bounds = [
         bound for estimate in estimates for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None
     ]
