@@ -87,7 +87,7 @@ class TraceFile:
     def __init__(self, path: Path) -> None:
         self.problem: str | None = None
         self._file: BinaryIO = path.open("a+b", buffering=0)
-        end = _end_of_last_line(self._file)
+        end = end_of_last_line(self._file)
         if self._file.seek(0, os.SEEK_END) > end:
             self._file.truncate(end)
             self._file.seek(end)
@@ -120,7 +120,7 @@ def leave_space(file: BinaryIO) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def _end_of_last_line(file: BinaryIO) -> int:
+def end_of_last_line(file: BinaryIO) -> int:
     """Return the position after the last complete line of the file. Return 0 if no line is complete."""
     end = file.seek(0, os.SEEK_END)
     while end:

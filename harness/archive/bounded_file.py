@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel
 
+from harness.archive.packed_parts import has_packed_parts, packed_name
 from ucp.plain_file import check_weight, open_plain_file
 
 GZIP_MAGIC = b"\x1f\x8b"
@@ -23,7 +24,9 @@ _CHUNK_BYTES = 256 * 1024
 
 
 class BoundedFile(io.BufferedReader):
-    """The content of a file as a binary stream. If the file is gzip data, it is decompressed.
+    """The content of a file as a binary stream.
+
+    Gzip data is decompressed. The packed parts of a file (`harness.archive.packed_parts`) come from its gzip file.
 
     `problem` is the reason why the content ends early, or empty. It is known after the stream was read to its end.
     """
@@ -52,6 +55,7 @@ class _LimitedContent(io.RawIOBase):
         self._file = open_plain_file(path).detach()
         self.packed: bool = self._file.read(2) == GZIP_MAGIC
         self._file.seek(0)
+        self._parts = _PackedParts(packed_name(path))
         self._unpacker = _unpacker()
         self._input = b""
 
@@ -74,11 +78,23 @@ class _LimitedContent(io.RawIOBase):
     def close(self) -> None:
         if not self.closed:
             self._file.close()
+            self._parts.close()
         super().close()
 
     def _next(self, most: int) -> bytes:
         """Return up to `most` bytes of content, or no bytes at the end."""
-        return self._unpacked(most) if self.packed else self._file.read(most)
+        return self._unpacked(most) if self.packed else self._read(most)
+
+    def _read(self, most: int) -> bytes:
+        """Return up to `most` bytes of a file that is no gzip data. Its packed parts read as NUL."""
+        begin = self._file.tell()
+        data: bytes = self._file.read(most)
+        plain = data.find(b"\0")
+        if plain < 0 or not has_packed_parts(self._file.fileno()):
+            return data
+        part = data[:plain] or self._parts.read(begin, len(data) - len(data.lstrip(b"\0"))) or data
+        self._file.seek(begin + len(part))
+        return part
 
     def _unpacked(self, most: int) -> bytes:
         while not self.problem:
@@ -100,6 +116,38 @@ class _LimitedContent(io.RawIOBase):
             if data:
                 return data
         return b""
+
+
+class _PackedParts:
+    """The content of the gzip file with the packed parts of a growing file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: BoundedFile | None = None
+        self._position = 0
+
+    def read(self, begin: int, most: int) -> bytes:
+        """Return up to `most` bytes from the position `begin`. Return no bytes if the file lacks or damages them."""
+        if self._file is not None and self._file.problem:
+            self.close()  # parts were added while their file was read
+        try:
+            self._file = self._file or BoundedFile(self._path)
+        except OSError:
+            return b""
+        while self._position < begin and self._take(min(begin - self._position, _CHUNK_BYTES)):
+            pass
+        return self._take(most) if self._position == begin else b""
+
+    def _take(self, most: int) -> bytes:
+        assert self._file is not None, "the caller opened it"
+        data = self._file.read(most)
+        self._position += len(data)
+        return data
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        self._file, self._position = None, 0
 
 
 def _unpacker() -> Any:

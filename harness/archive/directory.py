@@ -29,11 +29,11 @@ from harness.archive.lag import LAG_FILE
 from harness.archive.run_listing import RUNS
 from harness.archive.run_record import RunRecord
 from harness.archive.trace_files import SUFFIX as TRACE_SUFFIX
+from harness.archive.trace_files import open_trace
 from harness.archive.tracks import TRACKS_FILE
 from harness.errors import MachineError, RunDirectoryError
 from netem.radio import Place
-from ucp.agent_files import write_json_atomically
-from ucp.plain_file import open_plain_file
+from ucp.agent_files import end_of_last_line, write_json_atomically
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -108,13 +108,11 @@ class RunDirectory:
         later = directory / f"{agent_id}{TRACE_SUFFIX}"
         if not later.exists():
             return 0
-        with open_plain_file(later) as file:
-            file.seek(copied_bytes)
-            added = file.read()
+        with open_trace(later) as file:
+            added = file.read()[copied_bytes:]
         added = added[: added.rfind(b"\n") + 1]
         with (self.agents / later.name).open("a+b") as trace:
-            trace.seek(0)
-            trace.truncate(trace.read().rfind(b"\n") + 1)
+            trace.truncate(end_of_last_line(trace))
             trace.write(added)
         return len(added)
 

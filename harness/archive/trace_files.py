@@ -1,18 +1,15 @@
-"""Find the traces of a run, read them, and compress large traces with gzip.
+"""Find the traces of a run, read them, and pack large traces with gzip.
 
-A trace of a process contains every received datagram, so the traces of a large swarm take gigabytes. After the run, the
-harness compresses them to about a sixth of this size. It does not compress them earlier, because agents must be able to
-append lines, and a killed agent must leave all of its lines. All readers accept both `7.trace.jsonl` and
-`7.trace.jsonl.gz`.
+A trace of a process contains every received datagram, so the traces of a large swarm take gigabytes. Packed, they take
+about a sixth. The harness packs finished parts during the run (`harness.archive.packed_parts`), and the rest after it.
+All readers take `7.trace.jsonl`, also if a part of it is packed, and `7.trace.jsonl.gz`.
 """
 
-import contextlib
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 from harness.archive.bounded_file import BoundedFile
-from ucp.plain_file import open_plain_file
+from harness.archive.packed_parts import can_free_parts, has_finished_part, pack_whole
 
 SUFFIX = ".trace.jsonl"
 PACKED_SUFFIX = f"{SUFFIX}.gz"
@@ -23,10 +20,7 @@ minutes.
 PACKED_FROM_BYTES = 64 * 1024 * 1024
 """Size of all traces of a run together, in bytes, from which they are compressed."""
 PACKED_SHARE = 1 / 6
-"""Size of a compressed trace, as a share of its original size."""
-_LEVEL = 1
-"""The compression level of gzip. Higher levels take three times as long and reduce the size by only a tenth."""
-_CHUNK_BYTES = 1024 * 1024
+"""Size of a packed trace, as a share of its content."""
 
 
 def trace_files(agents: Path) -> list[Path]:
@@ -48,37 +42,48 @@ def is_packed(path: Path) -> bool:
     return path.name.endswith(".gz")
 
 
+def has_rest(path: Path) -> bool:
+    """Return true if the file at `path` has only the packed parts of a trace, whose rest is in a plain file."""
+    return is_packed(path) and path.with_name(path.name.removesuffix(".gz")).exists()
+
+
 def open_trace(path: Path) -> BoundedFile:
     """Open a trace for reading, compressed or not. Raises OSError if `path` is not a regular file."""
     return BoundedFile(path, MAX_TRACE_BYTES)
 
 
+def packable_traces(agents: Path) -> list[Path]:
+    """Return the traces of an active run of which `pack_parts` can pack a part. The list is empty while all traces
+    together are small, and on a file system that cannot free parts.
+    """
+    traces = _plain_traces(agents)
+    if _are_small(traces) or not can_free_parts(agents):
+        return []
+    return [path for path in traces if has_finished_part(path)]
+
+
 def pack_traces(agents: Path, report_progress: Callable[[str], None]) -> None:
-    """Compress the traces of an ended run with gzip if their total size is large.
+    """Pack the traces of an ended run if their total size is large.
 
     Ctrl-C ends the compression, and the remaining traces stay uncompressed. A trace also stays uncompressed if the disk
     is full.
     """
-    plain = sorted(agents.rglob(f"*{SUFFIX}"))
-    if sum(path.stat().st_size for path in plain) < PACKED_FROM_BYTES:
+    traces = _plain_traces(agents)
+    if _are_small(traces):
         return
-    for number, path in enumerate(plain, 1):
-        packed = path.with_name(f".{path.name}.gz.tmp")
+    for number, path in enumerate(traces, 1):
         try:
-            report_progress(f"packing trace {number} of {len(plain)}")
-            _pack(path, packed)
-            packed.rename(path.with_name(f"{path.name}.gz"))
-            path.unlink()
-        except (OSError, KeyboardInterrupt) as error:
-            with contextlib.suppress(OSError):
-                packed.unlink(missing_ok=True)
-            if isinstance(error, KeyboardInterrupt):
-                return
+            report_progress(f"packing trace {number} of {len(traces)}")
+            pack_whole(path)
+        except OSError:
+            continue
+        except KeyboardInterrupt:
+            return
 
 
-def _pack(path: Path, packed: Path) -> None:
-    packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, 16 + zlib.MAX_WBITS)
-    with open_plain_file(path) as source, packed.open("wb") as target:
-        while data := source.read(_CHUNK_BYTES):
-            target.write(packer.compress(data))
-        target.write(packer.flush())
+def _plain_traces(agents: Path) -> list[Path]:
+    return sorted(agents.rglob(f"*{SUFFIX}"))
+
+
+def _are_small(traces: list[Path]) -> bool:
+    return sum(path.stat().st_size for path in traces) < PACKED_FROM_BYTES

@@ -3,6 +3,9 @@
 Each agent that receives a message writes a line to its trace, so traces grow with the third power of the number of
 agents, or faster. A trace ends at its quota in the same way as on a full disk: after a complete line, and with a reason
 in `run.json`. Without a quota, the traces would leave no space for exports, verdict and report.
+
+The quota counts the lines of a trace before they are packed, because a busy machine packs them late. The kernel
+enforces it as the maximum size of a file.
 """
 
 import math
@@ -10,7 +13,8 @@ import shutil
 from itertools import pairwise
 from pathlib import Path
 
-from harness.archive.trace_files import PACKED_FROM_BYTES, PACKED_SHARE
+from harness.archive.packed_parts import can_free_parts
+from harness.archive.trace_files import MAX_TRACE_BYTES, PACKED_FROM_BYTES, PACKED_SHARE
 from harness.scenario import Scenario
 
 MEGABYTE = 1_000_000
@@ -26,14 +30,14 @@ LINES_WITHOUT_IDLE_RECEIPTS = 2
 
 
 def trace_quota(scenario: Scenario, directory: Path) -> int:
-    """Return the maximum size of one agent's trace, in bytes."""
+    """Return the maximum size of one agent's trace before packing, in bytes."""
     free = shutil.disk_usage(_existing(directory)).free
     total = free * SHARE_OF_FREE_SPACE if scenario.trace_quota_mb is None else scenario.trace_quota_mb * MEGABYTE
-    return max(LEAST_BYTES_PER_AGENT, round(total / len(scenario.roster)))
+    return min(MAX_TRACE_BYTES, max(LEAST_BYTES_PER_AGENT, round(total / len(scenario.roster))))
 
 
 def estimated_bytes(scenario: Scenario, *, all_delivered: bool) -> int:
-    """Return the estimated size of all traces together.
+    """Return the estimated size of all traces together before packing.
 
     If `all_delivered` is true, traces also record messages that have no effect, as the traces of processes do.
     """
@@ -53,16 +57,23 @@ def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) 
     if expected < PACKED_FROM_BYTES and expected < quota:
         return "", ""
     packed = _size(expected * PACKED_SHARE)
-    remark = f"traces: about {_size(expected)} during the run, packed to about {packed} after it"
+    when = "during the run" if can_free_parts(_existing(directory)) else "after the run"
+    remark = f"traces: about {_size(expected)}, packed to about {packed} {when}"
     if expected < quota:
         return remark, ""
-    source = "half of the free disk space" if scenario.trace_quota_mb is None else "`trace_quota_mb`"
-    if trace_quota(scenario, directory) == LEAST_BYTES_PER_AGENT:
-        source = "the least for each agent"
     return remark, (
-        f"the traces will probably end early, because their quota is {_size(quota)} ({source}), and the run will then "
-        "not be judged completely: raise the quota, or choose fewer agents or a shorter mission"
+        f"the traces will probably end early, because their quota is {_size(quota)} ({_source(scenario, quota)}), and "
+        "the run will then not be judged completely: raise the quota, or choose fewer agents or a shorter mission"
     )
+
+
+def _source(scenario: Scenario, quota: int) -> str:
+    """Return the reason for the quota of all traces together."""
+    if quota == LEAST_BYTES_PER_AGENT * len(scenario.roster):
+        return "the least for each agent"
+    if quota == MAX_TRACE_BYTES * len(scenario.roster):
+        return "the most that can be judged"
+    return "half of the free disk space" if scenario.trace_quota_mb is None else "`trace_quota_mb`"
 
 
 def _messages_per_minute(agents: int) -> float:

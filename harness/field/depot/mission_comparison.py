@@ -20,7 +20,7 @@ from pydantic import ValidationError
 
 from harness.archive.exports import MAX_EXPORT_BYTES, agents_directory, read_export
 from harness.archive.exports import SUFFIX as EXPORT_SUFFIX
-from harness.archive.trace_files import PACKED_SUFFIX, open_trace
+from harness.archive.trace_files import PACKED_SUFFIX, has_rest, open_trace
 from harness.archive.trace_files import SUFFIX as TRACE_SUFFIX
 from harness.archive.traces import HEADER, MAX_LINE_BYTES
 from harness.errors import ExportError, HarnessError, RunDirectoryError
@@ -397,6 +397,7 @@ def _in_directory(directory: Path) -> list[Path]:
     agents_folder = agents_directory(directory)
     for pattern in ("*.json*", "*/*.json*"):
         files = [path for path in agents_folder.glob(pattern) if path.is_file() and path.name.endswith(_READ)]
+        files = [path for path in files if not has_rest(path)]
         if files:
             return sorted(files, key=lambda path: (path.parent, len(path.name), path.name))
     return []

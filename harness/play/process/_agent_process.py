@@ -22,7 +22,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from harness.archive.directory import RunDirectory
-from harness.archive.trace_files import SUFFIX
+from harness.archive.trace_files import SUFFIX, open_trace
 from harness.archive.traces import HANDLER_RUN, read_trace
 from harness.errors import AgentFailedError, HarnessError, MachineError, ScenarioError, UnsupportedError
 from harness.play._vehicle_keys import KeyDirectories
@@ -319,7 +319,10 @@ class AgentProcess:
         runs: list[HandlerRun] = []
         trace = self._incarnations[-1].directory / f"{self.agent_id}{SUFFIX}"
         name = json.dumps(handler).encode()
-        for line in reversed(trace.read_bytes().split(b"\n")[1:-1] if trace.exists() else ()):
+        content = b""
+        with contextlib.suppress(FileNotFoundError), open_trace(trace) as file:
+            content = file.read()
+        for line in reversed(content.split(b"\n")[1:-1]):
             if name in line:
                 with contextlib.suppress(ValidationError):
                     run = HANDLER_RUN.validate_json(line)

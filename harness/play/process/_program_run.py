@@ -7,6 +7,7 @@ the mission early. The agents that are still alive then export their chains.
 
 import asyncio
 import base64
+import contextlib
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -14,6 +15,8 @@ from dataclasses import replace
 from typing import Any, Self
 
 from harness.archive.directory import RunDirectory
+from harness.archive.packed_parts import pack_parts
+from harness.archive.trace_files import packable_traces
 from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
 from harness.play._radio_range import TRACK_S, RadioRange
 from harness.play._vehicle_keys import KeyDirectories, key_directories
@@ -43,6 +46,8 @@ from ucp.clock import MICROSECONDS, MissionClock
 
 POLL_S = 0.25
 QUIET_POLL_S = 0.1
+PACK_S = 1.0
+"""Wall time between two searches for parts of traces to pack."""
 START_DELAY_S = 0.05
 MIN_FOLLOW_S = 0.1
 """Minimum wall time between two reads of the vehicles' positions."""
@@ -175,6 +180,7 @@ class ProgramRun:
             self._watchers.start(self._capture.watch())
         await self._start_clock()
         self._watchers.start(self._poll_agents())
+        self._watchers.start(self._pack_traces())
         self._watchers.start(self._log_script(), of="script")
         if self._fleet:
             self._watchers.start(self._follow_flight())
@@ -440,6 +446,14 @@ class ProgramRun:
             await self._statuses()
             self._show(self.stage)
             await asyncio.sleep(POLL_S)
+
+    async def _pack_traces(self) -> None:
+        """Pack finished parts of large traces, so that the run needs less disk space."""
+        while True:
+            await asyncio.sleep(PACK_S)
+            with contextlib.suppress(OSError):  # the disk is full, and the agents record it
+                for path in packable_traces(self.rundir.agents):
+                    await asyncio.to_thread(pack_parts, path)
 
     # End of the run
 

@@ -1,5 +1,6 @@
 """Write the files of a simulated run, and define the interface of an object that records its events."""
 
+import contextlib
 import errno
 import os
 from collections import defaultdict
@@ -7,6 +8,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 from harness.archive.directory import RunDirectory
+from harness.archive.packed_parts import pack_parts
+from harness.archive.trace_files import PACKED_FROM_BYTES, packable_traces
 from harness.play.simulation.incarnations import SimulatedIncarnation
 from netem.radio import Place
 from ucp.agent_files import TraceFile, write_json_atomically
@@ -23,6 +26,8 @@ class DiskRecorder:
         self._rundir = rundir
         self._left = defaultdict[int, int](lambda: trace_quota)
         """Agent -> number of bytes by which its trace may still grow."""
+        self._written_bytes = 0
+        """Size of all traces since parts of them were last packed."""
         self._traces: dict[int, TraceFile] = {}
 
     def begin(self, incarnation: SimulatedIncarnation) -> None:
@@ -43,6 +48,12 @@ class DiskRecorder:
         if self._left[agent_id] < 0 and trace.problem is None:
             trace.problem = os.strerror(errno.EFBIG)
         trace.write(lines)
+        self._written_bytes += len(lines)
+        if self._written_bytes >= PACKED_FROM_BYTES:
+            self._written_bytes = 0
+            with contextlib.suppress(OSError):  # the disk is full, and the traces record it
+                for path in packable_traces(self._rundir.agents):
+                    pack_parts(path)
 
     def changed(self, record: dict[str, Any]) -> None:
         self._rundir.append_network(record)

@@ -6,13 +6,11 @@ single file contains all incarnations.
 """
 
 from collections import deque
-from io import BufferedReader
 from pathlib import Path
 
 from harness.archive.bounded_file import BoundedFile
-from harness.archive.trace_files import is_packed, open_trace, trace_file
+from harness.archive.trace_files import open_trace, trace_file
 from harness.archive.traces import MAX_LINE_BYTES
-from ucp.plain_file import open_plain_file
 
 _CHUNK_BYTES = 256 * 1024
 
@@ -26,7 +24,7 @@ class GrowingFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.trouble: str | None = None
-        self._file: BufferedReader | None = None
+        self._file: BoundedFile | None = None
         self._lines: deque[bytes] = deque()
         self._partial_line = b""
 
@@ -48,7 +46,7 @@ class GrowingFile:
             return False
         try:
             if self._file is None:
-                self._file = (open_trace if is_packed(self.path) else open_plain_file)(self.path)
+                self._file = open_trace(self.path)
             data = self._file.read(_CHUNK_BYTES)
         except FileNotFoundError:
             return False
@@ -56,7 +54,7 @@ class GrowingFile:
             self.trouble = f"cannot be read: {error.strerror}"
             return False
         if not data:
-            if isinstance(self._file, BoundedFile) and self._file.problem:
+            if self._file.problem:
                 self.trouble = f"breaks off: {self._file.problem}"
             return False
         *complete, self._partial_line = (self._partial_line + data).split(b"\n")

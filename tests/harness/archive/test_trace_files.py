@@ -1,4 +1,4 @@
-"""Large traces are packed after the run. All readers take packed traces, and a damaged one is never judged to hold."""
+"""Large traces are packed during and after the run. All readers take packed traces, and none judges a damaged one."""
 
 import gzip
 import shutil
@@ -9,11 +9,14 @@ from typing import Any
 import pytest
 
 from harness import checker
-from harness.archive import trace_files
+from harness.archive import packed_parts, trace_files
 from harness.archive.archive import RunArchive
-from harness.archive.trace_files import pack_traces
+from harness.archive.packed_parts import can_free_parts, has_finished_part, pack_parts, packed_name
+from harness.archive.trace_files import open_trace, pack_traces, packable_traces
 from harness.field.depot.mission_comparison import compare
+from harness.play.process import _program_run
 from harness.play.progress import SilentProgress
+from harness.play.simulation import run_files
 from harness.run.run import run
 from tests.harness.command import harness
 from tests.harness.report.live.runs import film
@@ -53,7 +56,35 @@ def test_run_packs_only_large_traces(plain: Path, tmp_path: Path, monkeypatch: p
         assert gzip.decompress((large / "agents" / f"{name}.gz").read_bytes()) == (plain / "agents" / name).read_bytes()
 
 
-def test_all_readers_take_packed_traces(plain: Path, packed: Path) -> None:
+@pytest.fixture
+def partly_packed(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a run of which the harness was killed. Its traces are packed except for their ends."""
+    monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 0)
+    monkeypatch.setattr(packed_parts, "PART_BYTES", 65536)
+    monkeypatch.setattr(packed_parts, "KEPT_BYTES", 1)
+    directory = shutil.copytree(plain, tmp_path / "run")
+    if not can_free_parts(directory):
+        pytest.skip("this file system cannot free a part of a file")
+    traces = packable_traces(directory / "agents")
+    assert [path.name for path in traces] == NAMES
+    for path in traces:
+        pack_parts(path)
+        assert not has_finished_part(path)
+        assert path.read_bytes().startswith(bytes(65536))
+        assert path.stat().st_blocks * 512 < path.stat().st_size
+    return directory
+
+
+@pytest.fixture
+def copied(partly_packed: Path, tmp_path: Path) -> Path:
+    """Return a copy of that run in which the freed parts are bytes again."""
+    return shutil.copytree(partly_packed, tmp_path / "copied")
+
+
+@pytest.mark.parametrize("directory", ["packed", "partly_packed", "copied"])
+def test_all_readers_take_packed_traces(plain: Path, directory: str, request: pytest.FixtureRequest) -> None:
+    packed = request.getfixturevalue(directory)
+
     def facts(directory: Path) -> list[Any]:
         archive = RunArchive(directory)
         result = checker.check(archive)
@@ -69,7 +100,8 @@ def test_all_readers_take_packed_traces(plain: Path, packed: Path) -> None:
         assert (done.returncode, done.stderr) == (0, "")
     again = packed.with_name("imported")
     assert "3 trace(s)" in harness("import", packed, "--out", again).stdout
-    assert "no difference" in harness("replay", packed / "agents" / "2.trace.jsonl.gz").stdout
+    (trace,) = (path for path in trace_files.trace_files(packed / "agents") if path.name.startswith("2."))
+    assert "no difference" in harness("replay", trace).stdout
 
 
 @pytest.mark.parametrize("cut", [0.5, 0.99])
@@ -93,3 +125,63 @@ def test_ctrl_c_keeps_the_traces_that_are_not_packed_yet(packed: Path) -> None:
 
     pack_traces(packed / "agents", interrupt)
     assert names(packed) == [f"{NAMES[0]}.gz", *NAMES[1:]]
+
+
+def test_traces_that_are_partly_packed_are_packed_completely(plain: Path, partly_packed: Path) -> None:
+    pack_traces(partly_packed / "agents", silent)
+    assert names(partly_packed) == [f"{name}.gz" for name in NAMES]
+    for name in NAMES:
+        content = gzip.decompress((partly_packed / "agents" / f"{name}.gz").read_bytes())
+        assert content == (plain / "agents" / name).read_bytes()
+
+
+def test_agent_and_reader_notice_nothing_of_packed_parts(plain: Path, partly_packed: Path) -> None:
+    """The agent appends between two packings. A reader that is open meanwhile reads each line once."""
+    path, whole = partly_packed / "agents" / NAMES[0], (plain / "agents" / NAMES[0]).read_bytes()
+    read = b""
+    with open_trace(path) as early, path.open("ab", buffering=0) as agent:
+        for _ in range(4):
+            read += early.read(20_000)
+            agent.write(whole)
+            pack_parts(path)
+            assert agent.tell() == path.stat().st_size
+        read += early.read()
+    with open_trace(path) as late:
+        assert late.read() == read == whole * 5
+    assert path.stat().st_blocks * 512 + packed_name(path).stat().st_size < len(whole) * 5 / 2
+
+
+def test_run_packs_its_traces_while_it_plays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    packed: list[Path] = []
+    monkeypatch.setattr(run_files, "PACKED_FROM_BYTES", 100_000)
+    monkeypatch.setattr(run_files, "packable_traces", trace_files._plain_traces)
+    monkeypatch.setattr(run_files, "pack_parts", packed.append)
+    run(ASKED, 1, tmp_path / "run", SilentProgress(), "sim")
+    assert [path.name for path in packed[:3]] == NAMES
+
+
+@pytest.mark.lab
+def test_processes_are_judged_alike_if_their_traces_are_packed_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One agent restarts, so the harness appends to a trace of which it has packed parts."""
+    monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 1)
+    monkeypatch.setattr(packed_parts, "PART_BYTES", 4096)
+    monkeypatch.setattr(packed_parts, "KEPT_BYTES", 4096)
+    monkeypatch.setattr(_program_run, "PACK_S", 0.1)
+    packed: list[Path] = []
+
+    def pack_and_note(path: Path) -> None:
+        pack_parts(path)
+        packed.append(path)
+
+    monkeypatch.setattr(_program_run, "pack_parts", pack_and_note)
+    timeline = [{"at_s": 150, "kill": [2]}, {"at_s": 160, "restart": [2]}]
+    keys = {"vehicles": {"kind": "none"}, "speedup": 60, "timeline": timeline}
+    replaced = scenario(agents=3, duration_s=300, events={"source": "random", "mean_s": 5}, **keys)
+    finished = run(replaced, 1, tmp_path / "run", SilentProgress(), "process")
+    assert {path.name for path in packed} == set(NAMES)
+    assert names(finished.directory) == [f"{name}.gz" for name in NAMES]
+    assert finished.result.errors == []
+    for key in ("1", "2", "3", "4", "records"):
+        assert finished.result.judgements[key].kind == "good", finished.result.judgements[key]

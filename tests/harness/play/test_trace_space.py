@@ -32,7 +32,7 @@ def test_estimate_is_near_the_size_of_real_traces(agents: int, all_delivered: bo
 def test_run_warns_before_traces_that_exceed_the_quota(tmp_path: Path) -> None:
     assert space_sentence(asked(5), tmp_path, all_delivered=True) == ("", "")
     remark, warning = space_sentence(asked(50, trace_quota_mb=2000), tmp_path, all_delivered=True)
-    assert remark == "traces: about 10.2 GB during the run, packed to about 1.7 GB after it"
+    assert remark == "traces: about 10.2 GB, packed to about 1.7 GB during the run"
     assert warning.startswith("the traces will probably end early, because their quota is 2.0 GB (`trace_quota_mb`)")
     assert space_sentence(asked(50, trace_quota_mb=20_000), tmp_path, all_delivered=True) == (remark, "")
 
