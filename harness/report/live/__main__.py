@@ -16,7 +16,7 @@ from typing import Any
 from harness.archive.exports import RUN_FILE
 from harness.errors import HarnessError
 from harness.report.live.change_log import ChangeLog
-from harness.report.live.feed import ChangeFeed
+from harness.report.live.feed import ChangeFeed, RunClock
 from harness.report.live.feed_to_log import copy_live_run
 from harness.report.live.server import UPDATE_S, LivePageServer
 
@@ -27,12 +27,12 @@ MAX_UNWATCHED_S = 3.0
 async def main(directory: Path, port: int) -> None:
     reader = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
-    log, ended = ChangeLog(), asyncio.Event()
+    log, ended, clock = ChangeLog(), asyncio.Event(), RunClock()
     server = LivePageServer(log, directory, live=True, on_request=_send_request)
     async with server.open(port) as address:
         _print(address)
-        following = asyncio.create_task(_follow_run(directory, log, ended))
-        if not await _read_until_over(reader, server, log):
+        following = asyncio.create_task(_follow_run(directory, log, ended, clock))
+        if not await _read_until_over(reader, server, log, clock):
             return
         ended.set()
         await following
@@ -53,7 +53,9 @@ def _send_request(page: int, request: Any) -> None:
         _print(json.dumps([page, request.get("number"), request]))
 
 
-async def _read_until_over(reader: asyncio.StreamReader, server: LivePageServer, log: ChangeLog) -> bool:
+async def _read_until_over(
+    reader: asyncio.StreamReader, server: LivePageServer, log: ChangeLog, clock: RunClock
+) -> bool:
     """Read messages from the process that plays the run, until the run is over. Return false if the process ended
     early.
     """
@@ -64,19 +66,21 @@ async def _read_until_over(reader: asyncio.StreamReader, server: LivePageServer,
         if kind == "answer":
             page, number, answer = rest
             server.answer(page, ["answer", number, answer])
+        elif kind == "t":
+            clock.report(rest[0])
         else:
             log.append([[kind, *rest]])
     return False
 
 
-async def _follow_run(directory: Path, log: ChangeLog, ended: asyncio.Event) -> None:
+async def _follow_run(directory: Path, log: ChangeLog, ended: asyncio.Event, clock: RunClock) -> None:
     while not (directory / RUN_FILE).exists():
         if ended.is_set():
             return
         await asyncio.sleep(UPDATE_S)
     try:
         with contextlib.closing(ChangeFeed(directory)) as feed:
-            await copy_live_run(feed, log, ended)
+            await copy_live_run(feed, log, ended, clock)
     except HarnessError as error:
         log.append([["note", str(error)]])  # the run goes on without the page
 

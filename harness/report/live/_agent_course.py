@@ -34,6 +34,8 @@ _RECEIPT_LINE = re.compile(
 )
 _NO_EFFECT = b'"branch":"no vote running"'
 _NO_CHANGES = b'"changes":[],"sent":[]'
+_RECEIVES = b'"handler":"receive_'
+_TIME = re.compile(rb'\{"t":(\d{1,9}(?:\.\d{1,9})?),')
 
 
 class MessageReceipt(NamedTuple):
@@ -73,6 +75,10 @@ class AgentActions:
         """True if the trace records a message without effect. By default, traces of virtual time omit these
         messages.
         """
+        self.has_unread = False
+        """True if the last `read` left lines unread."""
+        self.leaves_out_messages = False
+        """True to read only changes of the state, which is several times as fast."""
         self._trace = AgentTrace(agents, agent_id)
         self._ahead: MessageReceipt | HandlerRun | DroppedDatagram | None = None
         """An entry that was read but lies after the requested mission second."""
@@ -87,6 +93,7 @@ class AgentActions:
         """Read the trace up to mission second `until_s`, but at most `at_most` lines. Return true if there are further
         entries up to `until_s`.
         """
+        self.has_unread = False
         for _ in range(at_most):
             entry = self._ahead or self._next()
             if entry is None:
@@ -102,6 +109,7 @@ class AgentActions:
                 self._handler_run(entry)
             else:
                 self.changes.append(["d", entry.t, self.agent_id, str(entry.dropped)[:80]])
+        self.has_unread = True
         return True
 
     @property
@@ -117,6 +125,9 @@ class AgentActions:
     def _next(self) -> MessageReceipt | HandlerRun | DroppedDatagram | None:
         """Return the next entry that has a valid time. Return None if the trace has no further entry yet."""
         while self.problem is None:
+            if self.leaves_out_messages and (dropped := self._trace.drop_while(self._has_no_effect)):
+                time = _TIME.match(dropped)
+                self.at_s = max(self.at_s, float(time[1]) if time else 0.0)
             line = self._trace.next()
             if line is None:
                 self.problem = self._trace.trouble
@@ -136,6 +147,13 @@ class AgentActions:
             elif not isinstance(entry, CommandEntry) and 0 <= entry.t <= LATEST_S:
                 return entry
         return None
+
+    def _has_no_effect(self, line: bytes) -> bool:
+        return (
+            _NO_CHANGES in line
+            and _RECEIVES in line
+            and (not self._held.not_in_chain or not self._may_be_idle_too_early(line))
+        )
 
     def _may_be_idle_too_early(self, line: bytes) -> bool:
         return bool(self._held.not_in_chain) and b'"idle":true' in line

@@ -6,6 +6,7 @@ single file contains all incarnations.
 """
 
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 from harness.archive.bounded_file import BoundedFile
@@ -29,11 +30,20 @@ class GrowingFile:
         self._partial_line = b""
 
     def next(self) -> bytes | None:
-        """Return the next line with its line end. Return None if the next line is not complete yet."""
+        """Return the next line without its line end. Return None if the next line is not complete yet."""
         while not self._lines:
             if not self._read():
                 return None
         return self._lines.popleft()
+
+    def drop_while(self, can_be_dropped: Callable[[bytes], bool]) -> bytes | None:
+        """Drop the next lines of the part that was read, up to the first line that the function rejects. Return the
+        last dropped line.
+        """
+        dropped, lines = None, self._lines
+        while lines and can_be_dropped(lines[0]):
+            dropped = lines.popleft()
+        return dropped
 
     def close(self) -> None:
         if self._file is not None:
@@ -58,7 +68,7 @@ class GrowingFile:
                 self.trouble = f"breaks off: {self._file.problem}"
             return False
         *complete, self._partial_line = (self._partial_line + data).split(b"\n")
-        self._lines.extend(line + b"\n" for line in complete)
+        self._lines.extend(complete)
         if len(self._partial_line) > MAX_LINE_BYTES:
             self.trouble, self._partial_line = f"has a line of more than {MAX_LINE_BYTES // 1024 // 1024} MiB", b""
         return True
@@ -78,7 +88,7 @@ class AgentTrace:
         return self._file.trouble and f"{self._file.path.name} {self._file.trouble}"
 
     def next(self) -> bytes | None:
-        """Return the next line with its line end. Return None if the next line is not complete yet."""
+        """Return the next line without its line end. Return None if the next line is not complete yet."""
         while True:
             line = self._file.next()
             if line is None:
@@ -94,6 +104,10 @@ class AgentTrace:
             self._file.close()
             self._file = GrowingFile(trace_file(self._later, self._agent_id))
             self._incarnation, self._headers = self._incarnation + 1, 0
+
+    def drop_while(self, can_be_dropped: Callable[[bytes], bool]) -> bytes | None:
+        """Drop lines of the current incarnation as `GrowingFile.drop_while` does."""
+        return self._file.drop_while(can_be_dropped)
 
     @property
     def _later(self) -> Path:

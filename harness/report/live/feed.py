@@ -18,10 +18,14 @@ their hashes.
 | `d` | an agent dropped a datagram: agent, reason |
 | `x` | a visible violation of a characteristic: agent, number, key |
 | `t` | the current mission second |
+| `gap` | messages before that second were left out |
+| `late` | seconds of wall time in place of the second, by which the changes are late; true if messages are left out |
 | `all` | traces contain every received message: a missing receipt means a lost message |
 | `run`, `end`, `note` | a document in place of the second: the run; its outcome; a sentence about unreadable parts |
 """
 
+import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -47,11 +51,16 @@ from harness.scenario.verdict_names import kind_of
 MAX_VEHICLES = 200
 """Maximum number of vehicles whose links the page can draw."""
 LINES_AT_ONCE = 500
-"""Maximum number of lines that are read from one file before the reader continues with the next file."""
+"""Maximum number of lines that are read from one file before the reader continues with the next file. Lines that are
+left out do not count.
+"""
+LINES_AT_ONCE_LATE = 50
 POLLS_UNTIL_REPORTED = 2
 """Number of polls between the first sight of a message and its change on the page. By then most receivers have recorded
 the message. If a receiver on a busy machine records it later, this causes a change `h`.
 """
+MAX_BEHIND_S = 2.0
+"""Wall time. If the stream is further behind an active run, it leaves out messages until it has caught up."""
 MAX_KEPT = 100_000
 """Maximum number of reported messages that can still get a change `h`. The same limit applies to messages that only
 receivers have recorded.
@@ -73,6 +82,24 @@ class _Broadcast:
         before = self.mask
         self.mask |= bit
         return self.mask != before
+
+
+class RunClock:
+    """The mission seconds that an active run reported, and the wall time of each report."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self._reports: deque[tuple[float, float]] = deque()
+
+    def report(self, now_s: float) -> None:
+        self.now_s = now_s
+        self._reports.append((now_s, time.monotonic()))
+
+    def wall_s_since(self, mission_s: float) -> float:
+        """Return the wall time since this mission second. Earlier seconds are forgotten."""
+        while self._reports and self._reports[0][0] <= mission_s:
+            self._reports.popleft()
+        return time.monotonic() - self._reports[0][1] if self._reports else 0.0
 
 
 class ChangeFeed:
@@ -101,6 +128,10 @@ class ChangeFeed:
         self._reported: dict[tuple[int, int], _Broadcast] = {}
         """(sender, sequence number) -> the message, for the last reported messages."""
         self._polls = 0
+        self._leaves_out_messages = False
+        self._messages_from_s = -1.0
+        """Messages up to this mission second are left out, because their receivers are not known completely."""
+        self._reported_late: Change = ["late", 0, False]
         self._reported_s = 0.0
         self._reported_problems: set[str] = set()
         self._record = archive.record
@@ -144,8 +175,9 @@ class ChangeFeed:
         second.
         """
         more = self._surroundings.read(until_s, LINES_AT_ONCE)
+        at_once = LINES_AT_ONCE_LATE if self._leaves_out_messages else LINES_AT_ONCE
         for course in self._courses:
-            more |= course.read(until_s, LINES_AT_ONCE)
+            more |= course.read(until_s, at_once)
         # In a film, an agent with unread lines may still have received older messages. A live page cannot wait for it.
         self._polls += not more or isinf(until_s)
         changes = [*self._take_changes(), *self._messages(report_all=False)]
@@ -158,6 +190,36 @@ class ChangeFeed:
             self._all_receipts_recorded = True
             changes.append(["all", self._reported_s])
         return [*changes, *self._notes()], more
+
+    def poll_live(self, clock: RunClock) -> tuple[list[Change], bool]:
+        """Return the new changes of an active run, and whether more changes remain unread.
+
+        Far behind the run, the feed leaves out messages, which are most of the traces. It reports how late it is.
+        """
+        changes, more = self.poll()
+        unread = (course.at_s for course in self._courses if course.has_unread)
+        late_s = clock.wall_s_since(min(unread, default=clock.now_s))
+        if not self._leaves_out_messages and late_s > MAX_BEHIND_S:
+            self._leave_out_messages(True)
+        elif self._leaves_out_messages and not more:
+            self._leave_out_messages(False)
+            self._messages_from_s = max(course.at_s for course in self._courses)
+            changes.append(["gap", self._messages_from_s])
+        late: Change = ["late", round(late_s), self._leaves_out_messages]
+        if late != self._reported_late:
+            self._reported_late = late
+            changes.append(late)
+        if not more and clock.now_s > self._reported_s:
+            self._reported_s = clock.now_s
+            changes.append(["t", round(clock.now_s, 3)])
+        return changes, more
+
+    def _leave_out_messages(self, leave_out: bool) -> None:
+        self._leaves_out_messages = leave_out
+        for course in self._courses:
+            course.leaves_out_messages = leave_out
+        self._broadcasts.clear()
+        self._reported.clear()
 
     def final_changes(self) -> list[Change]:
         """Return the changes that were not returned yet, and the result of the run."""
@@ -204,6 +266,8 @@ class ChangeFeed:
             happened += [(receipts.t, 1, course.agent_id, receipts) for receipts in course.receipts]
             course.sent.clear()
             course.receipts.clear()
+        if self._leaves_out_messages:
+            return
         happened.sort(key=itemgetter(0, 1))
         late: dict[tuple[int, int], _Broadcast] = {}
         for _, _, agent_id, what in happened:
@@ -216,6 +280,8 @@ class ChangeFeed:
                 if key not in self._broadcasts:
                     self._broadcasts[key] = _Broadcast(0, self._polls)
                 self._broadcasts[key].add_receiver(self._bit[agent_id])
+                continue
+            if what.t <= self._messages_from_s:
                 continue
             key = agent_id, what.seq
             before = self._broadcasts.get(key)

@@ -3,7 +3,7 @@
 import asyncio
 
 from harness.report.live.change_log import ChangeLog
-from harness.report.live.feed import ChangeFeed
+from harness.report.live.feed import ChangeFeed, RunClock
 from harness.report.live.server import UPDATE_S
 
 STRIDE_S = 20.0
@@ -26,14 +26,14 @@ async def copy_finished_run(feed: ChangeFeed, log: ChangeLog) -> None:
     log.append(feed.final_changes())
 
 
-async def copy_live_run(feed: ChangeFeed, log: ChangeLog, ended: asyncio.Event) -> None:
+async def copy_live_run(feed: ChangeFeed, log: ChangeLog, ended: asyncio.Event, clock: RunClock) -> None:
     """Write the changes of an active run to a log until the run has a result. Also stop when `ended` is set, because
-    the process that plays the run has ended.
+    the process that plays the run has ended. `clock` has the mission seconds that the run reports.
     """
     log.append([feed.run_change(live=True)])
     while True:
         over = feed.over or ended.is_set()
-        changes, more = feed.poll()
+        changes, more = feed.poll_live(clock)
         log.append(changes)
         if over and not more:
             break

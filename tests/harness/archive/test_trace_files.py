@@ -13,6 +13,7 @@ from harness.archive import packed_parts, trace_files
 from harness.archive.archive import RunArchive
 from harness.archive.packed_parts import can_free_parts, has_finished_part, pack_parts, packed_name
 from harness.archive.trace_files import open_trace, pack_traces, packable_traces
+from harness.backend_names import BackendName
 from harness.field.depot.mission_comparison import compare
 from harness.play.process import _program_run
 from harness.play.progress import SilentProgress
@@ -160,9 +161,11 @@ def test_run_packs_its_traces_while_it_plays(tmp_path: Path, monkeypatch: pytest
     assert [path.name for path in packed[:3]] == NAMES
 
 
-@pytest.mark.lab
-def test_processes_are_judged_alike_if_their_traces_are_packed_meanwhile(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "backend", [pytest.param("process", marks=pytest.mark.lab), pytest.param("docker", marks=pytest.mark.docker)]
+)
+def test_programs_are_judged_alike_if_their_traces_are_packed_meanwhile(
+    backend: BackendName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One agent restarts, so the harness appends to a trace of which it has packed parts."""
     monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 1)
@@ -178,8 +181,9 @@ def test_processes_are_judged_alike_if_their_traces_are_packed_meanwhile(
     monkeypatch.setattr(_program_run, "pack_parts", pack_and_note)
     timeline = [{"at_s": 150, "kill": [2]}, {"at_s": 160, "restart": [2]}]
     keys = {"vehicles": {"kind": "none"}, "speedup": 60, "timeline": timeline}
+    keys |= {"docker": {"image_from_host": True}} if backend == "docker" else {}
     replaced = scenario(agents=3, duration_s=300, events={"source": "random", "mean_s": 5}, **keys)
-    finished = run(replaced, 1, tmp_path / "run", SilentProgress(), "process")
+    finished = run(replaced, 1, tmp_path / "run", SilentProgress(), backend)
     assert {path.name for path in packed} == set(NAMES)
     assert names(finished.directory) == [f"{name}.gz" for name in NAMES]
     assert finished.result.errors == []

@@ -37,12 +37,20 @@ def test_run_warns_before_traces_that_exceed_the_quota(tmp_path: Path) -> None:
     assert space_sentence(asked(50, trace_quota_mb=20_000), tmp_path, all_delivered=True) == (remark, "")
 
 
-@pytest.mark.parametrize("backend", ["sim", pytest.param("process", marks=pytest.mark.lab)])
+@pytest.mark.parametrize(
+    "backend",
+    [
+        "sim",
+        pytest.param("process", marks=pytest.mark.lab),
+        pytest.param("docker", marks=pytest.mark.docker),
+    ],
+)
 def test_trace_ends_at_the_quota_and_the_run_is_not_judged(
     backend: BackendName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trace_space, "LEAST_BYTES_PER_AGENT", 1)
-    keys = {"vehicles": {"kind": "none"}, "events": {"source": "random", "mean_s": 5}, "speedup": 100}
+    keys: dict[str, Any] = {"vehicles": {"kind": "none"}, "events": {"source": "random", "mean_s": 5}, "speedup": 100}
+    keys |= {"docker": {"image_from_host": True}} if backend == "docker" else {}
     small = scenario(agents=3, duration_s=200, trace_quota_mb=0.15, **keys)
     finished = run(small, 1, tmp_path / "run", SilentProgress(), backend)
     for number in (1, 2, 3):

@@ -12,6 +12,8 @@ export class Story {
     this.hand = null;
     this.notes = [];
     this.until = 0;
+    this.late = [0, false]; // seconds of wall time, and whether messages are left out
+    this.gaps = [];
     this.log = [];
     this.messages = [];
     this.tracks = new Map();
@@ -30,6 +32,8 @@ export class Story {
     else if (kind === "hand") this.hand = second;
     else if (kind === "note") this.notes.push(second);
     else if (this.run === null) return;
+    else if (kind === "late") this.late = change.slice(1);
+    else if (kind === "gap") this.gaps.push(change);
     else if (kind === "all") this.run.all_heard = true;
     else if (kind === "t") this.until = Math.max(this.until, second);
     else if (kind === "p") this.place(second, change[2]);
@@ -73,11 +77,13 @@ export class Story {
   // The messages after one second, up to and with another, the newest first, each with masks of the receivers that got
   // it and that lost it. A receiver handles messages in order. So it lost a message if it could have received it, and
   // has received a later one, up to the second `known`. What a receiver has done with the newest messages is not known.
+  // Receptions in a gap are not known either, so each gap begins anew.
   *fates(from, to, known = to) {
     const { messages } = this, { history } = this.ahead;
-    let later = 0n;
+    let later = 0n, gap = firstAfter(this.gaps, known) - 1;
     for (let at = firstAfter(messages, known) - 1; at >= 0 && messages[at][1] > from; at -= 1) {
       const [, t, sender, , , mask] = messages[at], heard = BigInt(`0x${mask}`);
+      for (; gap >= 0 && t <= this.gaps[gap][1]; gap -= 1) later = 0n;
       if (t <= to) yield { message: messages[at], heard: heard & later, lost: later & ~heard & history.reach(sender, t), all: heard };
       later |= heard;
     }

@@ -173,7 +173,10 @@ function showStatus() {
   status.classList.remove("good", "bad", "now");
   if (!end) {
     const stage = story.hand?.paused ? "held" : story.hand?.stage ?? "";
-    status.textContent = run?.live ? `● live${stage && stage !== "mission" ? `: ${stage}` : ""}` : "reading";
+    const [late, leavesOut] = story.late;
+    const behind = late || leavesOut ? `${late} s behind the run${leavesOut ? ", without messages" : ""}` : "";
+    const more = [stage !== "mission" ? stage : "", behind].filter(Boolean).join(", ");
+    status.textContent = run?.live ? `● live${more ? `: ${more}` : ""}` : "reading";
     if (run?.live) status.classList.add("now");
     return;
   }
@@ -282,7 +285,7 @@ function connect() {
   socket = new WebSocket(address);
   socket.addEventListener("message", ({ data }) => {
     const had = story.run, ended = story.end;
-    const stood = story.hand;
+    const stood = story.hand, late = story.late;
     for (const line of data.split("\n")) if (line) {
       const change = JSON.parse(line);
       if (change[0] === "answer") hand?.answered(change[1], change[2]); else story.take(change);
@@ -291,7 +294,7 @@ function connect() {
     arrivals.push([performance.now(), story.until]);
     changed = true;
     if (story.hand !== stood && hand) hand.take(story.hand);
-    if (story.run && (!had || story.end !== ended || story.hand !== stood)) showStatus();
+    if (story.run && (!had || story.end !== ended || story.hand !== stood || story.late !== late)) showStatus();
     if (story.notes.length && !story.end) complain(story.notes);
   });
   socket.addEventListener("close", () => {

@@ -15,7 +15,7 @@ from harness.errors import RunDirectoryError
 from harness.report.live import feed as feeds
 from harness.report.live._agent_course import KEY_LENGTH, AgentActions, Change
 from harness.report.live.change_log import FAR_BEHIND_BYTES, ChangeLog
-from harness.report.live.feed import ChangeFeed
+from harness.report.live.feed import ChangeFeed, RunClock
 from tests.harness.archive.test_history import handler_run, trace_of
 from tests.harness.report.live.runs import film, of_kind, played
 from ucp.trace import SentMessage
@@ -279,3 +279,54 @@ def test_slow_reader_of_a_live_run_skips_messages() -> None:
     assert Counter(read(may_skip=True))["c"] == 101
     assert Counter(read(may_skip=True))["m"] < 1000
     log.close()
+
+
+class SetClock(RunClock):
+    """A clock whose wall time the test sets."""
+
+    late_s = 0.0
+
+    def wall_s_since(self, mission_s: float) -> float:
+        return self.late_s if mission_s < self.now_s else 0.0
+
+
+def late_run(run: Path, growing: Path, monkeypatch: pytest.MonkeyPatch) -> list[Change]:
+    """Return the changes of an active run. The feed is late during its middle third."""
+    monkeypatch.setattr(feeds, "LINES_AT_ONCE", 3)
+    (growing / "agents").mkdir(parents=True)
+    shutil.copy(run / "run.json", growing)
+    shutil.copy(run / "network.jsonl", growing)
+    content = {path: path.read_bytes().splitlines(keepends=True) for path in run.glob(f"agents/*{SUFFIX}")}
+    feed, clock = ChangeFeed(growing), SetClock()
+    told = [feed.run_change(live=True)]
+    clock.now_s = 1e6
+    for step in range(1, 31):
+        for path, lines in content.items():
+            (growing / "agents" / path.name).write_bytes(b"".join(lines[: len(lines) * step // 30]))
+        clock.late_s = 3.4 if 10 < step <= 20 else 0.0
+        more = True
+        while more:
+            changes, more = feed.poll_live(clock)
+            told += changes
+            if clock.late_s and more:
+                break
+    told += feed.final_changes()
+    feed.close()
+    return told
+
+
+def test_late_feed_leaves_out_messages_and_reports_how_late_it_is(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told, whole = late_run(run, tmp_path / "live", monkeypatch), film(run)
+    late = of_kind("late", told)
+    assert late[0] == ["late", 3, True]
+    assert late[-1] == ["late", 0, False]
+    gaps = [at_s for _, at_s in of_kind("gap", told)]
+    assert gaps
+    assert chains_of(told) == chains_of(whole)
+    known, complete = receivers(told), receivers(whole)
+    assert 0.3 < len(known) / len(complete) < 0.95
+    for message, mask in known.items():
+        if message[2] > gaps[-1]:
+            assert mask == complete[message], "after the last gap, all receivers are known"

@@ -14,7 +14,7 @@ from tests.harness.command import DEADLINE_S
 from tests.harness.report.browser import Browser
 from tests.harness.report.live.pages import page_of, until
 from tests.harness.report.live.runs import film, of_kind, played
-from tests.harness.report.live.test_feed import chains_of, late_film, of_report, reconcile_during_a_vote
+from tests.harness.report.live.test_feed import chains_of, late_film, late_run, of_report, reconcile_during_a_vote
 from tests.harness.virtual import scenario
 
 HOSTILE = "</title><script>document.title = 'owned'</script><img src=x onerror=\"document.title='owned'\">"
@@ -98,12 +98,15 @@ def test_page_keeps_a_vote_open_when_a_reconcile_begins(browser: Browser, run: P
         assert sorted(browser.evaluate("window.spans")) == [list(one[:3]) for one in of_report({1: trace})]
 
 
-def test_live_page_and_film_show_the_loss_of_the_network(browser: Browser, run: Path, tmp_path: Path) -> None:
+def test_live_page_and_film_show_the_loss_of_the_network(
+    browser: Browser, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Receivers record messages late, and a partition lasts for a part of the minute."""
     partition = [{"at_s": 50, "partition": [[1, 2, 3], [4, 5, 6]]}, {"at_s": 80, "heal": True}]
     asked = scenario(agents=6, duration_s=150, network={"loss": 0.2}, timeline=partition, events={"mean_s": 4})
     lossy = play(asked, 1, tmp_path / "lossy", SilentProgress(), "sim", delivers_all=True).directory
     stories = {"film": film(lossy), "live": late_film(lossy, tmp_path / "live", lag=1)}
+    stories["late"] = late_run(lossy, tmp_path / "late", monkeypatch)
     with page_of("watch", run) as (_, address):
         browser.show(address, width=1000, scheme="light")
         until(browser, "watch.story.end")
@@ -111,7 +114,9 @@ def test_live_page_and_film_show_the_loss_of_the_network(browser: Browser, run: 
             browser.evaluate(f"window.{name} = new watch.story.constructor()")
             browser.evaluate(f"for (const change of {json.dumps(told)}) {name}.take(change)")
         shares = {name: browser.evaluate(f"[70, 100, 130].map(t => {name}.shareLost(t - 60, t))") for name in stories}
+    late = shares.pop("late")
     assert shares["live"] == shares["film"] == [pytest.approx(0.2, abs=0.04)] * 3
+    assert late[-1] == pytest.approx(0.2, abs=0.06), "messages that were left out are not lost"
 
 
 def test_film_of_a_killed_run_reports_the_kill(browser: Browser, run: Path, tmp_path: Path) -> None:
