@@ -13,6 +13,7 @@ import contextlib
 import ctypes
 import errno
 import os
+import stat
 import zlib
 from pathlib import Path
 from typing import BinaryIO
@@ -69,7 +70,7 @@ def can_free_parts(directory: Path) -> bool:
 
 def has_finished_part(path: Path) -> bool:
     """Return true if `pack_parts` would pack a part of this file."""
-    with contextlib.suppress(OSError), path.open("rb", buffering=0) as file:
+    with contextlib.suppress(OSError), _opened(path, os.O_RDONLY) as file:
         return os.fstat(file.fileno()).st_size - hole_at_begin(file.fileno()) >= PART_BYTES + KEPT_BYTES
     return False
 
@@ -79,7 +80,7 @@ def pack_parts(path: Path) -> None:
 
     The file system must pass `can_free_parts`.
     """
-    with path.open("r+b", buffering=0) as file, _packed_file(path, file) as packed:
+    with _opened(path, os.O_RDWR) as file, _packed_file(path, file) as packed:
         begin = hole_at_begin(file.fileno())
         while os.fstat(file.fileno()).st_size - begin >= PART_BYTES + KEPT_BYTES:
             _append(packed, os.pread(file.fileno(), PART_BYTES, begin))
@@ -92,7 +93,7 @@ def pack_whole(path: Path) -> None:
 
     After an error or Ctrl-C, the rest is still in the file.
     """
-    with path.open("rb", buffering=0) as file, _packed_file(path, file) as packed:
+    with _opened(path, os.O_RDONLY) as file, _packed_file(path, file) as packed:
         file.seek(hole_at_begin(file.fileno()))
         before = packed.tell()
         try:
@@ -104,6 +105,20 @@ def pack_whole(path: Path) -> None:
             if not before:
                 packed_name(path).unlink()
             raise
+
+
+def _opened(path: Path, flags: int) -> BinaryIO:
+    """Open a file of an agent. Raises OSError if it is not a regular file.
+
+    In a run in containers, `path` is a link of the harness. The agent could replace its file by a link, which must not
+    lead to a file of this machine.
+    """
+    own = path.parent / path.readlink() if path.is_symlink() else path
+    descriptor = os.open(own, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "is not a regular file")
+    return os.fdopen(descriptor, "r+b" if flags == os.O_RDWR else "rb", buffering=0)
 
 
 def _packed_file(path: Path, file: BinaryIO) -> BinaryIO:

@@ -82,7 +82,10 @@ def pack_traces(agents: Path, report_progress: Callable[[str], None]) -> None:
 
 
 def _plain_traces(agents: Path) -> list[Path]:
-    return sorted(agents.rglob(f"*{SUFFIX}"))
+    """Return each plain trace once: in a run in containers, by its link in `agents`."""
+    traces = [path for path in agents.rglob(f"*{SUFFIX}") if path.exists()]
+    linked = {path.resolve() for path in traces if path.is_symlink()}
+    return sorted(path for path in traces if path.is_symlink() or path.resolve() not in linked)
 
 
 def _are_small(traces: list[Path]) -> bool:

@@ -1,6 +1,7 @@
 """Large traces are packed during and after the run. All readers take packed traces, and none judges a damaged one."""
 
 import gzip
+import os
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -189,3 +190,18 @@ def test_programs_are_judged_alike_if_their_traces_are_packed_meanwhile(
     assert finished.result.errors == []
     for key in ("1", "2", "3", "4", "records"):
         assert finished.result.judgements[key].kind == "good", finished.result.judgements[key]
+
+
+def test_link_of_an_agent_never_frees_parts_of_another_file(tmp_path: Path) -> None:
+    """In containers, a link of the harness leads to the file of the agent, and the agent can replace its file."""
+    own, other = tmp_path / "1-1" / NAMES[0], tmp_path / "other"
+    own.parent.mkdir()
+    other.write_bytes(b"x" * 4_000_000)
+    own.symlink_to(other)
+    (tmp_path / NAMES[0]).symlink_to(f"1-1/{NAMES[0]}")
+    os.mkfifo(tmp_path / NAMES[1])
+    for path in (tmp_path / NAMES[0], tmp_path / NAMES[1]):
+        assert not has_finished_part(path)
+        with pytest.raises(OSError, match=r"symbolic links|not a regular file"):
+            pack_parts(path)
+    assert other.read_bytes() == b"x" * 4_000_000
