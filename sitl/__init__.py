@@ -36,7 +36,7 @@ _NAMES_OF = {
     "sitl.plan": ("GoTo", "Land", "Loiter", "Plan", "PlanError", "TakeOff"),
     "sitl.vehicle": ("Home", "Launch", "VehicleError", "VehicleKind"),
 }
-"""Module -> its public names, to import at their first use."""
+"""Module -> its public names. The module is imported when one of these names is first used."""
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 
 if not TYPE_CHECKING:  # a type checker would accept any name

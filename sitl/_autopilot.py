@@ -2,12 +2,12 @@
 parsers.
 
 `Autopilot` is the vehicle. A client exchanges bytes with it through a `ClientChannel` (serial_channel.py). The module
-streams.py contains the messages that the vehicle sends at intervals. Times are simulated seconds since boot.
+streams.py defines the messages that the vehicle sends at intervals. Times are simulated seconds since boot.
 
-The autopilot answers like ArduPilot wherever a client can see a difference. It refuses to arm until its position is
+The autopilot answers like ArduPilot in every way that a client can observe. It refuses to arm until its position is
 known. It acknowledges a mode that is set in the first seconds after boot, and then undoes it. A copter begins a mission
-on command, a plane and a rover as soon as they are armed in AUTO mode. A course of closed formulas moves the vehicle. A
-new movement begins at the exact second at which the previous one ends, whatever the step size of `advance` is.
+on command, a plane and a rover as soon as they are armed in AUTO mode. Formulas determine the motion of the vehicle. A
+new movement begins at the exact second at which the previous one ends, regardless of the step size of `advance`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ACCEPTED, FAILED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_FAIL
 
 
 class MessageListener(Protocol):
-    """An object that receives the messages that the vehicle sends without a request."""
+    """An object that receives the messages that the vehicle sends on its own, without a request."""
 
     def send(self, message: Any) -> None: ...
 
@@ -80,12 +80,12 @@ class Autopilot:
 
     @property
     def ready(self) -> bool:
-        """True if the position is known, so that the vehicle can be armed."""
+        """True if the position is known, so that the vehicle may be armed."""
         return self.has_booted and self.failsafes.has_gps
 
     @property
     def battery_used(self) -> float:
-        """The used share of the battery, from 0 to 1."""
+        """The share of the battery charge that was used, from 0 to 1."""
         return self.used_mah / BATTERY_FULL_MAH
 
     @property
@@ -142,7 +142,7 @@ class Autopilot:
     def disarm(self, force: bool = False) -> int:
         """Disarm the vehicle. Return the result code of the MAVLink command.
 
-        `force` (MAV_CMD_COMPONENT_ARM_DISARM, param2 21196) also works in flight, and the vehicle then falls.
+        With `force` (MAV_CMD_COMPONENT_ARM_DISARM, param2 21196), this also works in flight. The vehicle then falls.
         """
         if self.airborne and self.armed and not force:
             return self._refuse("Disarm refused: in flight")
@@ -197,7 +197,9 @@ class Autopilot:
         return ACCEPTED
 
     def set_speed(self, speed_ms: float) -> int:
-        """Execute MAV_CMD_DO_CHANGE_SPEED, and return the result code. The speed applies from the next place on."""
+        """Execute MAV_CMD_DO_CHANGE_SPEED, and return the result code. The new speed applies to the flight to the next
+        place.
+        """
         if not 0 < speed_ms <= MAX_SPEED_MS:
             return FAILED
         self._speed_ms = speed_ms
@@ -215,9 +217,7 @@ class Autopilot:
         return ACCEPTED
 
     def load(self, mission: Sequence[Any]) -> None:
-        """Replace the mission. A mission in progress continues with the item that has the same number in the new
-        mission.
-        """
+        """Replace the mission. A mission in progress continues in the new mission with the item of the same number."""
         self.mission = mission
         if not self._in_mission:
             self.current_item = 0
@@ -237,7 +237,7 @@ class Autopilot:
                 self._go_on_to(self.place(item.frame, item.x, item.y, item.z), self.current_item)
 
     def hear(self, system: int) -> None:
-        """Process a heartbeat from this system."""
+        """Process a heartbeat from the system with this ID."""
         if system == self.failsafes.parameters[STATION]:
             self.station_heard_s = self.now_s
 
@@ -268,7 +268,7 @@ class Autopilot:
             self.set_mode(MODES[self.vehicle_type][mode])
 
     def _lose_thrust(self) -> None:
-        """Fall, because one of the four motors has failed and the vehicle cannot stay level."""
+        """Let the vehicle fall, because one of its four motors has failed and it cannot stay level."""
         self.say(mavlink.MAV_SEVERITY_EMERGENCY, "Potential Thrust Loss (2)")
         self.say(mavlink.MAV_SEVERITY_EMERGENCY, "Crash: Disarming")
         self.disarm(force=True)
@@ -326,7 +326,7 @@ class Autopilot:
         self.say(mavlink.MAV_SEVERITY_INFO, "Disarming motors")
 
     def _return_home(self, then: Callable[[], None]) -> None:
-        """Return home at RTL altitude. A copter then lands."""
+        """Return home at the altitude of RTL. A copter then lands."""
         if not self.airborne and self.vehicle_type != "rover":
             self._stand()
             return
@@ -341,7 +341,7 @@ class Autopilot:
     # The mission
 
     def _begin_item(self, number: int) -> None:
-        """Continue the mission from this item on. Items without a duration are executed at once."""
+        """Continue the mission with this item. Items without a duration are executed at once."""
         self._in_mission = True
         while number < len(self.mission) and self.mission[number].command == mavlink.MAV_CMD_DO_CHANGE_SPEED:
             self.set_speed(self.mission[number].param2)
@@ -375,15 +375,15 @@ class Autopilot:
                 self._land(place, self._place_before(number))
 
     def _go_on_to(self, place: LocalPlace, number: int) -> None:
-        """Fly to a place from the current position, in the current wind."""
+        """Fly to a place from the current position in the current wind."""
         here = self.motion.point
         bearing_rad = math.atan2(place.east_m - here.east_m, place.north_m - here.north_m)
         speed_ms = self.failsafes.over_ground(self._speed_ms, bearing_rad)
         self._begin(self._model.go_to(self.motion, place, speed_ms, self._place_before(number)), self._item_reached)
 
     def _place_before(self, number: int) -> LocalPlace | None:
-        """Return the place of the previous mission item, without regard to changes of speed. Return None if this item
-        has no place.
+        """Return the place of the previous mission item, ignoring changes of speed. Return None if that item has no
+        place.
         """
         for item in reversed(self.mission[1:number]):
             match item.command:
@@ -417,9 +417,9 @@ class Autopilot:
             self._stay()
 
     def place(self, frame: int, lat_e7: int, lon_e7: int, alt_m: float) -> LocalPlace:
-        """Return the position in metres from home of a place that is given in one of the coordinate frames `FRAMES`.
+        """Convert a place in one of the coordinate frames `FRAMES` to metres from home.
 
-        Latitude and longitude 0 mean the current position.
+        Latitude and longitude 0 stand for the current position.
         """
         up_m = alt_m - self.home.alt_m if frame in ABSOLUTE_FRAMES else alt_m
         if lat_e7 == lon_e7 == 0:
@@ -434,7 +434,7 @@ SAID: dict[Failsafe, str] = {
     "radio": "Radio Failsafe",
     "fence": "fence breached",
 }
-"""ArduPilot's texts."""
+"""Failsafe -> the text with which ArduPilot reports it."""
 
 ABSOLUTE_FRAMES = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
 FRAMES = (*ABSOLUTE_FRAMES, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT)
@@ -448,4 +448,4 @@ ITEM_NAMES: dict[int, str] = {
     mavlink.MAV_CMD_NAV_TAKEOFF: "Takeoff",
     mavlink.MAV_CMD_DO_CHANGE_SPEED: "ChangeSpeed",
 }
-"""The supported mission items, with their names in ArduPilot's texts."""
+"""Number of a supported mission item -> its name in ArduPilot's texts."""

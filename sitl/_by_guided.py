@@ -35,7 +35,7 @@ POSITION_ONLY = (
 
 
 class GuidedFlight:
-    """Take off, then fly to one waypoint after another."""
+    """A flight in GUIDED mode: take off, then fly to one waypoint after another."""
 
     purpose = "fly its plan"
 
@@ -109,7 +109,7 @@ class GuidedFlight:
     def _on_its_way(self) -> bool:
         """Return true if the vehicle has accepted its target.
 
-        A plane acknowledges it, and other vehicles begin to move.
+        A plane acknowledges its target. Other vehicles begin to move.
         """
         if self._to.vehicle_type == "plane":
             return self._to.accepted(mavlink.MAV_CMD_DO_REPOSITION)

@@ -20,9 +20,11 @@ STARTS = (mavlink.MAV_CMD_MISSION_START, mavlink.MAV_CMD_DO_SET_MODE)
 
 
 class MissionFlight:
-    """Upload, arm, start, and follow the waypoints. A copter is armed in GUIDED mode, the other types in AUTO mode.
+    """A flight as a mission: upload the plan, arm, start, and count the waypoints. A copter is armed in GUIDED mode,
+    the other types in AUTO mode.
 
-    `under_way` means that the vehicle flies already. It then disarms at the end of its flight, and not before a start.
+    `under_way` is true if the vehicle is already flying. A disarmed vehicle then has finished its flight, and is not
+    waiting for a start.
     """
 
     purpose = "fly its plan"
@@ -62,7 +64,7 @@ class MissionFlight:
         return self._legs[self._done]
 
     def _count(self) -> None:
-        """Count the completed waypoints. A landing is complete when the vehicle is disarmed."""
+        """Count the waypoints that are complete. A landing is complete when the vehicle is disarmed."""
         state = self._to.state
         reached, heading_for = state.reached or 0, state.item or 0
         while self._done < len(self._waypoints):

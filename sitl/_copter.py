@@ -1,4 +1,6 @@
-"""Compute the motion of a copter, from ArduCopter's default parameters or from measurements with ArduCopter 4.7."""
+"""Compute the motion of a copter. The values are ArduCopter's default parameters, or measurements with ArduCopter
+4.7.
+"""
 
 from __future__ import annotations
 

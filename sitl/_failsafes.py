@@ -1,8 +1,8 @@
 """Simulate faults of the embedded vehicle, and decide when its failsafes act.
 
 Parameters have the names of ArduPilot and its simulation. The vehicle has a GPS, a battery, a receiver of a remote
-control, a fence and, if it is a copter, motors. A plane is affected by wind. There is no compass. Parameters of missing
-parts are unknown to the vehicle.
+control, a fence and, if it is a copter, motors. A plane is affected by wind. It has no compass. The vehicle does not
+know parameters of parts that it does not have.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ WIND, WIND_FROM = "SIM_WIND_SPD", "SIM_WIND_DIR"
 LOW_AT, CRITICAL_AT, LOW_FOR = "BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_TIMER"
 WHEN_LOW, WHEN_CRITICAL = "BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"
 BATTERY = {LOW_AT: 0.0, CRITICAL_AT: 0.0, LOW_FOR: 10.0, WHEN_LOW: 0.0, WHEN_CRITICAL: 0.0}
-"""ArduPilot's defaults: the battery is never low. A copter's battery can be low, but that has no effect."""
+"""ArduPilot's default parameters for the battery. With them, the battery is never low. A copter's battery can be low,
+but this has no effect.
+"""
 COPTER_LOW_V = 10.5
 
 ACTIONS: dict[VehicleType, dict[float, str]] = {
@@ -32,7 +34,7 @@ ACTIONS: dict[VehicleType, dict[float, str]] = {
     "plane": {1: "RTL", 2: "RTL"},
     "rover": {1: "RTL", 2: "HOLD", 3: "RTL", 4: "HOLD"},
 }
-"""The modes that BATT_FS_..._ACT selects if no better way home is known. Other values select none."""
+"""The modes that the values of BATT_FS_..._ACT select if no better way home is known. Other values select no mode."""
 
 RC_FAIL, RC_SILENT_S = "SIM_RC_FAIL", 1.0
 STATION = "MAV_GCS_SYSID"
@@ -44,10 +46,13 @@ LINKS: dict[VehicleType, dict[str, float]] = {
     "plane": {STATION_SILENT: 5.0, "FS_GCS_ENABL": 0.0, "THR_FAILSAFE": 1.0, "FS_LONG_ACTN": 0.0},
     "rover": {STATION_SILENT: 5.0, "FS_GCS_ENABLE": 0.0, "FS_THR_ENABLE": 1.0, "FS_ACTION": 2.0},
 }
-"""Parameters of the failsafes for the ground station and the remote control, with ArduPilot's defaults. A plane of
-ArduPilot has its timeout in FS_LONG_TIMEOUT."""
+"""Parameters of the failsafes for the ground station and the remote control, with ArduPilot's default values. For a
+plane, ArduPilot has the timeout in FS_LONG_TIMEOUT.
+"""
 LINK_ACTION: dict[VehicleType, str] = {"plane": "FS_LONG_ACTN", "rover": "FS_ACTION"}
-"""The parameter with the action of both failsafes. A copter has it in the parameters that enable them."""
+"""The parameter with the action of both failsafes. For a copter, the parameters that enable the failsafes contain the
+action.
+"""
 STATION_ACTIONS = {1.0: "RTL", 2.0: "RTL", 3.0: "RTL", 4.0: "LAND", 5.0: "LAND", 6.0: "RTL", 7.0: "LAND"}
 RC_ACTIONS = {1.0: "RTL", 2.0: "RTL", 3.0: "LAND", 4.0: "RTL", 5.0: "LAND", 6.0: "RTL", 7.0: "LAND"}
 
@@ -64,7 +69,7 @@ Failsafe = Literal["ekf", "battery low", "battery critical", "station", "radio",
 
 
 class Failsafes:
-    """The failsafes of one vehicle. Times are seconds on its own clock."""
+    """The failsafes of one vehicle. Times are seconds on the vehicle's own clock."""
 
     def __init__(self, vehicle_type: VehicleType) -> None:
         self.parameters = {GPS: 1.0, VOLTS: BATTERY_FULL_V, **BATTERY, RC_FAIL: 0.0, STATION: 255.0}
@@ -79,9 +84,9 @@ class Failsafes:
         if vehicle_type == "plane":
             self.parameters |= {WIND: 0.0, WIND_FROM: 180.0}
         self.acting: list[Failsafe] = []
-        """Failsafes that have acted, and whose cause still exists."""
+        """Failsafes that have acted and whose cause still exists."""
         self._since_s: dict[Failsafe, float] = {}
-        """The time at which the cause of a pending failsafe began."""
+        """Failsafe -> the time at which its cause began. Only failsafes that have not acted yet are included."""
 
     @property
     def has_gps(self) -> bool:
@@ -92,18 +97,20 @@ class Failsafes:
         return self.parameters.get(THRUST, 1.0) < 0.5
 
     def over_ground(self, speed_ms: float, bearing_rad: float) -> float:
-        """Return the ground speed for an air speed and a bearing. Bearings are clockwise from north."""
+        """Return the ground speed for an air speed and a bearing in the current wind. Bearings are clockwise from
+        north.
+        """
         from_rad = math.radians(self.parameters.get(WIND_FROM, 0.0))
         head_ms = self.parameters.get(WIND, 0.0) * math.cos(bearing_rad - from_rad)
         return max(SLOWEST_MS, speed_ms - head_ms) if head_ms else speed_ms
 
     def volts(self, used: float) -> float:
-        """Return the battery voltage after the share `used` of the charge, 0 to 1, was used."""
+        """Return the battery voltage after the share `used` (0 to 1) of the charge was used."""
         return max(0.0, self.parameters[VOLTS] - BATTERY_USED_V * used)
 
     def action(self, failsafe: Failsafe) -> str | None:
-        """Return the flight mode that the vehicle enters when this failsafe acts. Return None if it stays in its mode.
-        The failsafe concerns the battery, a link or the fence.
+        """Return the flight mode that the vehicle enters when this failsafe acts. Return None if the vehicle stays in
+        its mode. The failsafe must be one of the battery, a link or the fence.
         """
         kind = self._vehicle_type
         if failsafe == "fence":
@@ -130,10 +137,11 @@ class Failsafes:
         return silent and self._is_on(WHEN_SILENT)
 
     def look(self, now_s: float, used: float, place: LocalPlace, station_heard_s: float | None) -> Failsafe | None:
-        """Return the next failsafe that acts now. Return None if there is none. The caller repeats the call until then.
+        """Return the next failsafe that acts now. Return None if none acts. The caller repeats the call until the
+        result is None.
 
-        `place` is in metres from home. `station_heard_s` is the time of the last heartbeat of the ground station. None
-        means that it was never heard, and the vehicle does not miss it then.
+        `place` is in metres from home. `station_heard_s` is the time of the last heartbeat of the ground station. If it
+        is None, no heartbeat was ever received, and the failsafe of the ground station does not act.
         """
         volts = self.volts(used)
         low_for_s = self.parameters[LOW_FOR]

@@ -1,8 +1,8 @@
 """Describe the motion of vehicles as sequences of segments. Each segment is a formula of the time since its beginning.
 
-There are no dynamics and no time steps, so a position does not depend on how often it is computed. A process that wakes
-once in twenty simulated seconds and a simulation in virtual time compute the same track. The motions of copters, planes
-and rovers are in _copter.py, _plane.py and _rover.py.
+The formulas do not simulate forces or time steps, so a position does not depend on how often it is computed. A process
+that wakes once in twenty simulated seconds and a simulation in virtual time compute the same track. The motions of
+copters, planes and rovers are in _copter.py, _plane.py and _rover.py.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class MotionSegment(Protocol):
         """The duration of the segment in seconds, or math.inf if it has no end."""
 
     def at(self, since_s: float) -> MotionState:
-        """Return the motion at a time since the beginning, 0 to `duration_s`."""
+        """Return the motion at a time since the beginning of the segment, from 0 to `duration_s`."""
 
 
 class RestSegment:
@@ -73,10 +73,11 @@ class RestSegment:
 
 
 class StraightLine:
-    """A straight line: the speed changes from `from_ms` to `speed_ms`, and at the end to `to_ms`, with `accel_ms2`.
+    """A straight line. The speed changes from `from_ms` to `speed_ms`, and at the end to `to_ms`, with the acceleration
+    `accel_ms2`.
 
-    On a short line the profile is triangular. The line must be long enough for the change from `from_ms` to `to_ms`.
-    The vehicle heads along the line. On a vertical line it keeps its heading.
+    On a short line the speed profile is triangular. The line must be long enough for the change from `from_ms` to
+    `to_ms`. The heading is the direction of the line. On a vertical line, the heading does not change.
     """
 
     def __init__(
@@ -146,7 +147,7 @@ class CircularArc:
 
 
 class ClimbingSegment:
-    """A level segment, with a climb or descent at `rate_ms` to the altitude `up_m`."""
+    """A level segment to which a climb or descent is added, at `rate_ms` to the altitude `up_m`."""
 
     def __init__(self, level: MotionSegment, up_m: float, rate_ms: float) -> None:
         self._level, self._up_m = level, up_m
@@ -163,7 +164,7 @@ class ClimbingSegment:
 
 
 class FallSegment:
-    """A fall to the ground without power and drag."""
+    """A fall to the ground without power and air resistance."""
 
     def __init__(self, start: MotionState) -> None:
         self._start = start
@@ -187,9 +188,7 @@ class FallSegment:
 
 
 class PlannedMotion:
-    """A sequence of segments that begins at `begin_s`. All times are seconds of the same clock, which the caller
-    chooses.
-    """
+    """A sequence of segments that begins at `begin_s`. All times are seconds of one clock, which the caller chooses."""
 
     def __init__(self, begin_s: float, segments: Sequence[MotionSegment]) -> None:
         """Create a motion from at least one segment. Only the last segment may be infinite."""
@@ -198,11 +197,13 @@ class PlannedMotion:
 
     @property
     def rests_from_s(self) -> float:
-        """The time from which the position stays the same, or infinity if there is none."""
+        """The time from which the position does not change any more. Infinity if it always changes."""
         return self._begin_s[-1] if isinstance(self._segments[-1], RestSegment) else self.end_s
 
     def at(self, now_s: float) -> MotionState:
-        """Return the motion at the time `now_s`. For a time outside the sequence, use its nearer end."""
+        """Return the motion at the time `now_s`. For a time outside the sequence, return the motion at its nearer
+        end.
+        """
         index = max(0, bisect.bisect_right(self._begin_s, now_s) - 1)
         segment = self._segments[index]
         return segment.at(min(max(0.0, now_s - self._begin_s[index]), segment.duration_s))

@@ -1,4 +1,4 @@
-"""Compute the motion of a plan in GUIDED mode, in which each leg ends when the pilot notices its end."""
+"""Compute the motion of a plan in GUIDED mode, in which each leg ends when the pilot detects its end."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ FAST = 4.0  # limit of a vehicle's speed as a multiple of the commanded one
 def leg_by_leg(
     waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState
 ) -> tuple[list[MotionSegment], MotionSegment]:
-    """Return the segments up to the last completed waypoint, and the motion that follows if the pilot sends no further
-    commands.
+    """Return the segments up to the last completed waypoint. They are followed by the motion of a vehicle that gets no
+    further commands.
 
-    A waypoint that takes longer than the pilot's time limit is the last one.
+    If a waypoint takes longer than the pilot's time limit, the flight ends with it.
     """
     model, motion, goal = AT_ONCE[vehicle_type], start, None
     flown: list[MotionSegment] = []
@@ -44,7 +44,9 @@ def leg_by_leg(
 def _made_s(
     course: PlannedMotion, since_s: float, waypoint: Waypoint, vehicle_type: VehicleType, limit_s: float
 ) -> float:
-    """Return the time at which the motion completes a waypoint. Return infinity if that is not before `limit_s`."""
+    """Return the time at which the motion completes a waypoint. Return infinity if it does not complete the waypoint
+    before `limit_s`.
+    """
     now_s = since_s
     while now_s < limit_s:
         place = course.at(now_s).point

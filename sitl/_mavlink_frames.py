@@ -8,15 +8,15 @@ _HEADER_BYTES = 3  # bytes that determine the length of a frame
 
 
 class FrameSplitter:
-    """Divides the bytes of one vehicle into frames. Other bytes are skipped."""
+    """A splitter that divides the bytes of one vehicle into frames, and skips all other bytes."""
 
     def __init__(self) -> None:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Return the frames that end in these bytes.
+        """Add bytes, and return the frames that are complete now.
 
-        The splitter keeps less than one frame, which is at most 292 bytes.
+        The splitter stores less than one frame, which has at most 292 bytes.
         """
         stream, at, frames = self._rest + data, 0, []
         while len(stream) - at >= _HEADER_BYTES:

@@ -1,8 +1,9 @@
 """Implement the vehicle's side of the MAVLink mission protocol: receive a mission, and send the current one.
 
-The vehicle requests a mission item by item. The mission replaces the old one when it is complete. There are no timers:
-a client without an answer sends MISSION_COUNT again, which restarts the transfer. Results equal those of ArduPilot
-(https://mavlink.io/en/services/mission.html; MAV_MISSION_RESULT). Item 0 is home, and the vehicle keeps its own.
+The vehicle requests a mission item by item. The mission replaces the old one when it is complete. The vehicle needs no
+timers, because a client without an answer sends MISSION_COUNT again, which restarts the transfer. Results equal those
+of ArduPilot (https://mavlink.io/en/services/mission.html; MAV_MISSION_RESULT). Item 0 is the home position. The vehicle
+keeps its own home position.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class MissionInbox:
 
 
 def _sender(message: Any) -> tuple[int, int]:
-    """Return the system and component ID of the sender, to which the answer goes."""
+    """Return the system and component ID of the sender, to which the answer must be sent."""
     return message.get_srcSystem(), message.get_srcComponent()
 
 

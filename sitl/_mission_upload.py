@@ -1,6 +1,7 @@
 """Convert a route to a MAVLink mission and upload the mission. This module is the pilot's side of the mission protocol.
 
-https://mavlink.io/en/services/mission.html. Item 0 is home. ArduPilot replaces it by its own.
+https://mavlink.io/en/services/mission.html. Item 0 is the home position. ArduPilot replaces it by its own home
+position.
 """
 
 from __future__ import annotations

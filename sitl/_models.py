@@ -29,21 +29,21 @@ class MotionModel(Protocol):
     def go_to(
         self, start: MotionState, place: LocalPlace, speed_ms: float, before: LocalPlace | None = None
     ) -> Sequence[MotionSegment]:
-        """Go to a place. A plane first returns to the straight line from its previous place `before`."""
+        """Go to a place. A plane first returns to the straight line from `before`, its previous place."""
 
     def loiter(
         self, start: MotionState, place: LocalPlace, speed_ms: float, seconds: float, after: LocalPlace | None = None
     ) -> Sequence[MotionSegment]:
         """Go to `place` and stay there for `seconds`, which may be infinite.
 
-        A plane continues its circle until it heads for `after`, its next place.
+        A plane continues its circle until it flies towards `after`, its next place.
         """
 
     def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[MotionSegment]:
         """Land at `place`, and stop there. `before` is used as in `go_to`."""
 
     def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
-        """Take off without a mission, and then continue with the default behaviour without end."""
+        """Take off without a mission. Then stay, or circle if the vehicle is a plane, without end."""
 
 
 MODELS: dict[VehicleType, MotionModel] = {"copter": CopterMotion(), "plane": PlaneMotion(), "rover": RoverMotion()}

@@ -1,4 +1,4 @@
-"""Record the commands that an operator sends from a ground station, up to a maximum number."""
+"""Record the commands that an operator sends from a ground station. The number of recorded commands is limited."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 MOST_COMMANDS = 1000
-"""Maximum number of recorded commands. Further ones are only counted."""
+"""Maximum number of recorded commands. Further commands are only counted."""
 
 _ASKS_ONLY = re.compile(r"MAV_CMD_(REQUEST_|GET_|SET_MESSAGE_INTERVAL$|RUN_PREARM_CHECKS$|DO_SEND_BANNER$)")
-"""Commands that only make a vehicle answer. Ground stations send them by themselves."""
+"""Names of commands that only make a vehicle answer. Ground stations send them automatically."""
 
 _AT_THE_STICKS = frozenset({"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"})
-"""Messages that are sent many times per second. Consecutive ones make one entry."""
+"""Names of messages that are sent many times per second. Consecutive messages form one entry."""
 
 _COMMANDS = frozenset(
     {
@@ -35,7 +35,7 @@ _COMMANDS = frozenset(
     }
 )
 _SETTINGS = frozenset({"PARAM_SET"})
-"""Messages that change a vehicle, but do not fly it."""
+"""Names of messages that change a vehicle but do not fly it."""
 
 _ADDRESS = frozenset({"target_system", "target_component", "command", "mavpackettype"})
 
@@ -50,7 +50,7 @@ class CommandLog:
     def note(self, message: Any, vehicle_ids: Iterable[int], at_s: float) -> bool:
         """Record a message to these vehicles at mission second `at_s`, if it is a command.
 
-        Returns whether the operator flies the vehicles from now on.
+        Return true if the operator flies the vehicles from now on.
         """
         kind = message.get_type()
         if kind not in _COMMANDS | _SETTINGS or _ASKS_ONLY.match(_command(message) or ""):
@@ -85,7 +85,9 @@ def _command(message: Any) -> str | None:
 
 
 def _values(message: Any) -> dict[str, Any]:
-    """Return the fields of the message, without its address, as JSON values. For joystick messages they are empty."""
+    """Return the fields of the message as JSON values, without its address. The result is empty for joystick
+    messages.
+    """
     if message.get_type() in _AT_THE_STICKS:
         return {}
     values = {name: getattr(message, name) for name in message.get_fieldnames() if name not in _ADDRESS}

@@ -1,6 +1,6 @@
 """Connect a pilot to its vehicle: track the vehicle's state, write the telemetry log, and send messages.
 
-One process has a link for each vehicle of a run. Therefore a link has no thread, only an asyncio protocol and a timer.
+One process has a link for each vehicle of a run. To save threads, a link consists of an asyncio protocol and a timer.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from sitl.vehicle import Home
 
 STATION_SYSTEM = 255  # ArduPilot's default for the ground station
 STATION_PARAMETERS = ("MAV_GCS_SYSID", "SYSID_MYGCS")
-"""Parameters with the system ID of the vehicle's ground station, since ArduPilot 4.7 and before."""
+"""Names of the parameter with the system ID of the vehicle's ground station: since ArduPilot 4.7, and before."""
 PILOT_SYSTEMS = (254, 253)
-"""System IDs of the pilot. The second one is for a vehicle that has the first one."""
+"""System IDs of the pilot. The second one is used for a vehicle that itself has the first ID."""
 HEARTBEAT_INTERVAL_S = 1.0  # wall time
 MAX_HEARTBEAT_INTERVAL_S = 2.0  # simulated: ArduPilot's ground station failsafe acts after 5 (FS_GCS_TIMEOUT)
 LOW_M = 2.0  # a vehicle below this may lie on the ground
@@ -46,16 +46,16 @@ TELEMETRY = (
 class PilotLink(asyncio.Protocol):
     """A connection to one vehicle over a connected socket. It may be used in one event loop only.
 
-    The link sends two kinds of heartbeats. Those of the pilot have a system ID of their own. Those of a ground station
-    have the ID that the vehicle expects of its ground station, because its failsafe watches for them. They stop while
-    `station_is_heard` is false. A run with a real ground station sets `plays_station` to false.
+    The link sends two kinds of heartbeats. The heartbeats of the pilot have the pilot's system ID. The heartbeats of a
+    ground station have the ID that the vehicle expects from its ground station, because its failsafe acts without them.
+    They stop while `station_is_heard` is false. A run with a real ground station sets `plays_station` to false.
 
     `heard` is set when data arrives and when the connection ends. `closed` is set only when it ends. Times in
     `heard_at`, `heartbeat_at` and `position_at` come from time.monotonic().
     """
 
     def __init__(self, sysid: int, sock: socket.socket, tlog: Path, speedup: float, home: Home) -> None:
-        """Take over `sock`, which is connected to the vehicle that was started at `home`.
+        """Take over `sock`, a socket that is connected to the vehicle. The vehicle was started at `home`.
 
         Raises OSError if `tlog` cannot be opened.
         """
@@ -114,7 +114,7 @@ class PilotLink(asyncio.Protocol):
         await asyncio.get_running_loop().create_connection(lambda: self, sock=self._socket)
 
     async def close(self) -> None:
-        """End the connection and complete the telemetry log. May be called twice, and before `start`."""
+        """End the connection and complete the telemetry log. It may be called twice, and before `start`."""
         if self._transport is None:
             self._socket.close()
             self._end_log()
@@ -127,7 +127,7 @@ class PilotLink(asyncio.Protocol):
         """The simulated seconds per second of real time since the first message, divided by the speedup. None if too
         little time has passed.
 
-        1.0 means a fast enough machine.
+        With the value 1.0, the machine is fast enough.
         """
         if self._first_time is None or self._last_time is None:
             return None
@@ -137,7 +137,7 @@ class PilotLink(asyncio.Protocol):
         return (self._last_time[1] - self._first_time[1]) / wall_s / self.speedup
 
     def request_telemetry(self) -> None:
-        """Request the messages of TELEMETRY, unless they were requested a moment ago."""
+        """Request the messages of TELEMETRY, unless they were requested very recently."""
         interval_s = max(TELEMETRY_INTERVAL_S, MIN_TELEMETRY_INTERVAL_S * self.speedup)
         now, patience_s = time.monotonic(), max(1.0, PATIENCE_INTERVALS * interval_s / self.speedup)
         if self._asked_at is not None and now - self._asked_at < patience_s:
@@ -273,7 +273,7 @@ class PilotLink(asyncio.Protocol):
             self._tlog = None
 
     def _give_up_log(self, error: OSError) -> None:
-        """Stop writing the telemetry log after an error, such as a full disk. The flight continues."""
+        """Stop writing the telemetry log after an error, for example on a full disk. The flight continues."""
         self.state.log_error = f"telemetry log {self.tlog_path}: {error.strerror}"
         if self._tlog is not None:
             self._tlog.abandon()

@@ -1,7 +1,7 @@
 """Compute the motion of a plane in arcs and straight lines, never slower than its minimum flying speed.
 
-The figures are those of ArduPlane's SITL (plane.parm), or measurements with ArduPlane 4.7 where noted. Turns are the
-shortest ones, as in the paths of Dubins (1957). ArduPlane's L1 controller flies turns that differ by some tens of
+The values are those of ArduPlane's SITL (plane.parm), or measurements with ArduPlane 4.7 where this is noted. Turns are
+the shortest ones, as in the paths of Dubins (1957). ArduPlane's L1 controller flies turns that differ by some tens of
 metres.
 """
 
@@ -58,7 +58,7 @@ ROLL_OUT_ACCEL_MS2 = LANDING_MS**2 / (2 * (ROLL_OUT_M + PAST_M))
 
 
 class PlaneMotion:
-    """The motion of a plane: it passes the places of a plan, and circles where it must stay."""
+    """The motion of a plane. It passes the places of a plan, and flies circles where it must stay."""
 
     cruise_ms = CRUISE_MS
 
@@ -68,7 +68,7 @@ class PlaneMotion:
         return [*run, *path.segments]
 
     def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
-        """Take off as in mode TAKEOFF: fly to the left side of a circle ahead, and circle without end."""
+        """Take off as in mode TAKEOFF: fly to the left side of a circle ahead, and then circle without end."""
         run, path = _lift_off(start, altitude_m, min(LEVEL_M, altitude_m))
         place = _ahead(start, AHEAD_M)._replace(up_m=altitude_m)
         path.straight_to(_on_circle(place, LOITER_RADIUS_M, start.yaw_rad - math.pi / 2))
@@ -122,10 +122,10 @@ class PlaneMotion:
 
 
 def _until_heading_for(there: LocalPlace, centre: LocalPlace, here: MotionState) -> float:
-    """Return the angle in radians by which to continue on a circle, until the plane flies towards a place within
+    """Return the angle in radians for which the plane continues on a circle until it flies towards a place, within
     ArduPlane's tolerance.
 
-    0 if the place is so near that the plane never heads for it.
+    Return 0 if the place is so near that the plane never flies towards it.
     """
     away_m, radius_m = math.dist(centre[:2], there[:2]), math.dist(centre[:2], here.point[:2])
     if away_m < 1.05 * radius_m:
@@ -136,7 +136,7 @@ def _until_heading_for(there: LocalPlace, centre: LocalPlace, here: MotionState)
 
 
 def loiter_radius_m(speed_ms: float) -> float:
-    """Return the radius of the circle around a place at this airspeed."""
+    """Return the radius in metres of the circle that a plane flies around a place at this airspeed."""
     return LOITER_RADIUS_M + LOITER_RADIUS_M_PER_MS * (speed_ms - CRUISE_MS)
 
 
@@ -165,7 +165,7 @@ class _PlanePath:
     def fly_by(self, place: LocalPlace, reached_m: float, rather_left_m: float = 0.0) -> None:
         """Turn towards `place` by the shorter turn, and fly straight until the distance is `reached_m`.
 
-        The right turn must be shorter by more than `rather_left_m`.
+        The right turn is chosen only if it is shorter by more than `rather_left_m`.
         """
         here = self._end
         if math.dist(here.point[:2], place[:2]) <= max(reached_m, NEAR_M):
@@ -195,7 +195,7 @@ class _PlanePath:
 def _lift_off(
     start: MotionState, altitude_m: float, straight_to_m: float
 ) -> tuple[Sequence[MotionSegment], _PlanePath]:
-    """Return the motion on the ground before take-off, and a path that climbs to `altitude_m`."""
+    """Return the motion on the ground before the take-off, and a path that climbs to `altitude_m`."""
     run = StraightLine(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
     path = _PlanePath(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
     path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
@@ -226,7 +226,9 @@ def _fly_by(
 
 
 class _TurnToPlace(NamedTuple):
-    """A turn after which a place is straight ahead: its centre, its clockwise angle, and the remaining distance."""
+    """A turn after which a place is straight ahead: its centre, its clockwise angle, and the distance that remains
+    after it.
+    """
 
     centre: tuple[float, float]
     turn_rad: float
@@ -234,7 +236,7 @@ class _TurnToPlace(NamedTuple):
 
 
 def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather_left_m: float) -> _TurnToPlace | None:
-    """Return the turn with the shorter path. Return None if the place is inside both possible circles."""
+    """Return the turn with the shorter path. Return None if the place is inside the circles of both turns."""
     ways = []
     for side in (1, -1):  # to the right, to the left
         centre = _beside(start, side * radius_m)
@@ -283,7 +285,7 @@ def _on_circle(place: LocalPlace, radius_m: float, bearing_rad: float) -> LocalP
 
 
 def _towards(place: LocalPlace, other: LocalPlace, length_m: float) -> LocalPlace:
-    """Return the point at this distance from a place in the direction of the other place, but not beyond it."""
+    """Return the point at this distance from `place` towards `other`, but not beyond `other`."""
     away_m = max(math.dist(place[:2], other[:2]), NEAR_M)
     part = min(1.0, length_m / away_m)
     north_m, east_m = (a + part * (b - a) for a, b in zip(place[:2], other[:2], strict=True))

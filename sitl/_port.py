@@ -1,7 +1,7 @@
 """One TCP port of the embedded vehicle, for at most one client. It never blocks, and its memory is limited.
 
-A client that reads too slowly loses telemetry, and the vehicle does not wait for it. ArduPilot does wait at a speedup
-above 1. A second client can connect, but receives nothing until the first disconnects, as with ArduPilot.
+A client that reads too slowly loses telemetry, because the vehicle does not wait for it. ArduPilot waits if the speedup
+is above 1. A second client can connect, but receives nothing until the first disconnects, as with ArduPilot.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Convert a flight plan to a route with a place, an altitude and a speed for each leg, and an approach for a plane.
 
-The pilot, which flies a plan, and track.py, which computes its track, both use the route. Therefore they agree.
+The pilot flies this route, and track.py computes the track from the same route. The two therefore agree.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ GRACE_S = 120.0
 
 CLIMBED = 0.95  # share of the commanded altitude that counts as reached, as in ArduPilot's tests
 NEAR_M: dict[VehicleType, float] = {"copter": 2.0, "plane": 120.0, "rover": 5.0}
-"""Distance at which a place is reached in GUIDED mode: WPNAV_RADIUS, 1.5 times WP_LOITER_RAD, and about WP_RADIUS."""
+"""Distance in metres at which a place counts as reached in GUIDED mode: WPNAV_RADIUS, 1.5 times WP_LOITER_RAD, and
+about WP_RADIUS.
+"""
 NEAR_UP_M = 10.0
 
 APPROACH_SLOPE = 0.1  # of a plane: it begins to land ten times as far away as it is high
@@ -31,7 +33,9 @@ Kind = Literal["take_off", "go_to", "loiter", "land"]
 
 @dataclass(frozen=True)
 class Waypoint:
-    """One action of a route at `place`. `speed_ms` is the speed on the way there, and `seconds` the time to stay."""
+    """One action of a route at `place`. `speed_ms` is the speed of the flight to this place, and `seconds` is the time
+    to stay.
+    """
 
     leg: str  # of the plan, in words: "leg 2 of 5 (...)"
     kind: Kind
@@ -81,13 +85,13 @@ def is_near(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) ->
 
 
 def to_go_m(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
-    """Return the remaining distance over the ground in metres. It is negative inside the tolerance."""
+    """Return the remaining distance over the ground to the waypoint in metres. It is negative inside the tolerance."""
     return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
 
 
 def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> int | None:
-    """Return the index of the waypoint at which a plane's landing begins. Return None if the route has no landing. The
-    landing is always a mission.
+    """Return the index of the waypoint at which a plane's landing begins. Return None if the route has no landing. A
+    plane's landing is always a mission.
     """
     return len(waypoints) - 2 if vehicle_type == "plane" and waypoints[-1].kind == "land" else None
 
@@ -95,7 +99,7 @@ def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> 
 def _approach(place: LocalPlace, heading_deg: float) -> LocalPlace:
     """Return the place at which a plane begins to land at `place`.
 
-    It lies before it on the runway, along home's heading.
+    This place is before the landing on the line of the runway, which has the heading of home.
     """
     before_m, heading = place.up_m / APPROACH_SLOPE, math.radians(heading_deg)
     return LocalPlace(

@@ -1,4 +1,4 @@
-"""Read text files that a user names. The files must be regular and of limited size."""
+"""Read text files that a user names. Only regular files of limited size are read."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ _LINK_BITS = 3
 
 
 class TelemetryLog:
-    """A .tlog file to which frames are appended. A restarted vehicle continues its file. Methods raise OSError."""
+    """A .tlog file to which frames are appended. A restarted vehicle continues the same file. Methods raise OSError."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("ab")

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class ReportedPosition:
-    """A reported position in degrees, with its height in metres above sea level and above home.
+    """A reported position in degrees, with its heights in metres above sea level and above home.
 
-    The movement is in metres per second north, east and up. The heading is in degrees clockwise from north, None if
-    unknown.
+    The movement is in metres per second north, east and up. The heading is in degrees clockwise from north. It is None
+    if unknown.
     """
 
     lat_deg: float
@@ -26,7 +26,7 @@ class ReportedPosition:
 
 @dataclass(frozen=True)
 class Battery:
-    """The voltage and the remaining share (0 to 1) of a battery. None means unknown."""
+    """The voltage and the remaining share (0 to 1) of a battery. A value of None is unknown."""
 
     voltage_v: float | None
     left: float | None

@@ -37,9 +37,10 @@ class ListenAddress:
 
 
 def connected(address: ListenAddress) -> socket.socket:
-    """Return a UDP socket for this address only. Nothing is sent. Raises VehicleError if the address cannot be reached.
+    """Return a UDP socket that is connected to this address. The function sends nothing. Raises VehicleError if the
+    address cannot be reached.
 
-    If a name has both, the IPv4 address is used, because ground stations listen on it.
+    If a host name has IPv4 and IPv6 addresses, the IPv4 address is used, because ground stations listen on it.
     """
     try:
         ways = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM)

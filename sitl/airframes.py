@@ -1,8 +1,9 @@
 """List ArduPilot's frames: the type of vehicle, the model name, and the default parameters of each.
 
-The table has the frames of ArduPilot's sim_vehicle.py that its own simulation flies. The default parameters are files
-of ArduPilot's Tools/autotest, which are applied in order. Names must match exactly. ArduPilot's programs compare only
-the start of a name: they take `hexacopter` for a `hexa`, but it never takes off without the parameters of a hexa.
+The table contains those frames of ArduPilot's sim_vehicle.py that ArduPilot's own simulation flies. The default
+parameters are files of ArduPilot's Tools/autotest, which are applied in order. Names must match exactly. ArduPilot's
+programs compare only the beginning of a name. They accept `hexacopter` as `hexa`, but such a vehicle never takes off
+without the parameters of a hexa.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from sitl.vehicle import VehicleError, VehicleType
 
 BINARIES: dict[VehicleType, str] = {"copter": "arducopter", "plane": "arduplane", "rover": "ardurover"}
 DEFAULTS: dict[VehicleType, str] = {"copter": "copter.parm", "plane": "plane.parm", "rover": "rover.parm"}
-"""Parameter files of ArduPilot's Tools/autotest (default_params, models), in the directory of the binary."""
+"""Type of vehicle -> parameter files of ArduPilot's Tools/autotest (default_params, models), in the directory of the
+binary.
+"""
 
 HELI = "arducopter-heli"
 
@@ -61,7 +64,7 @@ NOT_FLOWN = {
     "blimp": "Blimp",
     "tracker": "AntennaTracker",
 }
-"""Frames of programs that this pilot cannot fly, although each ArduPilot binary offers them."""
+"""Frames that this pilot cannot fly, although ArduPilot binaries offer them."""
 
 _ALIASES = {"helicopter": "heli", "boat": "motorboat", "quad": "+"}
 
@@ -145,7 +148,7 @@ _TABLE = _table()
 
 def stacked(vehicle_type: VehicleType) -> list[str]:
     """Return the names of the parameter files that frames use in addition to the usual file of the vehicle type. Only
-    frames of the type's usual program count.
+    frames of the usual program for this type are included.
     """
     program, own = BINARIES[vehicle_type], DEFAULTS[vehicle_type]
     frames = (frame for frame in _TABLE.values() if frame.program == program)

@@ -1,9 +1,9 @@
 """Find a binary of ArduPilot SITL, and start it without user interaction.
 
 The command line is that of ArduPilot's SITL (`arducopter --help`, developer documentation "SITL Simulator"). Each
-vehicle is instance 0 in its own network namespace, and so has the same ports. Builds with CAN need a multicast route in
-this namespace, or exit with status 1. The directory of a vehicle contains copies of its parameters, and `eeprom.bin`
-and `logs/` from ArduPilot. The run directory therefore documents the parameters of each vehicle.
+vehicle is instance 0 in its own network namespace, so all vehicles have the same ports. Builds with CAN need a
+multicast route in this namespace, or exit with status 1. The directory of a vehicle contains copies of its parameters,
+and `eeprom.bin` and `logs/` from ArduPilot. The run directory therefore documents the parameters of each vehicle.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ _ELF_NAMES = {number: name for machines in _ELF_MACHINES.values() for number, na
 class ArduPilot:
     """A kind of vehicle that runs ArduPilot SITL: an executable, its files of default parameters, and its settings.
 
-    `defaults` are the files that lie beside the executable. `missing` are those that its frame needs and that do not.
+    `defaults` are the parameter files next to the executable. `missing` are files that its frame needs but that are not
+    there.
     """
 
     binary: Path
@@ -79,7 +80,7 @@ class ArduPilot:
 
     @property
     def frame(self) -> str:
-        """The name of the frame in ArduPilot."""
+        """ArduPilot's name of the frame."""
         return self._airframe.model
 
     @property
@@ -88,7 +89,7 @@ class ArduPilot:
 
     @property
     def uses_udp(self) -> bool:
-        """True, because a binary with CAN support sends itself multicast datagrams."""
+        """True: an ArduPilot binary with CAN support sends itself multicast datagrams."""
         return True
 
     @property
@@ -109,7 +110,8 @@ class ArduPilot:
         vehicle_type: VehicleType = "copter",
         setup: VehicleSetup = USUAL_SETUP,
     ) -> ArduPilot:
-        """Return `binary`, or the first suitable binary in ARDUPILOT_SITL, on PATH, or among the installed ones.
+        """Return `binary` if it is given. Otherwise return the first suitable binary in ARDUPILOT_SITL, on PATH, or in
+        the cache.
 
         Raises UnusableBinaryError if the binary cannot be used, and NoBinaryError if none is found.
         """
@@ -250,11 +252,15 @@ _DEBUGGERS: dict[Debugger | None, tuple[str, ...]] = {
     ),
     "valgrind": ("valgrind", "--log-file=valgrind.log", "--soname-synonyms=somalloc=nouserintercepts"),
 }
-"""gdb prints the stack of each thread to the output of the vehicle if it crashes."""
+"""Debugger -> the beginning of its command line. gdb prints the stack of each thread to the output of the vehicle if it
+crashes.
+"""
 
 
 def models(binary: Path) -> list[str]:
-    """Return the names of the frames that a binary lists when it is started without a frame. The list may be empty."""
+    """Return the names of the frames that a binary lists when it is started without a frame. The result may be
+    empty.
+    """
     try:
         said = subprocess.run(
             [binary], stdin=subprocess.DEVNULL, capture_output=True, timeout=ANSWER_LIMIT_S, check=False, cwd="/"
@@ -293,7 +299,9 @@ def default_parameters(binary: Path, name: str) -> Path | None:
 
 
 def _own_defaults(sysid: int) -> str:
-    """Return the system ID as parameters under its old and new name. ArduPilot ignores an unknown parameter."""
+    """Return parameters that set the system ID, under the old and the new name. ArduPilot ignores unknown
+    parameters.
+    """
     return f"SYSID_THISMAV {sysid}\nMAV_SYSID {sysid}\n"
 
 

@@ -1,9 +1,9 @@
 """Simulate faults and weather of a vehicle, by parameters of ArduPilot's simulation (SIM_...).
 
-The names of these parameters differ between versions. A circumstance therefore has several alternatives, the current
-one first. The first alternative whose parameters all exist is used. ArduPilot does not answer a request for an unknown
-parameter, and it answers in order. So an answer to a later alternative shows that the earlier ones do not exist. A
-value is set when the vehicle reports it.
+The names of these parameters differ between versions. A fault therefore has several alternative sets of parameters. The
+one of the current version is first. The first alternative whose parameters all exist is used. ArduPilot does not answer
+a request for an unknown parameter, and it answers requests in order. An answer about a later alternative therefore
+shows that the earlier ones do not exist. A value counts as set when the vehicle reports it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,18 @@ if TYPE_CHECKING:  # a scenario names circumstances, and imports no MAVLink for 
     from sitl._pilot_link import PilotLink
 
 ANSWER_S = 3.0
-"""Time limit for an answer in seconds, divided by the speedup if that is below 1. A vehicle answers in one main
-loop."""
+"""Time limit for an answer in seconds. It is divided by the speedup if the speedup is below 1. A vehicle answers within
+one main loop.
+"""
 ASK_AGAIN_S = 0.5
 LOOK_S = 0.01
 
 GPS_OFF = ({"SIM_GPS1_ENABLE": 0.0}, {"SIM_GPS_DISABLE": 1.0})
 GPS_ON = ({"SIM_GPS1_ENABLE": 1.0}, {"SIM_GPS_DISABLE": 0.0})
 FENCE_M = 2.0
-"""ArduPilot allows no fence smaller than FENCE_MARGIN, which is 2 m by default."""
+"""Radius in metres to which the fence shrinks. ArduPilot allows no fence smaller than FENCE_MARGIN, which is 2 m by
+default.
+"""
 _COMPASSES = tuple(f"SIM_MAG{number}_FAIL" for number in (1, 2, 3))
 
 
@@ -39,10 +42,11 @@ class NotSimulatedError(VehicleError):
 
 @dataclass(frozen=True)
 class SimulatedFailure:
-    """An event to simulate, such as a GPS failure. `what` completes "simulate ...". Each of `ways` contains parameters
-    that cause the event.
+    """An event to simulate, such as a GPS failure. `what` completes "simulate ...". Each element of `ways` is a set of
+    parameters that causes the event.
 
-    `station_is_heard` begins or ends the vehicle's contact with its ground station. None leaves it unchanged.
+    `station_is_heard` states whether the vehicle is in contact with its ground station from now on. None does not
+    change the contact.
     """
 
     what: str
@@ -55,10 +59,12 @@ GPS_REGAINED = SimulatedFailure("a GPS that is back", GPS_ON)
 COMPASS_LOST = SimulatedFailure("the loss of its compasses", (dict.fromkeys(_COMPASSES, 1.0), {_COMPASSES[0]: 1.0}))
 COMPASS_REGAINED = SimulatedFailure("compasses that are back", (dict.fromkeys(_COMPASSES, 0.0), {_COMPASSES[0]: 0.0}))
 MOTOR_STOPPED = SimulatedFailure("the failure of a motor", ({"SIM_ENGINE_MUL": 0.0, "SIM_ENGINE_FAIL": 1.0},))
-"""SIM_ENGINE_FAIL 1 stops one motor: the second if the value is an output number, the first if it is a mask."""
+"""The failure of one motor. SIM_ENGINE_FAIL 1 stops the second motor if the value is the number of an output, and the
+first motor if it is a bit mask.
+"""
 
 RC_LOST = SimulatedFailure("the loss of its remote control", ({"SIM_RC_FAIL": 1.0},))
-"""SIM_RC_FAIL 1 means no pulses from the receiver."""
+"""The loss of the remote control. With SIM_RC_FAIL 1, the receiver gives no pulses."""
 RC_REGAINED = SimulatedFailure("a remote control that is back", ({"SIM_RC_FAIL": 0.0},))
 STATION_LOST = SimulatedFailure("the loss of its ground station", ({},), station_is_heard=False)
 STATION_REGAINED = SimulatedFailure("a ground station that is back", ({},), station_is_heard=True)
@@ -67,7 +73,9 @@ FENCE_BREACHED = SimulatedFailure(
     "a breach of its fence",
     ({"FENCE_TYPE": 3.0, "FENCE_ALT_MAX": FENCE_M, **_AROUND_HOME}, {"FENCE_TYPE": 2.0, **_AROUND_HOME}),
 )
-"""FENCE_TYPE 3 is a maximum altitude and a circle around home. 2 is the circle alone, for a rover."""
+"""A breach of the fence. With FENCE_TYPE 3, the fence is a maximum altitude and a circle around home. With 2, it is
+only the circle, for a rover.
+"""
 FENCE_LIFTED = SimulatedFailure("a flight without a fence", ({"FENCE_ENABLE": 0.0},))
 
 
@@ -77,7 +85,7 @@ def battery(volts: float) -> SimulatedFailure:
 
 
 def wind(speed_ms: float, from_deg: float) -> SimulatedFailure:
-    """Return the event that wind blows at this speed, from a direction in degrees clockwise from north."""
+    """Return the event that wind blows at this speed from a direction, in degrees clockwise from north."""
     return SimulatedFailure(f"wind of {speed_ms:g} m/s", ({"SIM_WIND_SPD": speed_ms, "SIM_WIND_DIR": from_deg},))
 
 
@@ -127,8 +135,8 @@ async def _heard(
     ask: Callable[[], None],
     limit_s: float,
 ) -> Mapping[str, float] | None:
-    """Repeat a request until the answer arrives, the time limit passes or the connection ends. Return the answer, or
-    None without an answer.
+    """Repeat a request until an answer arrives, the time limit passes or the connection ends. Return the answer or
+    None.
     """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + limit_s

@@ -45,7 +45,7 @@ class UnreachableError(DownloadError):
 
 @dataclass(frozen=True)
 class _PartialDownload:
-    """The size and version mark that the server reported for a partly downloaded file."""
+    """The size of a partly downloaded file and its version mark, as the server reported them."""
 
     size: int
     validator: str
@@ -135,7 +135,7 @@ def _answer(url: str, headers: Mapping[str, str], stall_s: float) -> Iterator[An
 
 
 def _chunks(url: str, answer: Any, stall_s: float) -> Iterator[bytes]:
-    """Yield the content in pieces. Raises DownloadError if it is missing or incomplete."""
+    """Yield the content in pieces. Raises DownloadError if the content is missing or incomplete."""
     left: int | None = answer.length
     if left is None and not answer.chunked:
         raise _endless(url)
@@ -161,12 +161,12 @@ def _broken_off(url: str) -> DownloadError:
 
 
 def _endless(url: str) -> DownloadError:
-    """Return the error for an answer without a size, because it cannot be checked for completeness."""
+    """Return the error for an answer without a size. Such a file cannot be checked for completeness."""
     return DownloadError(f"{urlsplit(url).netloc} does not say how large {url} is: use another --url")
 
 
 def _kept(part: Path, noted: Path) -> tuple[int, _PartialDownload] | None:
-    """Return the size and origin of an earlier partial download. Return None if there is none."""
+    """Return the size and origin of an earlier partial download. Return None if no earlier part exists."""
     try:
         have, origin = part.stat().st_size, _PartialDownload(**json.loads(noted.read_text()))
         return (have, origin) if have else None
@@ -190,7 +190,9 @@ def _validator(answer: Any) -> str | None:
 
 
 def _size(url: str, answer: Any, limit: int) -> int:
-    """Return the size that the server announces. Raises DownloadError if there is none, or above `limit` bytes."""
+    """Return the size that the server announces. Raises DownloadError if it announces no size, or one above `limit`
+    bytes.
+    """
     size: int | None = answer.length
     if size is None:
         raise _endless(url)

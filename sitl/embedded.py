@@ -4,8 +4,8 @@
 
 A small process with one thread, which needs only the standard library and a MAVLink dialect. It listens on 127.0.0.1 on
 the three ports of ArduPilot SITL and answers like ArduPilot, so the same pilot flies both. Its clock runs `speedup`
-times as fast as wall time, but the data that it sends per second of wall time is bounded. SIGTERM ends it with exit
-status 0.
+times as fast as wall time, but the amount of data that it sends per second of wall time is limited. SIGTERM ends it
+with exit status 0.
 """
 
 from __future__ import annotations
@@ -71,7 +71,9 @@ class Embedded:
             raise VehicleError(f"embedded vehicles have no {' and no '.join(lacks)}: fly ArduPilot, or leave it out")
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
-        """Return the command. The embedded vehicle writes no files to `directory`. Raises VehicleError."""
+        """Return the command that starts the embedded vehicle. It writes no files to `directory`. Raises
+        VehicleError.
+        """
         check_launch(sysid, home, speedup)
         return Launch(
             [

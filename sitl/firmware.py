@@ -2,10 +2,10 @@
 
 The firmware server has a statically linked binary at VEHICLE/RELEASE/BOARD/, and `git-version.txt` with its commit and
 version. RELEASE is stable, beta, latest, or for example stable-4.6.3. BOARD is SITL_x86_64_linux_gnu or
-SITL_arm_linux_gnueabihf. There are no other boards (ArduPilot's Tools/scripts/board_list.py). An aarch64 machine uses
-the latter if it runs 32-bit programs. The default parameters of the vehicle and its frames come from ArduPilot's source
-tree at the same commit. A tag would not suffice: `latest` has none, and the binary of 4.6.3 was built from the commit
-before its tag. A mirror (`base`) replaces both hosts, with the same paths.
+SITL_arm_linux_gnueabihf. ArduPilot has no other SITL boards (Tools/scripts/board_list.py). An aarch64 machine uses the
+second one if it can run 32-bit programs. The default parameters of the vehicle and its frames come from ArduPilot's
+source tree at the same commit. A tag is not sufficient: `latest` has none, and the binary of 4.6.3 was built from the
+commit before its tag. A mirror (`base`) replaces both hosts, with the same paths.
 
 This module was written without access to the server, from ArduPilot's build scripts and from published listings. It
 therefore does not rely on the following properties. The server may send no validators, and then a download is not
@@ -41,7 +41,7 @@ SOURCE = "https://raw.githubusercontent.com"
 LIMIT = 100_000_000  # bytes; a binary has about 7 MB
 TEXT_LIMIT = 1_000_000  # bytes
 HELP_S = 10.0
-"""Time limit for `--help`. A program that is still running after it is able to run."""
+"""Time limit in seconds for `--help`. If a program still runs after this time, this machine can run it."""
 
 # Where the source tree keeps a vehicle's defaults; the plane's have moved.
 _AUTOTEST = "Tools/autotest"
@@ -86,12 +86,12 @@ class InstallWatcher(Protocol):
         """Report that another installation of this vehicle must finish first."""
 
     def downloads(self, done: int, total: int) -> None:
-        """Report the number of downloaded bytes of the binary, and its size."""
+        """Report the number of bytes of the binary that were downloaded, and its size."""
 
 
 @dataclass(frozen=True)
 class InstallOutcome:
-    """The installed version, and true if it was installed before."""
+    """The installed version, and true if it was already installed."""
 
     installed: InstalledVersion
     already: bool
@@ -120,10 +120,12 @@ def install(
     base: str | None = None,
     stall_s: float = STALL_S,
 ) -> InstallOutcome:
-    """Install the binary and default parameters of a vehicle, unless they are in the cache. Runs then use this version.
+    """Install the binary and the default parameters of a vehicle, unless they are in the cache. Runs then use this
+    version.
 
-    `version` is `stable`, `beta`, `latest` or a number such as 4.6.3. A number that is installed needs no server. An
-    interrupted installation is resumed. Parameter files of frames are included if the version has them.
+    `version` is `stable`, `beta`, `latest` or a number such as 4.6.3. If a version with this number is already
+    installed, no server is needed. An interrupted installation is resumed. Parameter files of frames are included if
+    the version has them.
 
     Raises RequestError for a version or a `base` that does not exist, DownloadError if a download fails, CacheError if
     the cache cannot be written, and VehicleError if this machine cannot run the binary.
@@ -293,7 +295,7 @@ def _use(installed: InstalledVersion, already: bool) -> InstallOutcome:
 
 @contextlib.contextmanager
 def _locked(home: Path, watcher: InstallWatcher) -> Iterator[None]:
-    """Allow one installation of a vehicle at a time, by a lock that the kernel releases when a process ends
+    """Allow only one installation of a vehicle at a time. The kernel releases the lock when the process ends
     (flock(2)).
     """
     home.mkdir(parents=True, exist_ok=True)

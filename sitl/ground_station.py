@@ -1,8 +1,8 @@
 """Connect vehicles with a ground station over UDP: QGroundControl, Mission Planner, MAVProxy or another program.
 
 Each vehicle has a port for ground stations (STATION_PORT), separate from the ports of its pilot and its agent. An
-operator therefore disturbs neither of them. A `GroundStation` forwards complete frames between these ports and one UDP
-address, in both directions and without changes.
+operator therefore does not disturb pilot and agent. A `GroundStation` forwards complete frames between these ports and
+one UDP address, in both directions and without changes.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from sitl._operator import CommandLog
 from sitl.address import ListenAddress, connected
 
 MOST_DATAGRAMS_PER_S = 1000
-"""Maximum rate of datagrams from the ground station. Further ones are dropped and counted."""
+"""Maximum number of datagrams per second from the ground station. Further datagrams are dropped and counted."""
 MOST_DATAGRAM_BYTES = 4096
 MOST_WAITING_BYTES = 64 * 1024
 """Maximum size of data waiting for a slow vehicle. Further data is dropped and counted."""
 DATAGRAM_BYTES = 1400
-"""Maximum size of a datagram, in which simultaneous frames of one vehicle are combined."""
+"""Maximum size of a datagram in bytes. Several frames of one vehicle are combined up to this size."""
 
 
 class GroundStation(asyncio.DatagramProtocol):
-    """Forwards messages between vehicles and one ground station, which may connect and disconnect at any time.
+    """A forwarder of messages between vehicles and one ground station. The ground station may connect and disconnect at
+    any time.
 
-    It may be used in one event loop only.
+    Use the object in one event loop only.
     """
 
     def __init__(
@@ -39,14 +40,14 @@ class GroundStation(asyncio.DatagramProtocol):
     ) -> None:
         """Create the object. Callers use `open` instead. `now` returns the mission second, for the log of commands.
 
-        `taken_over` receives the vehicles that the operator flies from now on.
+        `taken_over` is called with the vehicles that the operator flies from now on.
         """
         self._address = address
         self._now = now
         self._taken_over = taken_over
         self._transport: asyncio.DatagramTransport | None = None
         self._vehicles: dict[int, _VehicleConnection] = {}
-        """The vehicles by MAVLink system ID."""
+        """MAVLink system ID -> connection to the vehicle."""
         self._out_of_reach: set[int] = set()
         self._mav = mavlink.MAVLink(None)
         self._commands = CommandLog()
@@ -88,7 +89,7 @@ class GroundStation(asyncio.DatagramProtocol):
             self._out_of_reach.add(sysid)
 
     def close(self) -> None:
-        """End all connections. May be called twice."""
+        """End all connections. It may be called twice."""
         for vehicle in self._vehicles.values():
             vehicle.close()
         if self._transport is not None:
@@ -128,7 +129,7 @@ class GroundStation(asyncio.DatagramProtocol):
     def datagram_received(self, data: bytes, addr: object) -> None:
         """Forward a datagram from the ground station to its vehicle.
 
-        The socket only accepts datagrams from its address.
+        The socket accepts datagrams only from the address of the ground station.
         """
         second = int(time.monotonic())
         if second != self._second:

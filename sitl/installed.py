@@ -58,7 +58,7 @@ class DownloadManifest:
     def read(cls, directory: Path) -> DownloadManifest:
         """Return the manifest of a directory.
 
-        Raises OSError, ValueError, TypeError, LookupError or AttributeError if it is missing or damaged.
+        Raises OSError, ValueError, TypeError, LookupError or AttributeError if the manifest is missing or damaged.
         """
         document = json.loads((directory / MANIFEST).read_text())
         files = {
@@ -96,7 +96,7 @@ class InstalledVersion:
     @cached_property
     def damage(self) -> str | None:
         """A description of the first problem with the installed files, such as a change after the download. None if all
-        are intact. All files are read for this.
+        files are intact. The method reads all files.
         """
         if self.manifest is None:
             return f"{MANIFEST} is missing or cannot be read"
@@ -128,8 +128,8 @@ def all_installed(vehicle: VehicleType, environ: Mapping[str, str]) -> list[Inst
 
 
 def current(vehicle: VehicleType, environ: Mapping[str, str]) -> InstalledVersion | None:
-    """Return the version that was installed last. Return None without an installation. Raises UnusableBinaryError if
-    the version is damaged.
+    """Return the version that was installed last, or None if no version is installed. Raises UnusableBinaryError if the
+    version is damaged.
     """
     try:
         directory = (cache(environ) / vehicle / CURRENT).resolve(strict=True)

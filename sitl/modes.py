@@ -15,7 +15,7 @@ MODES: dict[VehicleType, dict[str, int]] = {
     "rover": {"MANUAL": 0, "HOLD": 4, "AUTO": 10, "RTL": 11, "GUIDED": 15},
 }
 BOOT_MODES: dict[VehicleType, str] = {"copter": "STABILIZE", "plane": "MANUAL", "rover": "MANUAL"}
-"""The mode after boot, without any command. In it a person flies by remote control."""
+"""The flight mode after boot, before any command. In this mode a person flies the vehicle by remote control."""
 
 
 def mode_name(vehicle_type: VehicleType, number: int | None) -> str:

@@ -21,7 +21,7 @@ MAX_LINE_SHOWN = 60
 LARGEST = 3.4028235e38  # of 32 bits
 
 OURS = frozenset({"SYSID_THISMAV", "MAV_SYSID"})
-"""Parameters that the harness sets, and that a user must not set."""
+"""Parameters that only the harness may set. A user must not set them."""
 
 _NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}", re.ASCII)
 _COMMENTS = re.compile(r"#.*|//.*")
@@ -67,9 +67,9 @@ def check(values: Mapping[str, float]) -> None:
 
 
 def unknown(asked: Iterable[str], known: Iterable[str]) -> str | None:
-    """Return a phrase about the requested parameters that a vehicle lacks, with similar known ones.
+    """Return a phrase about the requested parameters that a vehicle does not have, with similar parameters that it has.
 
-    Return None if all are known.
+    Return None if it has all of them.
     """
     names = set(known)
     missing = sorted(set(asked) - names)

@@ -1,9 +1,9 @@
 """Fly ArduPilot or the embedded vehicle over MAVLink.
 
 A pilot has a link (_pilot_link.py) and executes procedures (procedure.py): a take-off, a plan as a mission or in GUIDED
-mode, and the end of a flight. It executes the steps before arming of a take-off or plan separately. Each step has a
-time limit, and so has the silence of the vehicle. If a limit expires, or the vehicle ends the connection, the pilot
-raises a FlightError. The error names the step and the last message of the vehicle.
+mode, and the end of a flight. The steps before arming are executed separately. Each step has a time limit, and the
+vehicle must not be silent for too long. If a limit expires, or the vehicle ends the connection, the pilot raises a
+FlightError. The error names the step and the last message of the vehicle.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ class Pilot:
         vehicle_type: VehicleType = "copter",
         vehicle_id: int | None = None,
     ) -> None:
-        """Create the pilot. `sock` must be connected to the pilot port of the vehicle. `close` closes it.
+        """Create the pilot. `sock` must be connected to the pilot port of the vehicle. `close` closes the socket.
 
-        `sysid` is the MAVLink system ID. `tlog` is the file of the telemetry log. `speedup`, in simulated seconds per
-        second, and `home` are those of the vehicle's launch. Errors contain `vehicle_id`, by default the system ID.
-        Raises OSError if `tlog` cannot be opened.
+        `sysid` is the MAVLink system ID. `tlog` is the file of the telemetry log. `speedup` (simulated seconds per
+        second) and `home` are those with which the vehicle was started. Error messages contain `vehicle_id`, which is
+        the system ID by default. Raises OSError if `tlog` cannot be opened.
         """
         self.link = PilotLink(sysid, sock, tlog, speedup, home)
         self.vehicle_type: VehicleType = vehicle_type
@@ -67,7 +67,7 @@ class Pilot:
 
     @property
     def real_time_factor(self) -> float | None:
-        """The simulated seconds per second, divided by the speedup. 1.0 means that the machine is fast enough."""
+        """The simulated seconds per second, divided by the speedup. With the value 1.0, the machine is fast enough."""
         return self.link.real_time_factor
 
     async def start(self) -> None:
@@ -75,7 +75,7 @@ class Pilot:
         await self.link.start()
 
     async def close(self) -> None:
-        """End the connection and complete the telemetry log. May be called twice, and before `start`."""
+        """End the connection and complete the telemetry log. It may be called twice, and before `start`."""
         await self.link.close()
 
     def ascent(self, altitude_m: float) -> PilotProcedure:
@@ -100,8 +100,8 @@ class Pilot:
     async def get_ready(self, flight: PilotProcedure) -> None:
         """Execute the steps before arming. Return when all steps have stayed complete for READY_FOR_S seconds.
 
-        ArduPilot repeats its checks, and has further ones in other modes. It may therefore report ready and then not
-        ready. Raises FlightError.
+        ArduPilot repeats its checks, and has further checks in other modes. It may therefore report first that it is
+        ready, and then that it is not. Raises FlightError.
         """
         await self._pursue(ArmingPreparation(flight, self.state))
 
@@ -134,7 +134,7 @@ class Pilot:
         return values
 
     def shortfall(self, flight: PilotProcedure) -> str | None:
-        """Return a sentence if the vehicle should have left its home position and has not. Return None otherwise."""
+        """Return a sentence if the vehicle should have left its home position but has not. Otherwise return None."""
         if self.state.has_moved or self._terminated or self._handed_over or self._befallen:
             return None
         awaited = self._awaited.name if self._awaited else "its end"
@@ -209,7 +209,7 @@ class Pilot:
 
 
 class _ListenOnlyProcedure:
-    """A procedure without steps, which only receives messages."""
+    """A procedure without steps, during which the pilot only receives messages."""
 
     purpose = "stay in touch"
     _step = ProcedureStep("its next word", math.inf)
@@ -234,7 +234,7 @@ class _StepWaitingTimes:
         self.patience_s = 0.0  # of our time: then it is worth looking again, even if nothing is heard
 
     def lost(self) -> str | None:
-        """Return the reason if the connection to the vehicle is lost. Return None otherwise."""
+        """Return the reason if the connection to the vehicle is lost. Otherwise return None."""
         now = time.monotonic()
         if self._link.closed.is_set():
             return "it ended the connection"
@@ -246,7 +246,7 @@ class _StepWaitingTimes:
         return None
 
     def overdue(self, step: ProcedureStep) -> str | None:
-        """Return the reason if a time limit of the step has passed. Return None otherwise."""
+        """Return the reason if a time limit of the step has passed. Otherwise return None."""
         link, now = self._link, time.monotonic()
         if self._step is not None:
             if self._time_s is not None and link.state.time_s is not None:
@@ -268,8 +268,8 @@ class _StepWaitingTimes:
         return SILENCE_S / min(1.0, self._link.speedup)
 
     def _streams(self) -> dict[str, float]:
-        """Return the time of the last message. Add the times of the last heartbeat and of the last position, if there
-        was one.
+        """Return text about a silent stream -> time of its last message. Heartbeats and positions are included only if
+        the vehicle has sent any.
         """
         times = {"it has sent no heartbeat": self._link.heartbeat_at, "it has sent no position": self._link.position_at}
         return {"it has been silent": self._link.heard_at, **{what: at for what, at in times.items() if at is not None}}

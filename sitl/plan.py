@@ -46,8 +46,8 @@ class TakeOff:
 class GoTo:
     """Go to a place in metres north and east of home.
 
-    `altitude_m` is above home; None keeps the altitude. `speed_ms` is in metres per second; None is the speed of the
-    type.
+    `altitude_m` is above home. With None, the altitude does not change. `speed_ms` is in metres per second. With None,
+    it is the usual speed of the type of vehicle.
     """
 
     north_m: float

@@ -1,8 +1,8 @@
 """Define steps and procedures, which all flights use.
 
-A flight is not a script. At each heartbeat the pilot determines the first step that is not complete, and requests it.
-ArduPilot may acknowledge a mode and undo it, or disarm by itself while the machine is busy. The pilot then simply
-requests the step again.
+A flight is not a fixed sequence of commands. At each heartbeat the pilot determines the first step that is not
+complete, and requests it. ArduPilot may acknowledge a mode and then leave it, or disarm by itself on a busy machine.
+The pilot then requests the step again.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class HopelessError(Exception):
 
 
 class PilotProcedure(Protocol):
-    """A procedure that a pilot executes. `purpose` completes the phrase "did not ..."."""
+    """A procedure that a pilot executes. `purpose` completes an error message that begins with "did not"."""
 
     purpose: str
 
@@ -80,7 +80,7 @@ class ArmingPreparation:
 
 
 class Commander:
-    """The requests that all procedures share."""
+    """The commands that all procedures share."""
 
     def __init__(self, link: PilotLink, vehicle_type: VehicleType) -> None:
         self.link = link
@@ -94,7 +94,7 @@ class Commander:
         self.link.ask_for_mode(MODES[self.vehicle_type][name])
 
     def arming(self) -> ProcedureStep | None:
-        """Return the next step of arming. Return None if the vehicle is armed."""
+        """Return the next step that arms the vehicle. Return None if the vehicle is armed."""
         if self.state.armed:
             return None
         return ARM if self.state.ready_to_arm and self.state.position else READY

@@ -1,4 +1,4 @@
-"""Connect one client to the embedded vehicle, like one serial port of an ArduPilot: MAVLink without a socket.
+"""Connect one client to the embedded vehicle, as over one serial port of ArduPilot: MAVLink without a socket.
 
 Each `ClientChannel` has its own parser, sequence numbers, message intervals and incomplete mission.
 """
@@ -85,7 +85,7 @@ class ClientChannel:
         self._mav.seq = (self._mav.seq + 1) % 256
 
     def send_due(self) -> None:
-        """Send each message that is due once. A slow client receives the latest state, and not all messages that it
+        """Send each message that is due, once. A slow client receives the latest state, and not every message that it
         missed.
         """
         now_s = self._autopilot.now_s
@@ -167,8 +167,8 @@ class ClientChannel:
         return vehicle.go_to(vehicle.place(message.frame, message.x, message.y, message.z))
 
     def _position_target(self, message: Any) -> None:
-        """Process a message with a complete target position. The vehicle sends no answer. A plane ignores the message,
-        as ArduPlane does.
+        """Process a message with a complete target position, to which the vehicle sends no answer. A plane ignores the
+        message, as ArduPlane does.
         """
         vehicle = self._autopilot
         whole = not message.type_mask & NO_POSITION and message.coordinate_frame in FRAMES
@@ -188,7 +188,7 @@ class ClientChannel:
         self.send(self._parameters()[name])
 
     def _parameters(self) -> dict[str, Any]:
-        """Return the message PARAM_VALUE for each parameter. A ground station requests them all before it shows a
+        """Return the message PARAM_VALUE for each parameter. A ground station requests all parameters before it shows a
         vehicle.
         """
         values: dict[str, float] = {SYSTEM_ID: self._autopilot.sysid}
@@ -222,7 +222,7 @@ class ClientChannel:
     def _set_interval(self, message_id: float, interval_us: float) -> int:
         """Execute MAV_CMD_SET_MESSAGE_INTERVAL, and return its result code. The interval is in microseconds.
 
-        0 is the default interval, and -1 turns the message off.
+        An interval of 0 stands for the default, and -1 switches the message off.
         """
         if message_id not in STREAMS or not math.isfinite(interval_us):
             return int(mavlink.MAV_RESULT_FAILED)
@@ -261,5 +261,5 @@ class ClientChannel:
 
 
 def _seventh(message: Any) -> float:
-    """Return parameter 7 of a command, the altitude, which is called z in a COMMAND_INT."""
+    """Return parameter 7 of a command, the altitude. In a COMMAND_INT it has the name z."""
     return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

@@ -14,7 +14,8 @@ DEBUGGERS: tuple[Debugger, ...] = get_args(Debugger)
 class VehicleSetup:
     """The settings of one vehicle.
 
-    `frame` None is the default frame of its type. `log_mib` None means no limit of the log.
+    If `frame` is None, the vehicle has the default frame of its type. If `log_mib` is None, the size of the log is not
+    limited.
     """
 
     frame: str | None = None

@@ -1,6 +1,7 @@
 """Show a vehicle on a computed flight path in a ground station.
 
-It uses the same `ClientChannel` as the embedded vehicle, and refuses each command of an operator with a text.
+The vehicle uses the same `ClientChannel` as the embedded vehicle. It refuses each command of an operator with a text
+message.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class ShownVehicle(Autopilot):
         self.failsafes.parameters.clear()
 
     def show(self, mission_s: float) -> None:
-        """Move the vehicle to its position at this mission second. The mission began when the vehicle was ready."""
+        """Move the vehicle to its position at this mission second. The mission begins when the vehicle is ready."""
         self.now_s = READY_S + mission_s
         self.airborne = self.vehicle_type != "rover" and self.motion.up_m > LOW_M
 

@@ -29,7 +29,9 @@ class PlaceError(VehicleError):
 
 
 class HomeOffset(NamedTuple):
-    """An offset in metres from the first home position. A heading of None means the heading of the first one."""
+    """An offset in metres from the first home position. If the heading is None, it is that of the first home
+    position.
+    """
 
     east_m: float
     north_m: float

@@ -31,7 +31,9 @@ SENSORS = (
     | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
 FENCE = mavlink.MAV_SYS_STATUS_GEOFENCE
-"""Reported as healthy without a fence, as in ArduPilot. Otherwise MAVProxy would report a breach of the fence."""
+"""The fence sensor, which is reported as healthy even without a fence, as ArduPilot does. Otherwise MAVProxy would
+report a breach of the fence.
+"""
 NOT_YET = mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_AHRS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
 
@@ -130,7 +132,7 @@ def home_position(vehicle: Autopilot) -> Any:
 
 
 def autopilot_version(vehicle: Autopilot) -> Any:
-    """Return the version of this package, without a commit. It is only sent on request."""
+    """Return the message with the version of this package, without a commit. It is sent only on request."""
     parts = [min(part, 255) for part in release(_installed())]
     number = int.from_bytes([*parts, mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL], "big")
     capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
@@ -149,7 +151,7 @@ def release(installed: str) -> tuple[int, int, int]:
 
 
 def _installed() -> str:
-    """Return the version of the package. A container image contains only its files, and no version."""
+    """Return the version of the installed package. In a container image, the package has no version."""
     try:
         return version("ucp-harness")
     except PackageNotFoundError:
@@ -178,4 +180,4 @@ ON_REQUEST: dict[int, Callable[[Autopilot], Any]] = {
     mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
     mavlink.MAVLINK_MSG_ID_HOME_POSITION: home_position,
 }
-"""Messages that are sent once after MAV_CMD_REQUEST_MESSAGE. Requests for other messages are refused."""
+"""Messages that are sent once after MAV_CMD_REQUEST_MESSAGE. The vehicle refuses requests for other messages."""

@@ -1,7 +1,6 @@
 """Compute the position of a vehicle at each mission second without flying, for radio ranges in virtual time.
 
-The motion models are those of the embedded vehicle. The computation is a pure function without MAVLink, clock or
-process.
+The motion models are those of the embedded vehicle. The computation needs no MAVLink, no clock and no process.
 """
 
 from __future__ import annotations
@@ -48,10 +47,10 @@ def track(
 ) -> VehicleTrack:
     """Return the path of a vehicle that begins to fly `plan` at mission second `begin_s`.
 
-    Before that it stands at home. After the plan it stays, or circles if it is a plane, unless it has landed.
-    `home_offset` is the place of home in the field, in metres north, east and up from its centre. `heading_deg` is the
-    heading of home. Without a plan, a copter takes off to `takeoff_altitude_m` and stays, a plane circles, and a rover
-    stands. Raises PlanError if the type cannot fly the plan.
+    Before that, the vehicle stands at home. After the plan it stays, or circles if it is a plane, unless it has landed.
+    `home_offset` is the position of home in metres north, east and up from the centre of the field. `heading_deg` is
+    the heading of home. Without a plan, a copter takes off to `takeoff_altitude_m` and stays, a plane circles, and a
+    rover stands. Raises PlanError if the type cannot fly the plan.
     """
     start = MotionState(yaw_rad=math.radians(heading_deg))
     segments: Sequence[MotionSegment]
@@ -64,7 +63,7 @@ def track(
 
 
 def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState) -> Sequence[MotionSegment]:
-    """Return the segments for the waypoints in AUTO mode, and for the unlimited stay after the last one."""
+    """Return the segments for the waypoints in AUTO mode, and for staying after the last one without end."""
     model, last = MODELS[vehicle_type], waypoints[-1]
     segments: list[MotionSegment] = [RestSegment(start, 0.0)]
     for before, waypoint, after in zip((None, *waypoints), waypoints, (*waypoints[1:], None), strict=False):
@@ -86,7 +85,9 @@ def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mot
 def _manoeuvre(
     model: MotionModel, waypoint: Waypoint, start: MotionState, before: Waypoint | None, after: Waypoint | None
 ) -> Sequence[MotionSegment]:
-    """Return the segments for one waypoint from the current motion, with regard to its neighbours."""
+    """Return the segments for one waypoint, beginning at the current motion. They depend on the waypoints `before` and
+    `after` it.
+    """
     led = before.place if before is not None and before.kind in ("go_to", "loiter") else None
     match waypoint.kind:
         case "take_off":

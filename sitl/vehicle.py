@@ -1,9 +1,9 @@
 """Define a vehicle: a program that offers MAVLink on three TCP ports, and the command that starts it.
 
-Each vehicle runs in its own network namespace. Therefore all vehicles listen on the same ports, those of the first
-three serial ports of ArduPilot SITL. The pilot in the orchestrator uses the first, the agent the second, and a ground
-station the third. A `VehicleKind` stands for the program, ArduPilot or the embedded vehicle. Other code does not depend
-on it.
+Each vehicle runs in its own network namespace, so all vehicles can listen on the same ports. These are the first three
+serial ports of ArduPilot SITL. The pilot in the harness uses the first port, the agent the second, and a ground station
+the third. A `VehicleKind` represents the program: ArduPilot or the embedded vehicle. Other code does not depend on the
+program.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class VehicleError(Exception):
 
 
 class NoBinaryError(VehicleError):
-    """An error: no ArduPilot binary is named or found. A run may use the embedded vehicle instead."""
+    """An error: no ArduPilot binary is given or found. A run may use the embedded vehicle instead."""
 
 
 class UnusableBinaryError(VehicleError):
-    """An error: an ArduPilot binary is named or found, but cannot be run."""
+    """An error: an ArduPilot binary was given or found, but cannot be run."""
 
 
 class NoProgramError(VehicleError):
@@ -71,7 +71,7 @@ class Home:
             raise VehicleError(f"home heading {self.heading_deg} is no heading: give 0 to 359 degrees")
 
     def __str__(self) -> str:
-        """Return the place as in ArduPilot's option `--home`: LAT,LON,ALT,HDG."""
+        """Return the place in the format of ArduPilot's option `--home`: LAT,LON,ALT,HDG."""
         return f"{self.lat_deg:.7f},{self.lon_deg:.7f},{self.alt_m:.2f},{self.heading_deg:.1f}"
 
     @classmethod
@@ -126,7 +126,7 @@ class VehicleKind(Protocol):
 
     @property
     def frame(self) -> str | None:
-        """The name of the frame in the program, or None if the program has only one."""
+        """The name of the frame in the program. None if the program has only one frame."""
 
     @property
     def sha256(self) -> str | None:
@@ -166,10 +166,10 @@ def check_launch(sysid: int, home: Home, speedup: float) -> None:
 
 
 def place_in_field(index: int, spacing_m: float = SPACING_M) -> tuple[float, float]:
-    """Return metres north and east of the field's centre for the vehicle with this index, from 0.
+    """Return the home of the vehicle with this index (from 0) in metres north and east of the centre of the field.
 
-    The places form the pattern of the seeds of a sunflower. Two places are at least about `spacing_m` apart. Any number
-    of vehicles fits, and a further vehicle moves no other.
+    The places have the pattern of sunflower seeds. Two places are at least about `spacing_m` apart. The pattern allows
+    any number of vehicles, and an additional vehicle does not move the others.
     """
     radius = spacing_m * math.sqrt(index)
     bearing = index * math.pi * (3 - math.sqrt(5))  # the golden angle
@@ -177,5 +177,5 @@ def place_in_field(index: int, spacing_m: float = SPACING_M) -> tuple[float, flo
 
 
 def home_in_field(index: int, centre: Home, spacing_m: float = SPACING_M) -> Home:
-    """Return the home position of the vehicle with this index, from 0."""
+    """Return the home position of the vehicle with this index, counted from 0."""
     return centre.offset(*place_in_field(index, spacing_m))

@@ -24,10 +24,12 @@ class AgentUnderTest(ABC):
     def __init__(self, variant: SettingsVariant) -> None:
         self.model = ReferenceModel(variant.settings)
         self.reference_follows = True
-        """False if the machine was late, and the reference could not follow the agent to its state."""
+        """True while the reference is in the state of the agent. False if the machine was late and the reference could
+        not follow.
+        """
 
     async def step(self, given: AgentInput) -> TestedStep | None:
-        """Give the input to the agent and to the reference, and return the comparison of their behaviour.
+        """Give an input to the agent and to the reference. Return the comparison of their behaviour.
 
         Return None if the input is impossible in the current state.
         """
@@ -46,7 +48,7 @@ class AgentUnderTest(ABC):
     @property
     @abstractmethod
     def timer_is_near(self) -> bool:
-        """True if the next timer of the agent expires so soon that its expiry must be the next input."""
+        """True if the agent's next timer expires soon, so that its expiry must be the next input."""
 
     @abstractmethod
     def exchanges(self) -> tuple[RecordedDatagram, ...]:
@@ -58,8 +60,9 @@ class AgentUnderTest(ABC):
 
 
 Start = Callable[[SettingsVariant, bool], Awaitable[AgentUnderTest]]
-"""Function that starts an agent with a variant of the settings. The second argument is true for a replay, in which few
-agents run in parallel. Raises NoAgentError, UnsupportedError, AgentEndedError."""
+"""A function that starts an agent with a variant of the settings. Its second argument is true for a replay, for which
+few agents run in parallel. Raises NoAgentError, UnsupportedError, AgentEndedError.
+"""
 
 
 NO_KEYS: Mapping[str, Any] = MappingProxyType({})
@@ -74,7 +77,7 @@ def mission(
     speedup: float,
     keys: Mapping[str, Any] = NO_KEYS,
 ) -> dict[str, Any]:
-    """Return a mission file for the agent. `keys` replace or extend its keys."""
+    """Return a mission file for the agent. The keys in `keys` replace or extend those of the file."""
     return {
         "schema": SCHEMA,
         "contract": CONTRACT,

@@ -1,8 +1,8 @@
 """List all inputs of the generated tests: the relevant variants of the nine messages, events, timers and commands.
 
-An input is a function of the reference's state. For example, "vote no of an agent that has voted" needs an agent that
-has voted. The function returns an action, or None if the input is impossible in this state. All peers behave alike, so
-agent 2 answers first, then agent 3, then agent 4.
+An input is a function of the reference's state. For example, "vote no of an agent that has voted" is possible only if
+an agent has voted. The function returns an action, or None if the input is impossible in this state. The peers are
+interchangeable, so agent 2 always answers first, then agent 3, then agent 4.
 """
 
 from collections.abc import Callable
@@ -35,24 +35,27 @@ from ucp.messages import (
 )
 
 UNKNOWN = bytes.fromhex("de" * 32)
-"""A hash of no block and no chain."""
+"""The hash of no block and no chain."""
 
 Tally = Literal["voting", "phase one", "phase two", "timer"]
 
 
 @dataclass(frozen=True)
 class AgentInput:
-    """One kind of input for the agent under test, described by its name."""
+    """A kind of input for the agent under test. Its name describes it."""
 
     name: str
     make: Callable[[ReferenceModel], Action | None]
     tally: Tally | None = None
-    """Activity whose counted answers the effect depends on. "timer": the counted answers of any activity."""
+    """The activity whose counted answers determine the effect of the input. "timer" stands for the activity of the
+    running timer.
+    """
     counted_twin: str | None = None
-    """Only of an answer that the agent must ignore: the name of a similar answer that it must count."""
+    """Name of a similar answer that the agent must count. Only for an answer that the agent must ignore."""
     preceding: str | None = None
-    """Only of the expiry of a timer after an ignored answer: the name of the answer. The expiry shows whether the agent
-    counted it."""
+    """Name of an ignored answer before a timer expiry. The expiry reveals whether the agent counted this answer. Only
+    for timer expiries.
+    """
 
 
 INPUTS: dict[str, AgentInput] = {}
@@ -98,8 +101,8 @@ def _last_responder(responders: Callable[[ReferenceModel], set[int]]) -> Callabl
 
 
 def _voters(model: ReferenceModel) -> set[int]:
-    """Return the agents that have voted in the current vote. During a reconcile, return an empty set because votes do
-    not count.
+    """Return the agents that have voted in the current vote. During a reconcile votes do not count, and the set is
+    empty.
     """
     state = model.state
     return state.voters if state.voting_timer.active and not state.reconcile_in_progress else set()
@@ -139,7 +142,7 @@ def _top_block(model: ReferenceModel) -> Block | None:
 
 
 def _chain_with_popped_block(model: ReferenceModel) -> bytes | None:
-    """Return the hash of the chain with the most recently removed block on top."""
+    """Return the hash of the chain with the most recently popped block on top."""
     stack = model.state.reconcile_stack
     return next_chain_hash(_top(model), stack[-1].block_hash) if stack else None
 

@@ -20,10 +20,12 @@ from ucp.handler import LocalEvent
 from ucp.messages import Message
 
 BLOCK_KEYS = {"chain", "deque", "stack", "completed", "top_chain_hash"}
-"""Keys of the status about the blocks of the agent."""
+"""Keys of the status that describe the blocks of the agent."""
 
 Branch = tuple[str, str, bool]
-"""Handler, branch, and whether the run changes blocks. One branch of Algorithm 20 changes blocks in some runs only."""
+"""A branch of a handler: handler, branch, and whether the run changes blocks. The last element is needed because one
+branch of Algorithm 20 changes blocks only in some runs.
+"""
 
 STARTED_BY = {timer: handler.name for handler in HANDLERS.values() for timer in handler.starts}
 """Timer -> the handler that starts it."""
@@ -33,18 +35,18 @@ BEGINNING_OF_COUNT = {
     "reconcile_phase_2_timer_expiration": "reconcile_phase_2",
     "reconcile_phase_3_timer_expiration": "reconcile_phase_3",
 }
-"""Handler of a timer's expiry -> the handler that began the count on which it decides."""
+"""Handler of a timer expiry -> the handler that began the count which decides the expiry."""
 
 _EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 _LEADING_EVENTS = {"Reconcile Begin", "Reconcile Phase 1"}
-"""Local events whose handlers only trigger a further handler."""
+"""Local events whose handlers only trigger another handler."""
 STARTING_BRANCHES = {"proposed", "asked", "recommitted, more to come"}
 """Branches in which a handler starts its timer."""
 
 
 @dataclass(frozen=True)
 class BlamedBranch:
-    """The handler that most likely caused a failure, and the branch that the reference took in it."""
+    """The branch that most likely caused a failure, with its handler. It is the branch that the reference took."""
 
     handler: str
     branch: str
@@ -59,8 +61,8 @@ class BlamedBranch:
 
 
 class BlameEvidence:
-    """The evidence for finding the handler that caused a failure. It counts the passed and failed tests of each branch,
-    and contains the pairs of successive branches in passed tests.
+    """The evidence for finding the handler that caused a failure. It contains the numbers of passed and failed tests of
+    each branch, and the pairs of successive branches in passed tests.
     """
 
     def __init__(self, variant_results: Iterable[VariantResult]) -> None:
@@ -100,15 +102,15 @@ class BlameEvidence:
         return BlamedBranch(run.handler, run.branch)
 
     def _fails_without_preceding_input(self, failure: ConfirmedFailure) -> bool:
-        """Return true if the test of the timer's expiry alone, without an ignored answer before it, has not passed."""
+        """Return true if the test of the timer expiry without an ignored answer before it has not passed."""
         key = failure.observation.key
         if INPUTS[key.input].preceding is None:
             return False
         return (failure.variant, VectorKey(*failure.observation.before, TIMER)) not in self._pairs
 
     def _counts_wrongly_from_start(self, failure: ConfirmedFailure) -> bool:
-        """Return true if the agent probably began its count wrongly. The sign of this is that it decides correctly
-        after other counts.
+        """Return true if the agent probably began its count wrongly. In this case it decides correctly after other
+        counts.
         """
         observation, first = failure.observation, failure.observation.outcome.runs[0]
         if first.handler not in BEGINNING_OF_COUNT:
@@ -119,10 +121,10 @@ class BlameEvidence:
         )
 
     def _holds_other_blocks(self, observation: TestedStep) -> ExpectedRun | None:
-        """Return the handler run that should have changed the blocks, if the agent's status shows wrong blocks.
+        """If the agent's status shows wrong blocks, return the handler run that should have changed the blocks.
         Otherwise return None.
 
-        If this branch passes elsewhere, return an earlier run whose branch never passes.
+        If the branch of this run passes in other tests, return an earlier run whose branch never passes.
         """
         if not BLOCK_KEYS & set(observation.wrong_status_keys):
             return None
@@ -136,8 +138,8 @@ class BlameEvidence:
 
     @staticmethod
     def _starter_of_timer(failure: ConfirmedFailure) -> BlamedBranch:
-        """Return the handler that starts the timer whose duration is wrong. Include its branch if the handler ran in
-        this step.
+        """Return the handler that starts the timer with the wrong duration. If this handler ran in the step, also
+        return its branch.
         """
         for run in failure.observation.outcome.runs:
             if HANDLERS[run.handler].starts and run.branch in STARTING_BRANCHES:
@@ -145,8 +147,8 @@ class BlameEvidence:
         return BlamedBranch(STARTED_BY[str(failure.observation.wrong_timer)], "")
 
     def _most_suspicious(self, runs: Sequence[ExpectedRun], failure: ConfirmedFailure) -> ExpectedRun:
-        """Return the handler run that most likely failed, judged by its messages, its successor, and the tests that
-        passed.
+        """Return the handler run that most likely failed. The choice depends on its messages, its successor, and the
+        passed tests.
         """
         observation = failure.observation
         if len(runs) == 1:
@@ -175,8 +177,8 @@ class BlameEvidence:
 
 
 def _took_another_decision(observation: TestedStep) -> ExpectedRun | None:
-    """Return the handler run at the expiry of the timer, if a different decision in it would explain all unexpected
-    messages. Otherwise return None.
+    """If a different decision at the expiry of the timer would explain all unexpected messages, return the handler run
+    of this expiry. Otherwise return None.
     """
     first, *then = observation.outcome.runs
     if first.handler not in BEGINNING_OF_COUNT or not observation.unexpected:
@@ -194,8 +196,8 @@ def _messages_after(event: LocalEvent) -> set[str]:
 
 
 def _sends_other_content(observation: TestedStep) -> ExpectedRun | None:
-    """Return the handler run that sent messages of the right types with wrong content. Return None if a block or a
-    message type is wrong.
+    """If the agent sent messages of the right types with wrong content, return the handler run that sent them. Return
+    None if a block or a message type is wrong.
     """
     if BLOCK_KEYS & set(observation.wrong_status_keys) or set(observation.missing) != set(observation.unexpected):
         return None

@@ -15,7 +15,7 @@ from ucp.agent import HANDLERS
 
 PARALLEL_CASES = 4
 RETRIES = 2
-"""Number of further runs in which a case must fail to be a failure."""
+"""Number of repetitions in which a case must fail again to count as a failure."""
 
 _HANDLER = {handler.algorithm: handler.name for handler in HANDLERS.values()}
 

@@ -13,7 +13,7 @@ from ucp.messages import MalformedDatagramError, Message, decode
 
 
 class KnownNames:
-    """Names such as "2.1" for the blocks and chains that the reference knows."""
+    """The names, such as "2.1", of the blocks and chains that the reference knows."""
 
     def __init__(self, model: ReferenceModel) -> None:
         state = model.state
@@ -48,7 +48,7 @@ class KnownNames:
 
 
 def message_text(message: Message, names: KnownNames) -> str:
-    """Return a text about a message, such as "Commit Block (1.1 on inception)"."""
+    """Describe a message, such as "Commit Block (1.1 on inception)"."""
     return in_words(message, names)
 
 
@@ -60,10 +60,10 @@ def datagram_text(data: bytes, names: KnownNames) -> str:
 
 
 COMPARED = ("idle", "reconcile_in_progress", "chain", "deque", "stack", "completed", "reconciles", "top_chain_hash")
-"""Keys of the status that are compared. A missing key is not compared."""
+"""Keys of the status that are compared. A key that the agent's status lacks is not compared."""
 SHOWN = 12
 MAX_EARLY_TIMERS = 3
-"""Maximum number of successive timers that are tried as an explanation for an early message."""
+"""Maximum number of successive timer expiries that are tried as an explanation for an early message."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class RecordedDatagram:
     """A datagram between the agent under test and the simulated other agents."""
 
     t: float
-    """Mission second."""
+    """Mission second at which the datagram was sent or received."""
     sent: bool
-    """True if the agent sent it, false if a peer sent it."""
+    """True if the agent under test sent the datagram. False if a peer sent it."""
     data: bytes
     text: str
-    """The message in words."""
+    """Description of the message."""
 
 
 @dataclass(frozen=True)
@@ -89,23 +89,25 @@ class TestedStep:
     expected: tuple[str, ...]
     received: tuple[str, ...]
     wrong: tuple[str, ...]
-    """A sentence for each deviation. Empty if the agent did the same as the reference."""
+    """A sentence for each deviation. Empty if the agent behaved like the reference."""
     before: AgentState
     late: bool = False
-    """True if the machine was so late that the step proves nothing."""
+    """True if the machine was late, so that the step proves nothing."""
     unexpected: tuple[str, ...] = ()
-    """Names of messages that the agent sent and the reference did not."""
+    """Names of messages that the agent sent but the reference did not."""
     missing: tuple[str, ...] = ()
     wrong_status_keys: tuple[str, ...] = ()
     """Keys of the status with wrong values."""
     wrong_timer: str | None = None
-    """Name of the timer that expired, or will expire, at a wrong time."""
+    """Name of the timer that expired or will expire at a wrong time. None without such a timer."""
     running_timer: str | None = None
-    """Name of the next timer, if its time of expiry is right. In virtual time only."""
+    """Name of the next timer to expire, if its expiry time is correct. Only in virtual time."""
     ended: str | None = None
-    """The end of the agent in words, or a sentence that it hangs. None if it runs."""
+    """A phrase about the end of the agent, or about its hanging. None if it still runs."""
     hidden_run: ExpectedRun | None = None
-    """A handler run that is the cause: of an answer that must not count, or that should have stopped a timer."""
+    """A handler run that may be the true cause: it handled an answer that must not count, or should have stopped a
+    timer.
+    """
 
 
 def compare(
@@ -162,10 +164,10 @@ def compare(
 def _timer_expired_early(
     model: ReferenceModel, expected: Sequence[Message], received: Sequence[Message], status: Mapping[str, Any]
 ) -> str | None:
-    """Return the timer whose early expiry explains the received messages and the status. Return None if there is no
-    such timer.
+    """Return the timer whose early expiry explains the received messages and the status. Return None if no early expiry
+    explains them.
 
-    This call advances the model, so the model cannot follow the agent any more.
+    The call advances the model, so the model cannot follow the agent afterwards.
     """
     sent, first = list(expected), next_timer_name(model)
     for _ in range(MAX_EARLY_TIMERS):

@@ -2,7 +2,7 @@
 SOCKET PORT...`.
 
 The program runs in the network namespace of a vehicle. It binds a UDP socket to each port, passes all of them to the
-harness through the Unix socket SOCKET, and ends. A socket stays in the namespace in which it was opened.
+harness through the Unix socket SOCKET, and ends. A socket belongs to the namespace in which it was opened.
 """
 
 import socket
@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 MAX_DESCRIPTORS = 100
-"""Maximum number of descriptors in one message. The limit of Linux is 253."""
+"""Maximum number of file descriptors in one message. The limit of Linux is 253."""
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -1,8 +1,8 @@
 """Run the reference implementation next to the agent under test, and save and restore its state.
 
 The reference is that of the step judge (`harness.checker.reference`). It receives the same inputs as the agent under
-test. The inputs are made from the reference's state, which contains the agent's real blocks with the timestamps of the
-agent's clock.
+test. The inputs are computed from the reference's state, which contains the agent's real blocks with the timestamps of
+the agent's clock.
 """
 
 from collections import deque
@@ -24,7 +24,9 @@ ROSTER = (AGENT, *PEERS)
 STRANGER = 9
 INITIAL_DATA = b"conformance"
 OLD_US, YOUNG_US = 1_000, 2**62
-"""Timestamps of peers' blocks in microseconds: older and younger than any block of the agent under test."""
+"""Timestamps of the peers' blocks in microseconds. They are older and younger than all blocks of the agent under
+test.
+"""
 EVENT_ID = 7
 
 
@@ -68,7 +70,7 @@ class ExpectedRun:
     branch: str
     sent: tuple[Message, ...]
     changes: bool = False
-    """True if it changes chain, deque, stack or completed blocks."""
+    """True if the handler run changes chain, deque, stack or completed blocks."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class ReferenceModel:
     def __init__(self, settings: Settings) -> None:
         self.agent = ReferenceAgent(AGENT, ROSTER, INITIAL_DATA, ReferenceSettings.of(settings))
         self.blocks: dict[bytes, Block] = {}
-        """Blocks of peers, by hash. Chain, deque and stack contain some of them, too."""
+        """Block hash -> block, for the blocks of peers. Some of them are also in the agent's chain, deque or stack."""
         self.datagrams: list[bytes] = []
         """Datagrams that the reference sent after the last input."""
         self.handled = self.reconciles = 0
@@ -145,7 +147,7 @@ class ReferenceModel:
         return ExpectedOutcome(runs)
 
     def status(self) -> dict[str, Any]:
-        """Return the answer that the agent should give to the command `status`."""
+        """Return the answer that a correct agent gives to the command `status`."""
         state = self.state
         return {
             "idle": state.idle,
@@ -171,7 +173,7 @@ CONTAINERS = frozenset((bytearray, set, list, deque, dict))
 class ModelSnapshot:
     """A saved state of the reference agent. `restore` sets the reference agent back to this state.
 
-    Counters for reports are left out. Paused timers are left out, too, because no timer is paused between inputs.
+    Counters for reports are omitted. Paused timers are omitted too, because no timer is paused between inputs.
     """
 
     def __init__(self, model: ReferenceModel) -> None:
@@ -191,8 +193,8 @@ class ModelSnapshot:
 
 
 def _sorted(part: dict[str, Any]) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """Split the attributes of an object into two groups. Return the immutable attributes, and copies of the attributes
-    that are containers.
+    """Divide the attributes of an object into two groups: immutable attributes, and copies of the attributes that are
+    containers.
     """
     containers = [(name, _copied(value)) for name, value in part.items() if type(value) in CONTAINERS]
     return {name: value for name, value in part.items() if type(value) not in CONTAINERS}, containers

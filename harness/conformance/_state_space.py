@@ -1,9 +1,9 @@
 """Explore all states that one agent can reach, breadth first.
 
-Two states are the same if no handler can distinguish them. Beyond two blocks, a longer chain, stack or deque does not
-change the branch that a handler takes. Counted answers matter only to the handlers that count in the same activity.
-Therefore a few values describe a state (`state_of`), and the number of states is small enough to visit all of them. A
-vector is one input in one of these states.
+Two states are the same if no handler can distinguish them. If a chain, stack or deque has more than two blocks, its
+length does not affect the branch that a handler takes. Counted answers affect only the handlers that count in the same
+activity. A few values therefore describe a state (`state_of`), and the number of states is small enough to visit all of
+them. A vector is one input in one of these states.
 """
 
 from collections import deque
@@ -21,7 +21,7 @@ STEP_S = 0.125
 """Mission seconds between two inputs that are not timers, in virtual time."""
 MAX_CHAIN, MAX_STACK, MAX_WAITING = 2, 2, 2
 MAX_STATES = 4000
-"""Limit of the exploration. It ends the program if an error in this module makes the state space infinite."""
+"""Maximum number of states. If an error in this module makes the state space infinite, the exploration ends here."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class SettingsVariant:
     name: str
     settings: Settings
     features: tuple[str, ...] = ()
-    """Features of the agent contract that the settings need."""
+    """Features of the agent contract that these settings need."""
 
 
 def _settings(**other: object) -> Settings:
     """Return settings in which each timer has a different duration and each event completes a block.
 
-    By default a vote ends before any phase that begins after it.
+    In the default settings, a vote ends before any phase that begins after it.
     """
     timers = {"vote_timeout_s": 10.0, "phase1_timeout_s": 12.0, "phase2_timeout_s": 13.0, "phase3_timeout_s": 14.0}
     room = {"max_block_bytes": MAX_EVENT_DATA_BYTES, "max_event_bytes": MAX_EVENT_DATA_BYTES}
@@ -64,7 +64,9 @@ class AgentState(NamedTuple):
     activity: str
     """Name of the running timer of a reconcile, "voting", "idle", or "stuck" (a reconcile without a running timer)."""
     holdings: tuple[str | int, ...]
-    """Length of the chain, owner of its top block, waiting blocks, and length of the stack. Lengths are limited."""
+    """The blocks of the agent: length of the chain, owner of its top block, waiting blocks, and length of the stack.
+    Lengths are limited.
+    """
     counted: tuple[object, ...]
     """Answers that the agent has counted in its current activity."""
 
@@ -151,7 +153,7 @@ class AgentTransition:
     after: AgentState
     outcome: ExpectedOutcome
     expired: str | None
-    """Name of the timer that expired."""
+    """Name of the timer that expired in this transition. None if the input is no expiry."""
 
 
 def next_timer_name(model: ReferenceModel) -> str | None:
@@ -234,11 +236,11 @@ _CHANGING_BRANCHES = {
     "receive_response_next_in_sequence": ("new candidate", "counted"),
     "receive_response_block_for_hash": ("committed",),
 }
-"""Handler -> the branches that change the agent. None: no branch does."""
+"""Handler -> the branches that change the agent. None if no branch does."""
 
 
 def changes_nothing(outcome: ExpectedOutcome) -> bool:
-    """Return true if these handler runs leave the agent unchanged."""
+    """Return true if these handler runs do not change the agent."""
     if len(outcome.runs) != 1:
         return False
     (run,) = outcome.runs
@@ -246,16 +248,17 @@ def changes_nothing(outcome: ExpectedOutcome) -> bool:
 
 
 COUNTING_HANDLERS = {"receive_vote_add_block", "receive_phase_1_response", "receive_response_next_in_sequence"}
-"""Handlers that only count an answer. A wrong count shows only when the timer expires."""
+"""Handlers that only count an answer. A wrong count becomes visible only when the timer expires."""
 COUNTING_STATES = {
     ("voting", (2, "another's block", "one block waits", 0)),
     ("voting", (2, "another's block", "blocks wait", 0)),
     ("phase one", (2, "another's block", "", 0)),
     ("phase two", (2, "another's block", "", 0)),
 }
-"""Activity and holdings of the states in which the exploration goes beyond one answer, and tests ignored answers. An
-agent counts and decides in the same way in all other states. These states have a long chain and an empty stack, so that
-one agent can reach them again and again."""
+"""Activity and holdings of the states in which the exploration tries more than one answer, and tests ignored answers.
+In all other states an agent counts and decides in the same way. These states have a long chain and an empty stack, so
+one agent can reach them repeatedly.
+"""
 
 
 def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, given: AgentInput) -> bool:
@@ -293,13 +296,13 @@ def _outcome_of_timer(snapshot: ModelSnapshot, now: float, name: str, *, counts:
 
 
 def handlers_and_messages(outcome: ExpectedOutcome) -> tuple[object, ...]:
-    """Return the handlers, branches and message names of these handler runs. None of these depends on block hashes."""
+    """Return the handlers, branches and message names of these handler runs. They do not depend on block hashes."""
     return tuple((run.handler, run.branch, tuple(message.NAME for message in run.sent)) for run in outcome.runs)
 
 
 def _is_redundant(model: ReferenceModel, before: AgentState, given: AgentInput) -> bool:
-    """Return true if the input leads only to states equivalent to known ones, or if its effect depends on more than the
-    state.
+    """Return true if the input leads only to states that are equivalent to known ones, or if its effect depends on more
+    than the state.
     """
     if given.name == LOG:
         return len(model.state.blocks_to_be_committed) >= MAX_WAITING

@@ -1,7 +1,7 @@
 """Play all generated tests with many agents in parallel. Then repeat the suspected failures with few agents at a time.
 
-Parallel agents compete for the processor, so a wrong answer may be the fault of the machine. A suspicion becomes a
-failure only if it repeats in each of several replays.
+Parallel agents compete for the processor, so a wrong answer may be caused by a slow machine. A suspected failure counts
+only if it occurs in each of several replays.
 """
 
 import asyncio
@@ -33,28 +33,30 @@ from harness.errors import UnsupportedError
 MAX_WORKERS = 24
 """Maximum number of agents in parallel."""
 WORKERS_PER_PASS = 0.01
-"""Increase of the number of agents with each vector that passes, after a decrease."""
+"""Increase of the number of agents for each vector that passes, after the number was reduced."""
 MIN_WORKERS = 6
-"""Minimum number of agents in parallel, if the machine is late again and again."""
+"""Minimum number of agents in parallel on a machine that is often late."""
 STARTS_AT_ONCE = 4
-"""Maximum number of simultaneous starts. A start needs the processor, and delays the agents under test."""
+"""Maximum number of agents that start at the same time. A start needs processor time and delays the agents under
+test.
+"""
 RETRY_WORKERS = 3
-"""Number of agents that replay in parallel. They are few, so that they do not disturb each other."""
+"""Number of agents that replay suspected failures in parallel. It is small, so that they do not delay each other."""
 MAX_FAILURES_OF_A_KIND = 3
-"""Number of suspicions with the same branches after which further vectors with these branches are set aside."""
+"""Number of suspected failures with the same branches. After it, further vectors with these branches are not played."""
 MAX_RETRIES_OF_A_KIND = 2
 MAX_SUSPICIONS = 24
-"""Maximum number of suspicions that are replayed. The suite stops its tours when it has as many."""
+"""Maximum number of suspected failures that are replayed. When this number is reached, the suite stops its tours."""
 MAX_HIDDEN = 16
 """Maximum number of ignored answers that are tried as the cause of a failure."""
 MAX_PATH = 80
-"""Maximum number of inputs in a replay of the end of a tour."""
+"""Maximum number of inputs in a replay that consists of the end of a tour."""
 REPETITIONS = 2
-"""Number of replays in which a suspicion must repeat to be a failure."""
+"""Number of replays in which a suspected failure must occur again."""
 MAX_ATTEMPTS = 4
 """Maximum number of replays, if the machine is late in some of them."""
 MAX_FAILED_STARTS = 3
-"""Number of failed starts in a row after which the suite gives up."""
+"""Number of consecutive failed starts after which the suite gives up."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +70,9 @@ class ConfirmedFailure:
     exchanges: tuple[RecordedDatagram, ...]
     """All datagrams since the start of the agent."""
     needs_earlier_round: bool = False
-    """True if the shortest path does not fail, but a path with an earlier vote or reconcile does."""
+    """True if the agent fails only after an earlier vote or reconcile, and not with the shortest sequence of inputs."""
     unexplained_end: str | None = None
-    """The end of the agent in words, if no short path to the last input causes it."""
+    """A phrase about the end of the agent, if no short sequence of inputs causes it. None otherwise."""
 
 
 @dataclass
@@ -86,7 +88,7 @@ class VariantResult:
 
 
 class ReplayVerdict(Enum):
-    """The result of a repeated test that did not fail."""
+    """The result of a replay in which no failure occurred."""
 
     RIGHT = auto()
     TOO_LATE = auto()
@@ -98,8 +100,8 @@ ReplayOutcome = ConfirmedFailure | ReplayVerdict
 
 
 class VectorSuite:
-    """All generated tests, with the methods that play them. `show_progress` gets the number of passed tests after each
-    change.
+    """All generated tests, and the methods that play them. `show_progress` receives the number of passed tests after
+    each change.
     """
 
     def __init__(
@@ -135,8 +137,7 @@ class VectorSuite:
         """Play all tests. Then repeat the tests for which the machine was too late, and at the end the suspected
         failures.
 
-        `until` is the second of the monotonic clock at which no further vectors begin. Raises NoAgentError if the
-        agent never starts.
+        No vector begins after the second `until` of the monotonic clock. Raises NoAgentError if the agent never starts.
         """
         workers = min(self._all_workers, 1 + sum(vector_map.left for vector_map in self._maps) // 10)
         await _run_all([self._work(place, until) for place in range(workers)])
@@ -177,9 +178,7 @@ class VectorSuite:
                 self._working[number] -= 1
 
     def _next_variant(self) -> int | None:
-        """Return the index of the settings with the most remaining tests for each agent. Return None if no tests
-        remain.
-        """
+        """Return the index of the settings with the most remaining tests per agent. Return None if no tests remain."""
         shares = [
             (vector_map.left / (self._working[number] + 1), number)
             for number, vector_map in enumerate(self._maps)
@@ -245,8 +244,8 @@ class VectorSuite:
 
     @staticmethod
     def _suspicions_to_retry(variant_result: VariantResult) -> Iterator[SuspectedFailure]:
-        """Yield the suspected failures, those with the fewest inputs first. Yield at most MAX_RETRIES_OF_A_KIND with
-        the same branches.
+        """Yield the suspected failures. Those with the fewest inputs come first. Yield at most MAX_RETRIES_OF_A_KIND
+        with the same branches.
         """
         kinds: Counter[object] = Counter()
         for suspicion in sorted(variant_result.suspicions, key=lambda suspicion: len(suspicion.path)):
@@ -299,8 +298,8 @@ class VectorSuite:
         """Test a suspected failure with several sequences of inputs, until the agent fails in one. Yield the result of
         each sequence.
 
-        The first sequence is the shortest one. The next ones are the shortest one with an additional answer that the
-        agent must ignore. The last ones are the ends of the original sequence.
+        The first sequence is the shortest one that leads to the state. The next ones contain an additional answer that
+        the agent must ignore. The last ones are the ends of the original sequence.
         """
         variant = variant_result.vectors.variant
         name = suspicion.path[-1]
@@ -328,8 +327,8 @@ class VectorSuite:
     async def _find_miscounted(
         self, variant: SettingsVariant, path: Sequence[str], failure: ConfirmedFailure, *, needs_earlier_round: bool
     ) -> ConfirmedFailure:
-        """Return the failure. Add the cause if the failure disappears without the answers that a certain handler must
-        ignore.
+        """Find out whether the failure disappears without the answers that a certain handler must ignore. Return the
+        failure, with this cause if it was found.
         """
         counted = _ignored_answers(variant, path)
         for handler in dict.fromkeys(run.handler for run in counted.values()):
@@ -342,7 +341,8 @@ class VectorSuite:
         return replace(failure, needs_earlier_round=needs_earlier_round)
 
     async def _play_repeatedly(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Play these inputs several times. Return RIGHT if the agent is right at least once, otherwise its failure.
+        """Play these inputs several times. If the agent is right at least once, return RIGHT. Otherwise return its
+        failure.
 
         Return TOO_LATE if the machine was late in too many replays.
         """
@@ -358,8 +358,8 @@ class VectorSuite:
         return TOO_LATE
 
     async def play(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Give these inputs to a new agent. Return its first failure, or RIGHT without a failure, or TOO_LATE if the
-        machine was too late.
+        """Give these inputs to a new agent. Return its first failure. Return RIGHT if it has none, or TOO_LATE if the
+        machine was late.
         """
         try:
             agent = await self._start(variant, True)
@@ -377,7 +377,7 @@ class VectorSuite:
 
 
 def _kind_of_end(ended: str) -> str:
-    """Return a short phrase about the end of an agent, such as "it hangs" or "it ended by itself with status 1"."""
+    """Return a phrase about the end of an agent, such as "it hangs" or "it ended with status 1"."""
     return ended.partition(":")[0]
 
 
@@ -388,8 +388,8 @@ def _unexplained_failure(variant: SettingsVariant, suspicion: SuspectedFailure, 
 
 
 def _single_run(variant: SettingsVariant, path: tuple[str, ...], name: str) -> ExpectedRun | None:
-    """Return the handler run that the input `name` causes after the inputs in `path`. Return None unless there is
-    exactly one.
+    """Return the only handler run that the input `name` causes after the inputs in `path`. Return None if it causes
+    none or several.
     """
     model, now = walk(variant, path)
     advanced = advance(model, INPUTS[name], now)
@@ -397,9 +397,7 @@ def _single_run(variant: SettingsVariant, path: tuple[str, ...], name: str) -> E
 
 
 def _ignored_answers(variant: SettingsVariant, path: Sequence[str]) -> dict[int, ExpectedRun]:
-    """Return the answers among these inputs that the agent must ignore: position of the input -> handler run that
-    ignores it.
-    """
+    """Return position -> handler run, for each of these inputs that is an answer the agent must ignore."""
     model, now = ReferenceModel(variant.settings), 0.0
     uncounted = {}
     for place, name in enumerate(path[:-1]):
@@ -412,10 +410,10 @@ def _ignored_answers(variant: SettingsVariant, path: Sequence[str]) -> dict[int,
 
 
 def _path_tails(variant: SettingsVariant, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield parts of these inputs that end with the last input, from the shortest part to all inputs. Before each part,
-    the agent was idle.
+    """Yield parts of these inputs that end with the last input, from the shortest part to all inputs. Each part begins
+    at an input before which the agent was idle.
 
-    Parts with more than MAX_PATH inputs are left out.
+    Parts with more than MAX_PATH inputs are omitted.
     """
     model, now = ReferenceModel(variant.settings), 0.0
     idle = [0]

@@ -1,9 +1,9 @@
 """Let one agent play many generated tests in sequence, along the shortest paths between their states.
 
-In each state the tour first plays the vectors that leave the agent unchanged, and then one that changes it. If no
-vectors are left in a state, the tour goes to the nearest state with vectors that are left. Many tours run in parallel,
-and share the set of vectors that are left. A deviation of the agent ends its tour with a suspicion. Another agent
-continues with the other vectors, and the suite plays the suspicion again, alone.
+In each state the tour first plays the vectors that do not change the agent, and then one that changes it. If no vectors
+remain in a state, the tour goes to the nearest state with remaining vectors. Many tours run in parallel, and share the
+set of remaining vectors. A deviation of the agent ends its tour with a suspected failure. Another agent continues with
+the other vectors, and the suite later replays the suspected failure.
 """
 
 import heapq
@@ -19,22 +19,22 @@ from harness.conformance._reference_model import ReferenceModel
 from harness.conformance._state_space import AgentState, AgentTransition, SettingsVariant, VectorKey, key_of, state_of
 
 TIMER_COSTS = 10.0
-"""Cost of the expiry of a timer on a path. A cost is about one mission second."""
+"""Cost of a timer expiry on a path. The unit of a cost is about one mission second."""
 INPUT_COSTS = 0.3
 START_COSTS = 100.0
-"""Cost of a new agent. It takes less time, but needs processor time, which the other agents then lack."""
+"""Cost of starting a new agent. The start takes less time, but it uses processor time that the other agents need."""
 GROWTH_COSTS = 60.0
-"""Cost of a block on the chain. A chain does not become shorter, and some vectors need a short chain."""
+"""Cost of adding a block to the chain. A chain never becomes shorter, and some vectors need a short chain."""
 MAX_TRIES = 6
-"""Maximum number of tries of one vector, if the machine is late each time."""
+"""Maximum number of attempts for a vector if the machine is late each time."""
 MAX_SEARCHED_STATES = 3000
-"""Maximum number of states in the search for a path."""
+"""Maximum number of states that the search for a path visits."""
 _RESTART = "another agent starts"
 
 
 @dataclass(frozen=True)
 class SuspectedFailure:
-    """A wrong answer of an agent whose cause may also be a slow machine."""
+    """A wrong answer of an agent. A slow machine may also have caused it."""
 
     path: tuple[str, ...]
     """All inputs since the start of the agent. The agent answered the last one wrongly."""
@@ -44,28 +44,26 @@ class SuspectedFailure:
 
 
 class VectorMap:
-    """The generated tests that remain for one combination of settings, and a map of the transitions that lead to
-    them.
-    """
+    """The remaining tests for one combination of settings, and a map of the transitions that lead to them."""
 
     def __init__(self, variant: SettingsVariant, transitions: list[AgentTransition], wanted: set[VectorKey]) -> None:
         self.variant = variant
         self.start = state_of(ReferenceModel(variant.settings))
         self._unseen: dict[tuple[str, tuple[str | int, ...]], set[VectorKey]] = defaultdict(set)
-        """Activity and holdings -> the vectors that are left there."""
+        """Activity and holdings -> the vectors that remain there."""
         self.left = len(wanted)
         for key in wanted:
             self._unseen[key.activity, key.holdings].add(key)
         self._edges: dict[tuple[str, tuple[str | int, ...], tuple[object, ...]], list[tuple[str, AgentState, float]]]
         self._edges = defaultdict(list)
-        """Activity, holdings and relevant counts -> edges from there: input, next state, and cost."""
+        """Activity, holdings and relevant counts -> the transitions from there: input, next state, and cost."""
         self._quiet: set[VectorKey] = set()
         self._growing: set[VectorKey] = set()
         self._tries: Counter[VectorKey] = Counter()
         self.given_up: list[VectorKey] = []
         """Vectors for which the machine was late MAX_TRIES times."""
         self.claimed: set[VectorKey] = set()
-        """Vectors to which a tour is on its way."""
+        """Vectors that a tour is about to play."""
         for transition in transitions:
             if transition.after == transition.before:
                 self._quiet.add(transition.key)
@@ -130,7 +128,7 @@ class VectorMap:
         self.left = 0
 
     def avoid(self, key: VectorKey) -> None:
-        """Remove a transition from all paths, because the agent deviates there."""
+        """Remove a transition from all paths, because the agent deviates at it."""
         edges = self._edges[key[:3]]
         edges[:] = [edge for edge in edges if edge[0] != key.input]
 
@@ -140,8 +138,8 @@ class VectorMap:
         """Return the cheapest sequence of inputs to a remaining test, and the test. Return None if no test can be
         reached.
 
-        An empty path means that a new agent reaches a test more cheaply. `ruled_out` contains tests that were
-        impossible, or led to a state that differs from the map.
+        An empty path means that it is cheaper to start a new agent. `ruled_out` contains tests that were impossible, or
+        that led to a state other than the one in the map.
         """
         queue: list[tuple[float, int, AgentState | VectorKey, tuple[str, ...]]] = [(0.0, 0, state, ())]
         if state != self.start:
@@ -234,7 +232,7 @@ class AgentTour:
             self._claim = None
 
     def _next_input(self) -> str | None:
-        """Return the name of the next input. Return None if this agent should stop here."""
+        """Return the name of the next input. Return None if the tour should end here."""
         state = state_of(self._agent.model)
         if self._agent.timer_is_near:
             self._discard_plan()

@@ -1,8 +1,8 @@
 """Test an agent over UDP: give the agent and the reference the same input, and compare their answers.
 
-The comparison covers the agent's broadcasts, and its answer to the command `status`. The count of handler runs in the
-status shows when the agent has handled the input. Therefore an input without an expected message costs no waiting time,
-unless the agent counts its handler runs in another way.
+The comparison covers the agent's broadcasts, and its answer to the command `status`. The number of handler runs in the
+status shows when the agent has handled the input. An input without an expected message therefore needs no waiting time,
+unless the agent counts handler runs differently.
 """
 
 import asyncio
@@ -60,19 +60,19 @@ class UdpTiming:
     """The speed of mission time, and the time limits in seconds of wall time."""
 
     speedup: float
-    """Mission seconds per wall second."""
+    """Mission seconds per second of wall time."""
     margin_s: float
-    """Minimum time between an input and the next expiry of a timer."""
+    """Minimum time between an input and the next timer expiry."""
     early_s: float
-    """Time by which a timer may expire too early."""
+    """Time by which a timer may expire early without a failure."""
     patience_s: float
-    """Time limit of an expected message."""
+    """Time limit for an expected message."""
     calm_s: float
-    """Time without a change after which the input counts as handled, if the agent does not report it as handled."""
+    """Time without a change after which an input counts as handled, if the agent does not report it as handled."""
     linger_s: float
-    """Additional time in which unexpected messages are received."""
+    """Additional time to wait for unexpected messages."""
     ask_again_s: float
-    """Time without an expected message after which the agent is asked for its status."""
+    """Time without an expected message after which the harness requests the agent's status."""
 
 
 TIMING_IN_PARALLEL = UdpTiming(
@@ -80,7 +80,9 @@ TIMING_IN_PARALLEL = UdpTiming(
 )
 TIMING_ALONE = UdpTiming(8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3, linger_s=0.1, ask_again_s=0.25)
 MIN_ANSWERS = 2
-"""Number of answers of an agent after which a missing message is the agent's fault, not that of a late machine."""
+"""Minimum number of answers of an agent after which a missing message counts as the agent's fault, and not as that of a
+late machine.
+"""
 
 
 class UdpAgent(AgentUnderTest):
@@ -148,7 +150,7 @@ class UdpAgent(AgentUnderTest):
         return (at_s - self._epoch) * self._timing.speedup
 
     def _wall_s(self, mission_s: float) -> float:
-        """Return the wall time of a mission second, in seconds since the Unix epoch."""
+        """Return the wall time at a mission second, in seconds since the Unix epoch."""
         return self._epoch + mission_s / self._timing.speedup
 
     @property
@@ -233,7 +235,7 @@ class UdpAgent(AgentUnderTest):
     ) -> bool:
         """Return true if timers that expired shortly before or after the input explain the agent's messages and status.
 
-        If so, the model then is in the state of the agent.
+        In this case, the model is afterwards in the state of the agent.
         """
         first, last = (
             (self._mission_s(received[0][0]), self._mission_s(received[-1][0]))
@@ -264,11 +266,11 @@ class UdpAgent(AgentUnderTest):
             return {}
 
     def _may_have_expired(self, deadline: float | None) -> bool:
-        """Return true if the timer may have expired by now."""
+        """Return true if the timer with this deadline may have expired by now."""
         return deadline is not None and self._wall_s(deadline) - time.time() < self._timing.early_s
 
     async def _wait_for_timer(self, until: float, name: str) -> str | None:
-        """Wait until the timer expires or a message arrives. Return a sentence if the message is too early. Otherwise
+        """Wait until the timer expires or a message arrives. If the message is too early, return a sentence. Otherwise
         return None.
         """
         while time.time() < until and not self.peer_socket.received:
@@ -303,11 +305,11 @@ class UdpAgent(AgentUnderTest):
     async def _settle(self, messages: int, since: float, deadline: float | None) -> tuple[dict[str, Any], int, bool]:
         """Wait until the agent has handled the input and sent the expected number of messages, or until a time limit.
 
-        `since` is the wall time of the input, and `deadline` is the mission second of the next timer. If the agent
-        counts its handler runs in another way, its status must have the expected values for a while.
+        `since` is the wall time of the input. `deadline` is the mission second of the next timer expiry. If the agent
+        counts handler runs differently, its status must have the expected values for some time.
 
-        Return the status, the number of answers, and whether it was too late. Only answers before the deadline count:
-        an agent that answers runs, and could have handled the input before.
+        Return the status, the number of answers, and whether it was too late. Only answers before the deadline count,
+        because they prove that the agent was running and could have handled the input.
         """
         timing = self._timing
         give_up, calm_since = since + timing.patience_s, math.inf
@@ -343,7 +345,7 @@ class UdpAgent(AgentUnderTest):
 
 
 def _end(error: Exception) -> str | None:
-    """Return a description of how the agent ended. Return None if a slow machine may be the cause of the error."""
+    """Return a description of the end of an agent. Return None if a slow machine may have caused the error."""
     return str(error) if isinstance(error, AgentHangsError | AgentExitedError) else None
 
 
@@ -362,7 +364,7 @@ def _messages(datagrams: Iterable[bytes]) -> list[Message] | None:
 def _expire(model: ReferenceModel, now: float) -> list[bytes]:
     """Let the next timer of the reference expire at its deadline, or at the time `now` if the deadline has passed.
 
-    Return the datagrams that the reference sends. Empty if no timer runs.
+    Return the datagrams that the reference sends. The result is empty if no timer runs.
     """
     deadline = model.agent.next_timer()
     if deadline is None:

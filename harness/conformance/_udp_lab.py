@@ -1,7 +1,7 @@
 """The virtual network of a test over UDP. It has two vehicles: one for all agents under test, and one for all simulated
 agents.
 
-Each agent has its own port. Therefore agents that are tested in parallel do not receive each other's messages.
+Each agent has its own port, so agents that are tested in parallel do not receive each other's messages.
 """
 
 import asyncio
@@ -30,14 +30,15 @@ from netem.lab import Lab
 from ucp.features import UNSUPPORTED
 
 AGENTS_VEHICLE, PEERS_VEHICLE = 1, 2
-"""Vehicles of the lab: that of all agents under test, and that of their peers."""
+"""The vehicles of the lab: one for all agents under test, and one for their peers."""
 FIRST_PORT = 14600
 MAX_READ_BYTES = 65536
 MAX_REPEATED_REQUESTS, REPEATED_REQUEST_LIMIT_S = 10, 1.0
-"""Number of further requests to an agent that did not answer one within ANSWER_LIMIT_S, and their time limit. An agent
-that answers none of them hangs. A pause of the harness uses up one of them only."""
+"""Number and time limit of additional requests to an agent that did not answer a request within ANSWER_LIMIT_S. An
+agent that answers none of them counts as hung. If the harness itself pauses, only one of these requests is wasted.
+"""
 _SO_TIMESTAMPNS = 35
-"""Socket option of Linux. Python has no name for it."""
+"""A socket option of Linux that has no name in Python."""
 _TIMESPEC = struct.Struct("@qq")
 ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
 
@@ -62,8 +63,8 @@ class AgentHangsError(AgentEndedError):
 
 
 class UdpLab:
-    """A virtual network in which `count` agents can be tested at once. Open it with `async with`. `take_port` reserves
-    a UDP port for an agent.
+    """A virtual network in which `count` agents can be tested at the same time. Open it with `async with`. `take_port`
+    reserves a UDP port for an agent.
     """
 
     def __init__(self, place: Path, command: Sequence[str], count: int) -> None:
@@ -170,8 +171,8 @@ class PeerSocket:
     """The UDP socket for all simulated agents of one test. The socket receives the datagrams of the tested agent, and
     sends those of the simulated agents.
 
-    `received` has pairs of arrival and datagram. The arrival is the time at which the kernel received the datagram, in
-    seconds since the Unix epoch. It does not depend on when the harness reads the socket.
+    `received` contains pairs (arrival time, datagram). The arrival time is the time at which the kernel received the
+    datagram, in seconds since the Unix epoch. It does not depend on the time at which the harness reads the socket.
     """
 
     def __init__(self, air: UdpLab, port: int) -> None:
@@ -181,7 +182,7 @@ class PeerSocket:
         self._arrived = asyncio.Event()
         self.received: list[tuple[float, bytes]] = []
         self.record: list[tuple[float, bool, bytes]] = []
-        """All datagrams: wall time in seconds, true if the agent sent it, and content."""
+        """All datagrams that were sent or received: wall time in seconds, true if the agent sent it, and content."""
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         with suppress(BlockingIOError):
             while True:
@@ -203,7 +204,7 @@ class PeerSocket:
                     self._arrived.set()
 
     async def arrival(self, until: float) -> None:
-        """Wait until a datagram arrives, or until this wall time in seconds since the Unix epoch."""
+        """Wait until a datagram arrives, but at most until this wall time in seconds since the Unix epoch."""
         self._arrived.clear()
         with suppress(TimeoutError):
             await asyncio.wait_for(self._arrived.wait(), max(0.0, until - time.time()))
@@ -227,7 +228,7 @@ class ProcessUnderTest:
         self.agent_id = agent_id
         self.program = program
         self.signalled = False
-        """True if the harness sent a signal, after which the agent may not answer."""
+        """True if the harness has sent a signal. The agent may not answer after it."""
 
     @classmethod
     async def start(

@@ -1,7 +1,7 @@
 """Test an agent in virtual time: `COMMAND --virtual` reads inputs and writes answers as lines of text.
 
-A test in virtual time waits for no timer. It also compares the time at which the next timer expires. One process plays
-many incarnations of the agent, one after another.
+A test in virtual time does not wait for timers. It also compares the time at which the next timer expires. One process
+plays many incarnations of the agent, one after another.
 """
 
 import asyncio
@@ -84,7 +84,7 @@ class VirtualProgram:
         return f"it still runs after {ANSWER_LIMIT_S:g} s" if status is None else f"status {status}"
 
     def close(self) -> None:
-        """End the process and all processes that it started, even if they hold its pipes open."""
+        """End the process and all processes that it started. This works even if they keep its pipes open."""
         self._program.close()
 
 
@@ -100,7 +100,7 @@ class VirtualTimeAgent(AgentUnderTest):
         self._now = 0.0
         self._record: list[RecordedDatagram] = []
         self._stopped_timers: dict[float, ExpectedRun] = {}
-        """Former deadline of a stopped timer -> the handler run that stopped the timer."""
+        """Former deadline of a stopped timer -> the handler run that stopped it."""
 
     @classmethod
     async def start(
@@ -185,7 +185,7 @@ def _same_instant(announced_s: Any, expected_s: float | None) -> bool:
 
 
 async def case_of_end(programs: Sequence[VirtualProgram]) -> CaseResult:
-    """Close the inputs of these processes, and return the result of the test case about their exit status."""
+    """Close the input of these processes. Return the result of the test case about their exit status."""
     ends = [await program.finish() for program in programs]
     wrong = next((end for end in ends if end != RIGHT_END), None)
     if wrong is None:

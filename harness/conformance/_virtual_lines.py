@@ -1,7 +1,7 @@
 """Convert a sequence of inputs to the lines that `COMMAND --virtual` reads, and to the answers that it should write.
 
-ucp/contract/CONTRACT.md describes the lines. An input has its time. An answer has datagrams in base64, and the time at
-which the next timer expires. Each line also has a description in words.
+ucp/contract/CONTRACT.md describes the lines. A line with an input contains its time. A line with an answer contains
+datagrams in base64, and the time at which the next timer expires. Each line also has a description in words.
 """
 
 import base64
@@ -34,18 +34,18 @@ class VirtualLine:
     given: dict[str, Any]
     answer: dict[str, Any]
     input_text: str
-    """The input in words."""
+    """Description of the input."""
     sent_texts: tuple[str, ...]
-    """The expected messages in words."""
+    """Descriptions of the expected messages."""
     outcome: ExpectedOutcome
 
 
 class NotPlayableError(Exception):
-    """An error: an input cannot occur in virtual time, because over UDP a timer expired late."""
+    """An error: an input is impossible in virtual time, because a timer expired late in the test over UDP."""
 
 
 class LineWriter:
-    """Runs the reference in virtual time, and converts each input and answer to a line."""
+    """A writer that runs the reference in virtual time, and converts each input and answer to a line."""
 
     def __init__(self, variant: SettingsVariant) -> None:
         self.model = ReferenceModel(variant.settings)

@@ -1,4 +1,4 @@
-"""Write a table of agents and Algorithms with test results, as a single HTML file."""
+"""Write the test results of several agents as a table of agents and Algorithms, in a single HTML file."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

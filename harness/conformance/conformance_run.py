@@ -27,9 +27,11 @@ from harness.conformance.vectors import VectorSet, generate
 from harness.errors import MachineError
 
 VIRTUAL_WORKERS = 2
-"""Number of processes of the agent in virtual time."""
+"""Number of processes of the agent in a test in virtual time."""
 LIMIT_S = 600.0
-"""Time limit of the tours in wall seconds. Vectors that are left then are not tried. An idle machine needs 100 s."""
+"""Time limit of the tours in seconds of wall time. Vectors that remain then are not played. An idle machine needs 100
+s.
+"""
 
 
 @dataclass(frozen=True)
@@ -38,13 +40,13 @@ class ConformanceRequest:
 
     command: tuple[str, ...]
     only: str | None
-    """Number or handler of the only Algorithm to test. None: test all."""
+    """Number or handler of the only Algorithm to test. None to test all."""
     keep: Path | None
-    """Directory for the files of failures. None: write no files."""
+    """Directory for the files about failures. None to write no files."""
     virtual: bool = False
-    """True: test in virtual time."""
+    """True to test in virtual time."""
     handwritten: bool = True
-    """True: also play the handwritten cases, over UDP."""
+    """True to play the handwritten cases as well, over UDP."""
     max_suspicions: int = MAX_SUSPICIONS
     limit_s: float = LIMIT_S
 
@@ -57,8 +59,8 @@ def conform(
 ) -> ConformanceResults:
     """Test an agent, and return the results. Raises MachineError, NoAgentError.
 
-    `show_progress` receives the number of passed vectors, and the number of all vectors. `vector_sets` replace the
-    vectors that the request selects.
+    `show_progress` receives the number of passed vectors and the number of all vectors. If `vector_sets` is given, it
+    replaces the vectors that the request selects.
     """
     results = ConformanceResults(request.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
     began = time.monotonic()

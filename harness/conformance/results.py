@@ -16,7 +16,7 @@ SCHEMA = "ucp-conformance/1"
 CaseVerdict = Literal["passed", "failed", "not applicable", "not tried"]
 TITLES = {handler.algorithm: handler.title for handler in HANDLERS.values()}
 FURTHER_CHECKS = 0
-"""Number in place of an Algorithm, for cases about the program, its datagrams and its files."""
+"""The number that replaces that of an Algorithm for cases about the program, its datagrams and its files."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class ConformanceResults:
     started_at: str
     cases: list[CaseResult] = field(default_factory=list)
     counted: dict[int, AlgorithmCounts] = field(default_factory=dict)
-    """Algorithm -> number of its vectors that did not fail. They have no entry in `cases`."""
+    """Algorithm -> numbers of its vectors by verdict. Vectors that failed are in `cases` instead."""
     notes: list[str] = field(default_factory=list)
     interrupted: bool = False
 

@@ -1,15 +1,16 @@
 """Generate the tests for all states and inputs of an agent, and write them to a file for use without the harness.
 
-An agent with other settings is another agent. Its vectors are included if they differ from those of the default
-settings.
+Agents with different settings have different vectors. The vectors for other settings are included if they differ from
+those for the default settings.
 
 The first line of the file describes the file. Each further line is one step: an input and the expected output. `after`
-is the number of the preceding step, so a reader finds all steps of a mission by going back. `in` and `out` are lines of
-virtual time (ucp/contract/CONTRACT.md): times are mission seconds, datagrams are in base64, and `timer` is the time at
-which the next timer expires, null if none runs. `says` and `sends` are the same in words.
+is the number of the preceding step. By following these numbers back, a reader finds all steps of a mission. `in` and
+`out` are lines of virtual time (ucp/contract/CONTRACT.md): times are mission seconds, datagrams are in base64, and
+`timer` is the time at which the next timer expires, or null if no timer runs. `says` and `sends` contain the same as
+text.
 
-Over UDP the agent's own blocks have other timestamps, and therefore other hashes. A reader must replace the hashes of
-the blocks 1.1, 1.2 and so on by those in the agent's export.
+Over UDP the agent's own blocks have different timestamps, and therefore different hashes. A reader must replace the
+hashes of the blocks 1.1, 1.2 and so on by those in the agent's export.
 """
 
 import json
@@ -38,7 +39,7 @@ class VectorSet:
     steps: Sequence[AgentTransition]
     """All transitions of the state space."""
     wanted: Mapping[VectorKey, AgentTransition]
-    """The transitions that are vectors. The others only lead to them."""
+    """The transitions that are vectors. All other transitions only lead to vectors."""
 
     @cached_property
     def by_key(self) -> dict[VectorKey, AgentTransition]:
@@ -60,7 +61,7 @@ def generate(only: str | None = None) -> list[VectorSet]:
 
 @cache
 def _all_sets() -> tuple[VectorSet, ...]:
-    """Return all generated tests. Their computation takes seconds, so all agents share one result."""
+    """Return all generated tests. They take seconds to compute, so all agents share the result."""
     default_results: dict[VectorKey, tuple[object, ...]] = {}
     generated = []
     for variant in VARIANTS.values():
@@ -115,8 +116,8 @@ def to_lines(generated: Sequence[VectorSet]) -> Iterator[str]:
 
 
 def _step(number: int, after: int, line: VirtualLine, state: str | None) -> dict[str, Any]:
-    """Return the JSON object for one line. `state` describes the tested state. It is None for a step that only leads to
-    a test.
+    """Return the JSON object for one line. `state` describes the tested state. `state` is None for a step that only
+    leads to a test.
     """
     runs = [{"algorithm": run.algorithm, "handler": run.handler, "branch": run.branch} for run in line.outcome.runs]
     step = {"step": number, "after": after, "input": line.name, "in": line.given, "out": line.answer}

@@ -124,7 +124,9 @@ def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
-    """Judge the run as a part of its test, not after the test. A violation is then a failure of the test."""
+    """Judge the run as a part of its test, so that a violation makes the test fail. After the test it would be too
+    late.
+    """
     try:
         yield
     except Exception:

@@ -24,7 +24,7 @@ DEFAULTS: dict[str, Any] = {"backend": "sim", "seed": 1, "variant": None}
 
 
 def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
-    """Yield the swarm of a test. If the test is aborted, its run ends here."""
+    """Yield the swarm of a test. If the test is aborted, this function ends the run."""
     with ExitStack() as stack:
         with one_sentence():
             options = SessionOptions.of(node.config)
@@ -92,14 +92,18 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
 
 
 def _variant(marked: Any, node: pytest.Item, options: SessionOptions) -> Path | None:
-    """Return the file of the variant from the command line. If it names none, use the marker. Raises ScenarioError."""
+    """Return the file of the protocol variant. An option of the command line takes precedence over the marker. Raises
+    ScenarioError.
+    """
     if marked is not None and not isinstance(marked, str | Path):
         raise ScenarioError(f"`variant` is {marked!r}: use the path of a Python file")
     return options.variant or (node.path.parent / marked if marked is not None else None)
 
 
 def _backend_and_seed(backend: Any, seed: Any, options: SessionOptions) -> tuple[BackendName, int]:
-    """Return the backend and seed from the command line. If it names none, use the marker. Raises ScenarioError."""
+    """Return the backend and the seed. Options of the command line take precedence over the marker. Raises
+    ScenarioError.
+    """
     if backend not in BACKEND_NAMES:
         *names, last = map(repr, BACKEND_NAMES)
         raise ScenarioError(f"`backend` is {backend!r}: use {', '.join(names)} or {last}")

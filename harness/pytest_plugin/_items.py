@@ -1,4 +1,4 @@
-"""Turn scenarios and stories into tests, one for each backend and seed."""
+"""Convert scenarios and stories to tests, one for each backend and seed."""
 
 from collections.abc import Iterator
 from difflib import unified_diff
@@ -137,8 +137,8 @@ class StoryItem(pytest.Item):
         return self._story.with_answers(answers)
 
     def _unknown_word(self, archive: RunArchive) -> str | None:
-        """Return a description of the first name in a trace that stories do not support. Return None if they support
-        all names.
+        """Return a description of the first name in a trace that stories do not support. Return None if stories support
+        all names in the traces.
         """
         for agent_id, trace in archive.traces.items():
             if unknown := first_unknown(unknown_names(trace.runs)):

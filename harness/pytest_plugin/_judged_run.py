@@ -23,8 +23,8 @@ from harness.scenario.expect import Expect
 
 
 class RunOfOneTest:
-    """The run of a test. `finish` ends the run and judges it. If its argument is true, it first waits until the agents
-    are idle.
+    """The run of a test. The function `finish` ends the run and judges it. With the argument true, it first waits until
+    the agents are idle.
 
     `variant` is the file of the protocol variant of the run, or None.
     """
@@ -92,9 +92,8 @@ class RunOfOneTest:
 
 @contextmanager
 def one_sentence() -> Iterator[None]:
-    """Skip the test if the machine cannot play it, and fail for any other error.
-
-    The message is the error's sentence.
+    """Convert an error inside the context to one sentence. Skip the test if the machine cannot play it, and let the
+    test fail for any other error.
     """
     try:
         yield

@@ -1,8 +1,8 @@
 """Play a mission that a test controls. Each action of the test is added to the timeline during the run.
 
-The actions come from another thread than the one of the mission's loop. Real processes therefore run on, and vehicles
-fly, while the test computes or stops in a debugger. Each action that changes something becomes an entry of the
-scenario's timeline. The entry is validated like any other, and the recorded scenario can be played again.
+The test and the mission run in different threads. Real processes therefore continue, and vehicles fly, while the test
+computes or stops in a debugger. Each action that changes the swarm or the network becomes an entry of the scenario's
+timeline. The entry is validated like any other entry, and the recorded scenario can be played again.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ from ucp.agent import HANDLERS
 HOLDABLE = ("message", "sender", "receiver", "block", "count")
 """Keys of a fate that select messages."""
 LOOK_EVERY_S = 5.0
-"""Mission seconds between two checks whether all agents have voted."""
+"""Keys of a fate that select the messages to hold back."""
 
 HANDLER_BRANCHES = {name: handler.branches for name, handler in HANDLERS.items()}
 
@@ -34,7 +34,7 @@ Action = Callable[[mission.Swarm], Awaitable[Any]]
 
 
 class LiveTimeline(GrowingTimeline):
-    """Plays the mission and performs the actions of the test.
+    """The player of a mission that also performs the actions of the test.
 
     `play` runs in the thread of the loop, and `started` is set when the mission begins. `queue_action` queues an
     action.
@@ -45,9 +45,9 @@ class LiveTimeline(GrowingTimeline):
         self.started: Future[Any] = Future()
         self._actions: asyncio.Queue[tuple[Action, Future[Any]] | None] = asyncio.Queue()
         self._holds: dict[int, dict[str, Any]] = {}
-        """Number of a fate -> its keys, for each active hold."""
+        """Number of an active hold -> the keys of its fate."""
         self._completed: dict[int, int] = {}
-        """Number of completed blocks of each agent at the last action."""
+        """Agent ID -> number of its completed blocks at the last action."""
 
     async def play(self, swarm: mission.Swarm, scenario: Scenario) -> None:
         first, *_ = timeline_of(scenario)
@@ -75,7 +75,7 @@ class LiveTimeline(GrowingTimeline):
         self._actions.put_nowait(None)
 
     async def change(self, swarm: mission.Swarm, **entry: Any) -> float:
-        """Apply an entry of a timeline now, and return its `at_s`. Raises ScenarioError if that is impossible."""
+        """Apply a timeline entry now, and return its `at_s`. Raises ScenarioError if that is impossible."""
         at_s = self.next_instant(swarm)
         before, document = self.scenario, self.scenario.model_dump()
         document["timeline"].append({"at_s": at_s, **entry})
@@ -140,7 +140,7 @@ class LiveTimeline(GrowingTimeline):
             await self.let_go(swarm, number)
 
     async def let_go(self, swarm: mission.Swarm, number: int) -> None:
-        """Deliver the messages held back by this rule, if it is still active."""
+        """Deliver the messages that this rule holds back, if it is still active."""
         if self._holds.pop(number, None) is None:
             return
         document = self.scenario.model_dump()
@@ -150,8 +150,8 @@ class LiveTimeline(GrowingTimeline):
         await swarm.release(number, self.scenario.fates[number])
 
     async def until_run(self, swarm: mission.Swarm, sought: SoughtRun, limit_s: float) -> int | None:
-        """Continue until an agent runs this handler and takes this branch. Return the agent's ID. Return None if none
-        does by `limit_s`.
+        """Continue until an agent runs this handler and takes this branch. Return the agent's ID, or None if no agent
+        does this by `limit_s`.
 
         Raises ScenarioError for an unknown handler, branch or agent.
         """
@@ -188,8 +188,8 @@ class LiveTimeline(GrowingTimeline):
         """Continue until all agents have voted since the last action and are idle. Return None if this does not happen
         by `limit_s`.
 
-        The snapshot is taken while no chain changes, because real processes run on. Only a vote shows an agent that its
-        chain differs from the others' (Section 3.2).
+        The snapshot is taken while no chain changes, because real processes continue to run. The method waits for votes
+        because an agent detects only by a vote that its chain differs from other chains (Section 3.2).
         """
         end_s = swarm.now() + limit_s
         while any(
@@ -209,7 +209,7 @@ class LiveTimeline(GrowingTimeline):
         return None
 
     def _silent(self) -> set[int]:
-        """Return the agents that log no more events. These agents never again vote on a block of their own."""
+        """Return the agents that log no more events. They will not vote on a block of their own again."""
         silent: set[int] = set()
         for fault in self.scenario.faults_in_order():
             if fault.stops_events:
@@ -235,7 +235,8 @@ class LiveTimeline(GrowingTimeline):
     async def break_off(self, swarm: mission.Swarm) -> None:
         """End the mission now, because the test failed. The recorded scenario also ends here.
 
-        A scenario lasts at least as long as its timeline. If a change lasts longer, the recorded duration stays.
+        A scenario lasts at least as long as its timeline. If a change of the timeline ends later, the recorded duration
+        does not change.
         """
         await self.release(swarm)
         lasts_s = max([0.0, *(entry.ends_at_s for entry in self.scenario.timeline)])
@@ -249,7 +250,7 @@ class LiveTimeline(GrowingTimeline):
 
 
 def _next_instant(mission_s: float) -> float:
-    """Return a slightly later time. All earlier messages have been sent by then."""
+    """Return a slightly later mission second, by which all earlier messages have been sent."""
     return round(mission_s + INSTANT_S, 3)
 
 

@@ -20,16 +20,16 @@ class SessionOptions:
     seed: int | None
     speedup: float | None
     keep: Path | None
-    """Absolute path of the directory for all run directories."""
+    """Absolute path of the directory in which run directories are kept. None to remove them."""
     in_uml: bool
-    """True to play processes in User Mode Linux."""
+    """True if processes are played in User Mode Linux."""
     image_from_host: bool
-    """True to make containers from this machine's files."""
+    """True if containers use this machine's files."""
     programs: Programs
     variant: Path | None
     """Absolute path of the file with a protocol variant."""
     rewrite: bool
-    """True to rewrite stories instead of comparing them."""
+    """True if stories are rewritten instead of compared."""
 
     @classmethod
     def of(cls, config: pytest.Config) -> "SessionOptions":
@@ -52,7 +52,7 @@ class SessionOptions:
         )
 
     def applied_to(self, scenario: Scenario) -> Scenario:
-        """Return the scenario changed by these options. Raises ScenarioError."""
+        """Return a copy of the scenario that is changed by these options. Raises ScenarioError."""
         document = scenario.model_dump()
         if self.speedup is not None:
             document["speedup"] = self.speedup

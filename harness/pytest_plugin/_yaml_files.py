@@ -1,6 +1,6 @@
 """Decide which YAML files are scenarios that contain expectations.
 
-Other files are not parsed, because a project has many of them.
+Other YAML files are not parsed, because a project may have many of them.
 """
 
 import os
@@ -18,7 +18,9 @@ EMPTY_SECTION = re.compile(rb"[ \t]*(?:\{[ \t]*\})?[ \t]*(?:#.*)?\s*")
 
 
 def is_selected(path: Path, config: pytest.Config) -> bool:
-    """Return true if a path that pytest was given contains the file. `pytest .` names the root."""
+    """Return true if a path that pytest was given contains the file. For example, `pytest .` selects all files below
+    the current directory.
+    """
     if PLACES not in config.stash:
         config.stash[PLACES] = _places(config)
     return any(path.is_relative_to(place) for place in config.stash[PLACES])
@@ -40,11 +42,11 @@ def _matching(root: Path, pattern: str) -> Iterable[Path]:
 
 
 def is_expectation_scenario(path: Path) -> bool:
-    """Return true if the file looks like a scenario with an `expect` section, judged by its top-level keys.
+    """Return true if the top-level keys of the file are those of a scenario with an `expect` section.
 
-    The section must contain one of its keys. If it is empty, all top-level keys must be keys of a scenario. If its keys
-    are misspelt, the file must also have more keys than `name` and `expect`, because tests of other tools have these
-    two.
+    The section must contain one of the known keys. If the section is empty, all top-level keys of the file must be keys
+    of a scenario. If the keys of the section are misspelt, the file must have more keys than `name` and `expect`,
+    because tests of other tools have these two keys.
     """
     try:
         if not path.is_file() or path.stat().st_size > MAX_BYTES:

@@ -15,7 +15,7 @@ EVIDENCE_SHOWN = 5
 
 @dataclass(frozen=True, repr=False)
 class JudgementInTest:
-    """A verdict with its number or key. A failing `assert` shows it together with its reason."""
+    """A verdict with its number or key. A failing `assert` shows the verdict together with its reason."""
 
     key: str
     name: str
@@ -81,9 +81,9 @@ class Findings:
         return self.result.figures
 
     def chain(self, agent: int) -> list[str]:
-        """Return the names of the blocks in the agent's chain, such as "4.11". The oldest is first.
+        """Return the names of the blocks in the agent's chain, such as "4.11". The oldest block is first.
 
-        Raises ScenarioError if the agent has left no chain.
+        Raises ScenarioError if no chain of the agent is available.
         """
         __tracebackhide__ = True
         exports = RunArchive(self.directory).exports.by_agent
@@ -94,5 +94,5 @@ class Findings:
 
     @property
     def report(self) -> Path:
-        """The path of the report. The report exists after the test if the test failed, or if `--ucp-keep` is set."""
+        """The path of the report. After the test, the report exists if the test failed, or if `--ucp-keep` is set."""
         return self.directory / "report.html"

@@ -51,10 +51,10 @@ class _ActionContext(AbstractContextManager[None]):
 class Swarm:
     """The value of the fixture `swarm`: agents on any backend, controlled by a test.
 
-    Times are mission seconds, and agents are named by their IDs. Between two calls virtual time stands still. Real
-    processes go on, and faults that are due in the meantime happen at the next call. Queries between two actions are
-    answered from one moment. An impossible action raises ScenarioError and changes nothing. Raises HarnessError if the
-    run cannot start.
+    Times are mission seconds, and agents are named by their IDs. Between two calls, virtual time stands still. Real
+    processes continue, and faults that are due in the meantime happen at the next call. Between two actions, all
+    queries of the test describe the same moment. An impossible action raises ScenarioError and changes nothing. Raises
+    HarnessError if the run cannot start.
     """
 
     def __init__(self, scenario: Scenario, seed: int, backend: BackendName, out: Path) -> None:
@@ -112,14 +112,16 @@ class Swarm:
     def loss(self, probability: float, for_s: float | None = None) -> AbstractContextManager[None]:
         """Let every receiver lose each message with this probability, from 0 to 1.
 
-        This and the conditions below last for `for_s` mission seconds, or until the end of a `with` block
-        (`with swarm.loss(0.5):`), or for the rest of the run.
+        This condition and the following ones last for `for_s` mission seconds, until the end of a `with` block (`with
+        swarm.loss(0.5):`), or for the rest of the run.
         """
         __tracebackhide__ = True
         return self._for_a_block(loss=probability, for_s=for_s)
 
     def network(self, for_s: float | None = None, **keys: Any) -> AbstractContextManager[None]:
-        """Set keys of a scenario's section `network`: `network(delay=0.2, receivers={3: {"loss": 1}})`."""
+        """Change network conditions. The arguments are keys of a scenario's section `network`, as in
+        `network(delay=0.2, receivers={3: {"loss": 1}})`.
+        """
         __tracebackhide__ = True
         return self._for_a_block(network=keys, for_s=for_s)
 
@@ -145,8 +147,8 @@ class Swarm:
         """Hold back matching messages until `release` is called. This only works in virtual time.
 
         Messages match by `message`, `sender`, `receiver`, `block` and `count`, as in a scenario's `fates`. A criterion
-        that is not given matches all. The end of `with swarm.hold("Commit Block", sender=2):` releases the messages,
-        and so does the end of the test.
+        that is not given matches all messages. If the method is used as `with swarm.hold("Commit Block", sender=2):`,
+        the messages are released at the end of the block. Otherwise they are released at the end of the test.
         """
         __tracebackhide__ = True
         words = _of_message(message, which)
@@ -155,7 +157,7 @@ class Swarm:
 
     def release(self, message: str | None = None, **which: Any) -> None:
         """Deliver the messages that a call of `hold` with the same criteria holds back. Without criteria, deliver all
-        messages held back.
+        messages that are held back.
         """
         __tracebackhide__ = True
         self._act(lambda swarm: self._timeline.release(swarm, **_of_message(message, which)))
@@ -190,7 +192,7 @@ class Swarm:
 
     @property
     def now_s(self) -> float:
-        """The number of mission seconds since the start."""
+        """The current mission second."""
         __tracebackhide__ = True
         return float(self._run_action(_now))
 
@@ -209,10 +211,11 @@ class Swarm:
     def wait_for(
         self, handler: str, branch: str | None = None, agent: int | None = None, limit_s: float = 1800.0
     ) -> int:
-        """Continue the mission until an agent runs this handler, with this branch if given. Return the agent's ID.
+        """Continue the mission until an agent runs this handler and, if `branch` is given, takes this branch. Return
+        the agent's ID.
 
-        A run that the last action caused counts. Names are those of traces (ucp/contract/HANDLERS.md). Raises
-        AssertionError if no agent runs it within `limit_s` mission seconds.
+        A handler run that the last action caused also counts. The names are those in traces (ucp/contract/HANDLERS.md).
+        Raises AssertionError if no agent runs it within `limit_s` mission seconds.
         """
         __tracebackhide__ = True
         if not 0 <= limit_s < math.inf:
@@ -245,23 +248,23 @@ class Swarm:
     # Queries
 
     def characteristic(self, number: int) -> JudgementInTest:
-        """Return the present verdict on a characteristic, 1 to 6: `holds`, `verdict`, `reason` and `evidence`."""
+        """Return the current verdict on a characteristic, 1 to 6: `holds`, `verdict`, `reason` and `evidence`."""
         __tracebackhide__ = True
         return self._findings().characteristic(number)
 
     def judgement(self, key: str) -> JudgementInTest:
-        """Return the present verdict on `steps`, `records` or `liveness`."""
+        """Return the current verdict on `steps`, `records` or `liveness`."""
         __tracebackhide__ = True
         return self._findings().judgement(key)
 
     @property
     def figures(self) -> dict[str, float | int | None]:
-        """The present numeric results, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
+        """The current numeric results, such as `mutual_chain`, `distinct_chains` and `reconciles`."""
         __tracebackhide__ = True
         return self._findings().figures
 
     def chain(self, agent: int) -> list[str]:
-        """Return the names of the blocks in the agent's chain, such as "4.11". The oldest is first."""
+        """Return the names of the blocks in the agent's chain, such as "4.11". The oldest block is first."""
         __tracebackhide__ = True
         return self._findings().chain(agent)
 
@@ -272,11 +275,11 @@ class Swarm:
 
     @property
     def report(self) -> Path:
-        """The path of the report. The report exists after the test if the test failed, or if `--ucp-keep` is set."""
+        """The path of the report. After the test, the report exists if the test failed, or if `--ucp-keep` is set."""
         return self.directory / "report.html"
 
     def _findings(self) -> Findings:
-        """Return the verdicts and numeric results. They are computed at the first query after an action."""
+        """Return the verdicts and numeric results. They are computed when the test first reads them after an action."""
         __tracebackhide__ = True
         if self._seen is None:
             self._seen = self._judge_by_now(self._run_action(_snapshot))

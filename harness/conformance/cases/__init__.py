@@ -1,6 +1,6 @@
 """Test cases that are written by hand, for behaviour that the generated tests do not cover.
 
-A case starts agents of its own and plays their peers (`_bench`). The modules of this package cover hostile datagrams,
+Each case starts its own agents and plays their peers (`_bench`). The modules of this package cover hostile datagrams,
 blocks and votes, start and end of the program, the disk, records, and missions with keys.
 """
 

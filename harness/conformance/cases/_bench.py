@@ -19,9 +19,9 @@ from ucp.messages import ChainContainQuery, ChainContainResponse, MalformedDatag
 
 SPEEDUP = 20.0
 PATIENCE_S = 3.0
-"""Time limit of an expected message in wall seconds."""
+"""Time limit for an expected message, in seconds of wall time."""
 SILENCE_S = 0.25
-"""Wall seconds without a message after which an agent counts as silent."""
+"""Seconds of wall time without a message after which an agent counts as silent."""
 INCEPTION = InceptionBlock(INITIAL_DATA).chain_hash
 
 
@@ -46,11 +46,11 @@ class HandwrittenCase:
 
     name: str
     algorithm: int
-    """Number of the Algorithm under test. 0: none."""
+    """Number of the Algorithm under test. 0 if the case tests no single Algorithm."""
     section: str
     """Section of the thesis or of the agent contract that the case tests."""
     play: Callable[["CaseBench"], Awaitable[None]]
-    """Function that plays the case. It raises WrongBehaviourError if the case fails."""
+    """The function that plays the case. It raises WrongBehaviourError if the case fails."""
 
 
 ALL_CASES: list[HandwrittenCase] = []
@@ -125,8 +125,8 @@ class BenchAgent:
         require(not received, f"nothing {why}", _names(received))
 
     async def require_single_answer(self, top: bytes, after: str) -> None:
-        """Ask the agent whether it has this chain. Raises WrongBehaviourError unless its next message is the answer
-        yes.
+        """Send the agent a query whether it has this chain. Raises WrongBehaviourError unless its next message is the
+        answer yes.
 
         This also detects an answer to an earlier message.
         """
@@ -147,7 +147,7 @@ class BenchAgent:
 
 
 class CaseBench:
-    """Starts agents in the virtual network for a handwritten test case."""
+    """The tools with which a handwritten test case starts agents in the virtual network."""
 
     def __init__(self, lab: UdpLab) -> None:
         self.lab = lab
@@ -189,8 +189,8 @@ class CaseBench:
     ) -> AsyncIterator[BenchAgent]:
         """Start an agent that may never become ready.
 
-        `text` replaces the whole mission file. `prepare` receives the directory of the agent before its start.
-        `directory` and `port` are those of an earlier incarnation.
+        `text` replaces the whole mission file. `prepare` receives the directory of the agent before its start. For a
+        restart, `directory` and `port` are those of the earlier incarnation.
         """
         taken = self.lab.take_port() if port is None else port
         try:

@@ -1,4 +1,4 @@
-"""Test cases about datagrams: malformed ones, datagrams of unknown senders, and a flood of datagrams."""
+"""Test cases about datagrams: malformed datagrams, datagrams of unknown senders, and floods."""
 
 import asyncio
 import time

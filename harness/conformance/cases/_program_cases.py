@@ -35,12 +35,14 @@ from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 WRONG_MISSION = 2
 REFUSALS: dict[str, Any] = json.loads((DIRECTORY / "refusals.json").read_text(encoding="ascii"))
 NO_EXPIRY = {**VARIANTS["default"].settings.to_json(), "vote_timeout_s": 10_000.0}
-"""Settings with which no vote ends during a case."""
+"""Settings with which no vote ends during a test case."""
 INPUTS = 50
 SIGNAL_GAP_S = 0.05
-"""Wall seconds between two signals, because a signal that is still pending absorbs an equal one."""
+"""Seconds of wall time between two signals. A pending signal would absorb an equal one."""
 SECONDS_WITHOUT_EVENT = 20.0
-"""Mission seconds in which an agent would log an event with a probability of almost 1, if it drew one each second."""
+"""Mission seconds in which an agent that draws an event each second logs at least one with a probability of almost
+1.
+"""
 
 
 async def _refused(agent: BenchAgent, command: str, why: str, **arguments: Any) -> None:

@@ -42,7 +42,7 @@ SETTINGS = {**VARIANTS["default"].settings.to_json(), "max_block_bytes": 1024, "
 LARGEST_EVENT = bytes(256)
 EVENTS_OF_A_BLOCK = 3
 MOMENT_S = 1.0
-"""Mission seconds by which the clocks of the harness and of the agent may differ."""
+"""Maximum difference in mission seconds between the clocks of the harness and of the agent."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,10 @@ class _CaseRecords:
     export: Export
     status: dict[str, Any]
     to_agent: Sequence[tuple[float, bytes]]
-    """Mission second and content of each datagram to the agent."""
+    """Mission second and content of each datagram that was sent to the agent."""
     sent: Sequence[bytes]
     export_s: tuple[float, float]
-    """Mission seconds before and after the command `export`."""
+    """The mission seconds directly before and directly after the command `export`."""
     epoch_us: int
 
     def require_verdict(self, judgement: Judgement, bad: str, expected: str) -> None:
@@ -67,7 +67,7 @@ class _CaseRecords:
 
 
 async def _play_recorded_mission(bench: CaseBench) -> _CaseRecords:
-    """Play a mission with every kind of step, kill the agent, and return its records."""
+    """Play a mission with handler runs of every kind, kill the agent, and return its records."""
     async with bench.agent({"settings": SETTINGS, "roster": [*ROSTER, *PEERS]}) as agent:
         first, second, *_ = PEERS
         block = Block(first, 1, b"block")

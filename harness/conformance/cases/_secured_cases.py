@@ -40,7 +40,7 @@ SECTION = "contract, Secured missions"
 
 
 class SecuredPeers:
-    """The agents of a secured mission that the harness plays beside the tested agent, with their keys."""
+    """The simulated peers of the tested agent in a secured mission, with their keys."""
 
     def __init__(self, agent: BenchAgent, keys: "KeySet") -> None:
         from ucp.secure.opening import DatagramOpener
@@ -97,8 +97,8 @@ class SecuredPeers:
         return len(received)
 
     async def require_single_answer(self, after: str) -> bytes:
-        """Ask the agent whether it has the inception block. Fail if the agent's next datagram is not the answer to this
-        request.
+        """Send the agent a query whether it has the inception block. Raise WrongBehaviourError if its next datagram is
+        not the answer to this query.
 
         Return the datagram of the request.
         """

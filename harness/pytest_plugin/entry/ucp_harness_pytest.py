@@ -1,9 +1,9 @@
-"""The entry point that pytest loads. It loads the plugin unless foreign packages have the names of the harness's
+"""The entry point that pytest loads. It loads the plugin unless other packages have the names of the harness's
 packages.
 
-A project may have a folder with the name of one of our packages, and one process can import only one of both. In this
-case the plugin is not loaded, and the project's tests run as without it. A test that uses a fixture of the harness
-fails with the reason.
+A project may have a folder with the name of one of the harness's packages, and a process can import only one of the
+two. In this case the plugin is not loaded, and the project's tests run as without it. A test that uses a fixture of the
+harness then fails with this reason.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ from typing import NoReturn
 import pytest
 
 OURS = {"harness": "pytest_plugin", "ucp": "quirks", "sitl": "pilot.py", "netem": "lab.py"}
-"""Package -> a file or folder that only our package contains."""
+"""Package of the harness -> a file or folder in it that no other package of this name contains."""
 
 
 def find_foreign_packages() -> list[Path]:
-    """Return packages from elsewhere that have the names of our packages and that Python imports in their place."""
+    """Return packages from elsewhere that Python imports instead of the harness's packages, because they have the same
+    names.
+    """
     here = Path.cwd()
     places = [here / name for name in OURS if (here / name / "__init__.py").exists()]
     for name in OURS:
