@@ -171,6 +171,16 @@ class HandlerRuns(_RecordModel):
     until_s: float
 
 
+class AgentFailure(_RecordModel):
+    """An error that ended an incarnation of an agent in virtual time. The run went on without the agent. `incarnation`
+    counts from 1, and `detail` completes a sentence that starts with "agent 3".
+    """
+
+    at_s: float
+    incarnation: int
+    detail: str
+
+
 class AgentRecord(_RecordModel):
     """The outcome of one agent. It is exported, not exported, killed, rebooting, crashed, hung, broken, not supported,
     paused, running or not started.
@@ -204,6 +214,7 @@ class AgentRecord(_RecordModel):
     trace_problem: str | None = None
     handler_runs: list[HandlerRuns | None] = []
     """The agent's last report in each incarnation. null for an incarnation without a report."""
+    failures: list[AgentFailure] = []
 
 
 class CapturedFrames(_RecordModel):

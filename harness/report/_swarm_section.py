@@ -108,12 +108,13 @@ def _vehicle_faults(recorded: Any) -> str:
 
 
 def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
-    kept = agent.model_dump(mode="json", exclude={"detail", "dropped", "command", "version"})
+    kept = agent.model_dump(mode="json", exclude={"detail", "dropped", "command", "version", "failures"})
     cells: dict[str, Any] = {text.label(key): value for key, value in kept.items()}
     cells["completed before"] = len(agent.completed_before) or None
     cells |= {"restarts": agent.restarts or None, "reboots": agent.reboots or None}
     runs = [life.counted for life in agent.handler_runs if life is not None]
     cells["handler runs"] = " + ".join(map(text.value, runs)) or None
+    cells["failed"] = ", ".join(f"at {failure.at_s:g} s" for failure in agent.failures) or None
     if agent.dropped:
         cells["dropped"] = ", ".join(f"{text.value(count)} {reason}" for reason, count in agent.dropped.items())
     return cells

@@ -76,6 +76,8 @@ def simulate_in_memory(
     with closing(simulation):
         run_to_end(mission.play(simulation, scenario))
         simulation.end()
+        if (failure := simulation.failed_program()) is not None:
+            raise failure
         evidence = memory.evidence(simulation)
     result = checker.check(evidence)
     if (records := simulation.records()) and (again or result.bad):

@@ -60,10 +60,10 @@ def _clock_slack_s(trace: Trace) -> float:
 
 
 def stopped(evidence: Evidence, agent_id: int, slack_s: float) -> list[Stop]:
-    """Return the intervals in which the agent was killed, rebooting, switched off or paused. Each interval is shortened
-    by `slack_s` at both ends.
+    """Return the intervals in which the agent was killed, rebooting, switched off or paused, or had failed. Each
+    interval is shortened by `slack_s` at both ends.
     """
-    stops: list[Stop] = []
+    stops = list(_failed(evidence, agent_id, slack_s))
     since: tuple[float, str] | None = None
     end_s = inf
     for fault in evidence.record.faults if evidence.record else ():
@@ -81,6 +81,21 @@ def stopped(evidence: Evidence, agent_id: int, slack_s: float) -> list[Stop]:
     if since is not None:
         stops.append((since[0] + slack_s, end_s, since[1]))
     return [stop for stop in stops if stop[0] < stop[1]]
+
+
+def _failed(evidence: Evidence, agent_id: int, slack_s: float) -> Iterator[Stop]:
+    """Yield the intervals between a failure of the agent and its next start."""
+    recorded = evidence.recorded(agent_id)
+    for failed in recorded.failures if recorded else ():
+        restarts_s = min(
+            (
+                fault.at_s
+                for fault in (evidence.record.faults if evidence.record else ())
+                if agent_id in (fault.agents or ()) and fault.at_s >= failed.at_s and fault.kind.begins_incarnation
+            ),
+            default=inf,
+        )
+        yield failed.at_s + slack_s, restarts_s - slack_s, f"its failure at {failed.at_s:g} s"
 
 
 def _while_stopped(run: HandlerRun, stops: list[Stop]) -> str | None:

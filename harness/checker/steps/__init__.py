@@ -19,7 +19,7 @@ from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
 from harness.checker.steps._late_timers import JudgedTimers
 from harness.checker.steps.deviation import StepDeviation
-from harness.checker.steps.end_of_record import crash, failure
+from harness.checker.steps.end_of_record import crashes, failure
 from harness.checker.steps.follower import OptionalTraceFields, StepComparer
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
 from ucp.messages import MalformedDatagramError
@@ -60,9 +60,9 @@ def check(evidence: Evidence) -> Judgement:
                 deviations.append(deviation)
         lost += [follower.lost for follower in followers if follower.lost]
         recorded = evidence.recorded(agent_id)
-        if (deviation := crash(trace, recorded)) is not None:
-            deviations.append(deviation)
-        elif (why := failure(recorded)) is not None:
+        crashed = crashes(trace, recorded)
+        deviations += crashed
+        if not crashed and (why := failure(recorded)) is not None:
             unjudged[agent_id] = why
         steps += len(trace.runs)
     if deviations:

@@ -10,6 +10,7 @@ possibilities.
 import math
 import re
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from typing import NamedTuple
 
 from harness.archive.run_record import AgentRecord
@@ -38,30 +39,34 @@ class MessageArrival(NamedTuple):
     arrived: bool
 
 
-def crash(trace: Trace, recorded: AgentRecord | None) -> StepDeviation | None:
-    """Return a deviation if run.json states that the agent crashed in a handler. Return None otherwise."""
-    if recorded is None or recorded.outcome != "crashed":
-        return None
-    named = _NAMED.search(recorded.detail or "")
-    if named is None or named[1] not in HANDLERS:
-        return None
-    ended = next((count.until_s for count in reversed(recorded.handler_runs) if count is not None), None)
-    line, t = last_line(trace)
-    what = f"its record ends here, because the handler did not finish: it {recorded.detail}"
-    return StepDeviation(trace.header.agent_id, line, t if ended is None else ended, named[1], what)
+def crashes(trace: Trace, recorded: AgentRecord | None) -> list[StepDeviation]:
+    """Return a deviation for each handler of the agent that ended in an error according to run.json."""
+    deviations = []
+    for failed in recorded.failures if recorded is not None else ():
+        named = _NAMED.search(failed.detail)
+        if named is not None and named[1] in HANDLERS:
+            line, _ = last_line(trace, failed.incarnation)
+            what = f"its record ends here, because the handler did not finish: it {failed.detail}"
+            deviations.append(StepDeviation(trace.header.agent_id, line, failed.at_s, named[1], what))
+    return deviations
 
 
 def failure(recorded: AgentRecord | None) -> str | None:
-    """Return the reason in run.json why the trace of an agent ends early. Return None without such a reason."""
-    if recorded is None or recorded.outcome not in FAILED:
+    """Return the reason why a record of an agent ends early. Return None if run.json has no such reason."""
+    if recorded is None:
         return None
-    return f"its record ends early: it {recorded.detail or recorded.outcome}"
+    if recorded.failures:
+        return f"its record ends early: it {recorded.failures[0].detail}"
+    return f"its record ends early: it {recorded.detail or recorded.outcome}" if recorded.outcome in FAILED else None
 
 
-def last_line(trace: Trace) -> tuple[int, float]:
-    """Return the line number and the mission second of the last handler run. The header is line 1."""
+def last_line(trace: Trace, incarnations: int | None = None) -> tuple[int, float]:
+    """Return the line number and the mission second of the last handler run. The header is line 1.
+
+    By default, all incarnations of the agent count. Otherwise only the first `incarnations` count.
+    """
     line, t = 1, 0.0
-    for incarnation in trace.incarnations():
+    for incarnation in islice(trace.incarnations(), incarnations):
         line, t = max(((number, run.t) for number, run in incarnation), default=(line, t))
     return line, t
 

@@ -201,9 +201,9 @@ class RecordPlayer:
         record = self.record
         if record.flight.record is not None:
             recorded = record.flight.record.agents.get(str(record.agent_id))
-            if (deviation := end_of_record.crash(record.trace, recorded)) is not None:
-                result.add(self.position, [deviation])
-            elif (why := end_of_record.failure(recorded)) is not None:
+            crashed = end_of_record.crashes(record.trace, recorded)
+            result.add(self.position, crashed)
+            if not crashed and (why := end_of_record.failure(recorded)) is not None:
                 result.lost.append(why)
                 result.unjudged += 1
         elif self._follower.lost is None and (sentence := record.ends_open(self._follower)) is not None:

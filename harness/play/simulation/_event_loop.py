@@ -17,7 +17,7 @@ from harness.play._shared_channel import ChannelTraffic
 from harness.play.backend import agent_seed
 from harness.play.core_version import edited_files
 from harness.play.mission import SoughtRun
-from harness.play.simulation._crash import core_crash
+from harness.play.simulation._crash import agent_failure
 from harness.play.simulation._recurrence import RecurrenceSearch
 from harness.play.simulation._simulated_agent import DiskContents, OwnAgent, VirtualAgent
 from harness.play.simulation.air import DueEvent, MessageInFlight, ScheduledInput, StrayDatagram, VirtualAir
@@ -185,12 +185,12 @@ class EventLoop:
 
     def _play(self, until: float) -> None:
         inputs = self._air.inputs_until(until)
-        while (crash := self._play_to_crash(inputs)) is not None:
-            self.fail(crash)
+        while (failure := self._play_to_failure(inputs)) is not None:
+            self.fail(failure)
 
-    def _play_to_crash(self, inputs: Iterator[ScheduledInput]) -> AgentFailedError | None:
-        """Play the inputs until an agent crashes, and return the failure of this agent. Return None if no agent
-        crashes.
+    def _play_to_failure(self, inputs: Iterator[ScheduledInput]) -> AgentFailedError | None:
+        """Play the inputs until an agent crashes or hangs, and return the failure of this agent. Return None if no
+        agent fails.
         """
         alive = self._alive
         incarnation: SimulatedIncarnation | None = None
@@ -211,23 +211,23 @@ class EventLoop:
                 if self._found is not None:
                     return None
         except Exception as error:
-            if (crash := core_crash(incarnation, error)) is None:
+            if (failure := agent_failure(incarnation, error, self._now)) is None:
                 raise
-            return crash
+            return failure
         return None
 
     @contextmanager
-    def _containing_crash(self, number: int) -> Iterator[None]:
-        """Let the other agents continue the mission if this agent crashes inside the context."""
+    def _containing_failure(self, number: int) -> Iterator[None]:
+        """Let the other agents continue the mission if this agent crashes or hangs inside the context."""
         try:
             yield
         except Exception as error:
-            if (crash := core_crash(self._alive[number], error)) is None:
+            if (failure := agent_failure(self._alive[number], error, self._now)) is None:
                 raise
-            self.fail(crash)
+            self.fail(failure)
 
     def fail(self, error: AgentFailedError) -> None:
-        """Record that an agent crashed, and end the records of this agent. The other agents continue."""
+        """Record that an agent crashed or hung, and end the records of this agent. The other agents continue."""
         raise NotImplementedError
 
     def _handle_message(self, number: int, incarnation: SimulatedIncarnation, flight: MessageInFlight) -> None:

@@ -10,7 +10,7 @@ import base64
 import dataclasses
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from harness.archive.run_record import Cycle
 from harness.errors import AgentFailedError, ScenarioError
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from harness.play.simulation.foreign._answer import AgentLacksError
     from harness.play.simulation.foreign._foreign_agent import IncarnationRecord
     from harness.play.simulation.foreign._program_pool import ProgramPool
+
+Returned = TypeVar("Returned")
 
 ENGINE = "virtual time"
 PROGRESS_S = 20.0
@@ -99,6 +101,9 @@ class Simulation(EventLoop):
         """Agent number -> content of its disk, for agents that are switched off and will reboot with it."""
         self._switched_off: dict[int, SimulatedIncarnation] = {}
         self._failures: dict[int, AgentFailedError | AgentLacksError] = {}
+        """Number of an agent -> its last failure."""
+        self._failed_incarnations: list[list[dict[str, Any]]] = [[] for _ in self.roster]
+        """Records of the failures of each agent."""
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
@@ -132,7 +137,8 @@ class Simulation(EventLoop):
         if self._foreign_swarm is not None:
             self._foreign_swarm.start()
         for number in range(len(self.roster)):
-            self._start(number)
+            with self._containing_failure(number):
+                self._start(number)
         for event in self.scenario.events.script:
             logged = ANY_INCARNATION, event.event_id, event.event_data, event.timestamp_us
             self._air.schedule(event.at_s, self._number[event.agent], logged)
@@ -210,7 +216,7 @@ class Simulation(EventLoop):
             self._rogue.begin(change, self._now)
             return
         for agent_id in change.agents:
-            with self._containing_crash(self._number[agent_id]):
+            with self._containing_failure(self._number[agent_id]):
                 await change.apply(self, agent_id)
         self._recorder.changed(record)
 
@@ -242,7 +248,7 @@ class Simulation(EventLoop):
             awake = (incarnation for incarnation in self.living() if incarnation.waiting is None)
             last = max([self._air.quiet_at, *(incarnation.deadline or 0.0 for incarnation in awake)])
             if last <= self._now:
-                return self._is_settled()
+                return self.survive(self._is_settled)
             if recurrence is None or self._now < look_at:
                 await self.until(min(limit, last))
             elif await self._run_until_recurrence(min(limit, last), recurrence):
@@ -287,7 +293,7 @@ class Simulation(EventLoop):
                 if incarnation and incarnation.waiting is None
             }
             for number, incarnation in incarnations.items():
-                with self._containing_crash(number):
+                with self._containing_failure(number):
                     self._tally_answers(number, incarnation)
             if any(self._alive[number] is not incarnation for number, incarnation in incarnations.items()):
                 return False  # an agent crashed
@@ -316,40 +322,56 @@ class Simulation(EventLoop):
         return False
 
     async def keep_chains(self) -> None:
-        self._recorder.keep_chains(self._now, self.exporting())
+        self.survive(lambda: self._recorder.keep_chains(self._now, self.exporting()))
 
     async def reconcile(self, agent_id: int) -> None:
         number = self._number[agent_id]
         incarnation = self._alive[number]
         if incarnation is not None and incarnation.waiting is None:
-            with self._containing_crash(number):
+            with self._containing_failure(number):
                 self._tally_answers(number, incarnation)
                 incarnation.agent.begin_reconcile(incarnation.local_s(self._now))
                 self._finish_input(number, incarnation)
 
     async def top_chain_hashes(self) -> dict[int, str]:
-        return {incarnation.agent.agent_id: incarnation.top_chain_hash for incarnation in self.living()}
+        return self.survive(
+            lambda: {incarnation.agent.agent_id: incarnation.top_chain_hash for incarnation in self.living()}
+        )
 
     async def completed(self) -> dict[int, int]:
-        return {
-            incarnation.agent.agent_id: len(incarnation.agent.completed())
-            for incarnation in self.living()
-            if incarnation.waiting is None
-        }
+        return self.survive(
+            lambda: {
+                incarnation.agent.agent_id: len(incarnation.agent.completed())
+                for incarnation in self.living()
+                if incarnation.waiting is None
+            }
+        )
 
     async def snapshot(self) -> RunOutcome:
-        played = self._outcome_so_far()
-        self._recorder.export(self._now, self.exporting())
-        return played
+        self.survive(lambda: self._recorder.export(self._now, self.exporting()))
+        return self.survive(self._outcome_so_far)
+
+    def survive(self, query: Callable[[], Returned]) -> Returned:
+        """Return the result of a query to the living agents. If an agent crashes or hangs, query the others again."""
+        while True:
+            try:
+                return query()
+            except AgentFailedError as error:
+                self.fail(error)
 
     def fail(self, error: "AgentFailedError | AgentLacksError") -> None:
         """Record that an agent crashed, hung, or does not support the mission, and end the record of this agent."""
         number = self._number[error.agent_id]
         if (incarnation := self._alive[number]) is not None:
             incarnation.ended_at = self._now
+        if self._foreign_swarm is not None:
+            self._foreign_swarm.ended(error.agent_id)
         self._alive[number] = None
         self._air.remove_agent(number)
         self._failures[number] = error
+        which = len(self._incarnations[number]) + (incarnation is None)
+        failure = {"at_s": round(self._now, 3), "incarnation": which, "detail": error.detail}
+        self._failed_incarnations[number].append(failure)
         if self.played.outcome == "completed":
             self.played.end_early("failed", error)
 
@@ -367,7 +389,7 @@ class Simulation(EventLoop):
     def _outcome_so_far(self) -> RunOutcome:
         for number, incarnation in enumerate(self._alive):
             if incarnation is not None:
-                with self._containing_crash(number):
+                with self._containing_failure(number):
                     self._tally_answers(number, incarnation)
         last_s, network = self._script.last_s, self.played.network
         return dataclasses.replace(
@@ -389,6 +411,15 @@ class Simulation(EventLoop):
         return silent_injections(self._injected, self._rogue.sent) if self._rogue is not None else []
 
     # State of the agents
+
+    def failed_program(self) -> AgentFailedError | None:
+        """Return the failure of a foreign agent. Return None if no foreign agent crashed or hung.
+
+        The judge finds the failures of other agents in the record of the run.
+        """
+        foreign = self._foreign_swarm or ()
+        failures = (error for error in self._failures.values() if error.agent_id in foreign)
+        return next((error for error in failures if isinstance(error, AgentFailedError)), None)
 
     def living(self) -> Iterator[SimulatedIncarnation]:
         return (incarnation for incarnation in self._alive if incarnation is not None)
@@ -426,6 +457,7 @@ class Simulation(EventLoop):
             **self._program_to_json(number, known),
             "restarts": max(0, len(incarnations) - 1 - reboots),
             "reboots": reboots,
+            **({"failures": failures} if (failures := self._failed_incarnations[number]) else {}),
             "completed_before": list(completed),
             "idle": incarnation.idle if incarnation else None,
             "bytes_sent": sum(incarnation.bytes_sent for incarnation in incarnations),
@@ -473,7 +505,7 @@ class Simulation(EventLoop):
                 self._disks[number] = incarnation.agent.stored(incarnation.local_s(self._now))
             incarnation.agent.end(incarnation.local_s(self._now))
             if self._foreign_swarm is not None:
-                self._foreign_swarm.ended(incarnation.agent)
+                self._foreign_swarm.ended(agent_id)
         self._alive[number] = None
         self._air.remove_agent(number)
 

@@ -73,7 +73,7 @@ class SimulationBackend(Backend):
         station: StationTracks | None = None
 
         async def on_progress(simulation: Simulation) -> None:
-            progress.show(_snapshot(simulation))
+            progress.show(simulation.survive(lambda: _snapshot(simulation)))
             if station is not None:
                 station.show(simulation.now(), simulation.lost_vehicles)
             await asyncio.sleep(0)  # the loop handles Ctrl-C now

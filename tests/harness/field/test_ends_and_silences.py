@@ -10,6 +10,8 @@ import pytest
 
 from benchmarks.field_damage import bring_home
 from harness.field.replay import RecordPlayer, ReplayResult, open_record
+from harness.play.progress import SilentProgress
+from harness.run.run import run
 from harness.run.simulate import simulate
 from tests.harness.command import harness
 from tests.harness.virtual import scenario
@@ -25,12 +27,12 @@ def _break_algorithm_3(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the handler of Algorithm 3 raise an error in one agent, as an edited core does."""
     right = ON_MESSAGE[BlockAddRequest]
 
-    def run(core: Core, sender: int, message: BlockAddRequest) -> str:
+    def dying(core: Core, sender: int, message: BlockAddRequest) -> str:
         if core.agent_id == DEAD and core.now > 60:
             raise KeyError("no such vote")
         return right.run(core, sender, message)
 
-    monkeypatch.setitem(ON_MESSAGE, BlockAddRequest, dataclasses.replace(right, run=run))
+    monkeypatch.setitem(ON_MESSAGE, BlockAddRequest, dataclasses.replace(right, run=dying))
 
 
 @pytest.fixture
@@ -52,8 +54,19 @@ def test_agent_that_dies_in_a_handler_does_not_end_the_run(monkeypatch: pytest.M
     steps = simulated.result.judgements["steps"]
     assert steps.verdict == "deviates"
     assert [(finding.agent_id, finding.handler) for finding in steps.evidence] == [(DEAD, "receive_request_add_block")]
-    assert "its record ends here, because the handler did not finish: it crashed in" in steps.evidence[0].detail
+    assert "its record ends here, because the handler did not finish: it crashed at " in steps.evidence[0].detail
     assert "KeyError: 'no such vote'" in steps.evidence[0].detail
+
+
+def test_messages_to_a_dead_agent_are_not_lost(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The run has no loss. The agent dies at about 60 s, starts again at 120 s, and dies again."""
+    _break_algorithm_3(monkeypatch)
+    reboot = [{"at_s": 100, "reboot": [DEAD], "down_s": 20, "disk": "lost"}]
+    flight = scenario(**FLIGHT, network={"loss": 0.0}, timeline=reboot)
+    finished = run(flight, 1, tmp_path / "run", SilentProgress(), "sim")
+    assert finished.result.bad == ("steps",)
+    assert [failure.incarnation for failure in finished.record.agents["3"].failures] == [1, 2]
+    assert finished.result.judgements["steps"].reason.startswith("2 differences")
 
 
 def _end_of_record(home: Path) -> ReplayResult:

@@ -27,6 +27,7 @@ from harness.play.simulation.foreign._answer import (
     read_answer,
 )
 from harness.play.simulation.foreign.line_program import LineProgram, ProgramFailedError
+from harness.scenario.scenario import AgentClock
 from ucp.events import LoggableEvent
 from ucp.messages import Datagram, Message
 from ucp.settings import Settings
@@ -96,6 +97,7 @@ class ForeignAgent:
         tracing: bool,
         store: DiskContents | None = None,
         key_fields: Mapping[str, Any] | None = None,
+        clock: AgentClock | None = None,
         record_bytes: int,
     ) -> None:
         """Start the agent by writing its first input line.
@@ -103,6 +105,7 @@ class ForeignAgent:
         - `mission`: mission file (`ucp-mission/1`).
         - `store`: content of the disk with which the agent boots.
         - `key_fields`: keys of the agent in a secured mission.
+        - `clock`: clock of the agent. None if it shows mission time.
         - `record_bytes`: maximum size of `record`.
         """
         self.agent_id: int = mission["agent_id"]
@@ -118,6 +121,7 @@ class ForeignAgent:
         self._program = program
         self._tracing = tracing
         self._now = now
+        self._clock = clock
         self._timer: float | None = None
         self._timers_ended, self._datagrams_sent = _CounterPerSecond(), _CounterPerSecond()
         self._sent: list[tuple[bytes, RecordedBytes]] = []
@@ -156,7 +160,7 @@ class ForeignAgent:
 
     def handle_timer(self, now: float) -> None:
         if self._timers_ended.add(1, now) > MAX_TIMERS_PER_S:
-            raise self._failure("hung", f"has a timer that expires again and again at {now:g} s")
+            raise self._failure("hung", f"has a timer that expires again and again {self._at(now)}")
         self._give_input(f'{{"t":{self._time_text(now)},"timer":true}}', "the expiry of its timer", now)
 
     def begin_reconcile(self, now: float) -> None:
@@ -248,6 +252,10 @@ class ForeignAgent:
         """
         return repr(float(max(now, self._now)))
 
+    def _at(self, now: float) -> str:
+        """Return the mission time of an input, for an error message."""
+        return f"at {now if self._clock is None else self._clock.mission_s(now):g} s"
+
     def _ask(self, command: str, now: float) -> dict[str, Any]:
         """Send a command that must not change the agent's state, and return the answer."""
         timer = self._timer
@@ -270,7 +278,8 @@ class ForeignAgent:
         """Give an input to the agent, and store the outputs. An input that the agent refuses has no outputs."""
         answer = self._exchange(line, what, now)
         if self._datagrams_sent.add(len(answer.sent), now) > MAX_SENT_PER_S:
-            raise self._failure("crashed", f"sent more than {MAX_SENT_PER_S} datagrams within mission second {now:.0f}")
+            what = f"sent more than {MAX_SENT_PER_S} datagrams within a second, {self._at(now)}"
+            raise self._failure("crashed", what)
         completed = self._check(answer.trace)
         self._status = None
         self._timer = answer.timer
@@ -295,13 +304,13 @@ class ForeignAgent:
         except ProgramFailedError as error:
             if error.status in NO_VIRTUAL_TIME and not self.record.exchanges:
                 raise self._start_error(error.status) from None
-            raise self._failure(error.outcome, f"{error} when it was given {what} at {now:g} s") from None
+            raise self._failure(error.outcome, f"{error} when it was given {what} {self._at(now)}") from None
         except AnswerError as error:
-            raise self._failure("crashed", f"answered {what} at {now:g} s {error}") from None
+            raise self._failure("crashed", f"answered {what} {self._at(now)} {error}") from None
         except LacksError as error:
             raise self._lacks_error(last_line(str(error))) from None
         except RefusedError as error:
-            raise self._failure("crashed", f"refused {what} at {now:g} s: {last_line(str(error))}") from None
+            raise self._failure("crashed", f"refused {what} {self._at(now)}: {last_line(str(error))}") from None
         self.record.add(given, line_read)
         self._now = max(now, self._now)
         return answer

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from harness.errors import MachineError, ScenarioError
 from harness.play.process._agent_process import agent_command, reboots_with_disk
 from harness.play.process.agent_mission import mission_file
-from harness.play.simulation._simulated_agent import DiskContents, VirtualAgent
+from harness.play.simulation._simulated_agent import DiskContents
 from harness.play.simulation.foreign._foreign_agent import ForeignAgent, IncarnationRecord
 from harness.play.simulation.foreign._program_pool import SHARED, ProgramPool
 from harness.play.simulation.foreign.line_program import LineProgram
@@ -105,14 +105,15 @@ class ForeignSwarm:
             tracing=self._tracing,
             store=stored,
             key_fields=key_fields,
+            clock=self._scenario.clocks.get(agent_id),
             record_bytes=MAX_RECORD_BYTES // len(self._commands),
         )
         self.records.append(agent.record)
         return agent
 
-    def ended(self, agent: VirtualAgent) -> None:
+    def ended(self, agent_id: int) -> None:
         """Return the program of an ended agent to the pool, so that a different agent can use it."""
-        if (program := self._playing.pop(agent.agent_id, None)) is not None:
+        if (program := self._playing.pop(agent_id, None)) is not None:
             self._programs.give_back(program)
 
     def close(self) -> None:

@@ -17,6 +17,9 @@ from ucp.messages import BlockAddRequest, encode
 from ucp.trace import in_base64
 
 SHORT = {"agents": 2, "duration_s": 30, "events": {"source": "scripted", "script": [{"at_s": 12.5, "agent": 2}]}}
+SCRIPT = [{"at_s": at_s, "agent": agent} for at_s, agent in ((12.5, 2), (14, 1), (17, 3), (20, 1))]
+BUSY: dict[str, Any] = {"agents": 3, "network": {"loss": 0.0}, "events": {"source": "scripted", "script": SCRIPT}}
+WRONG = {2: {"offset_s": 50, "drift": 0.01}}
 EVENT = "if 'event_id' in given:\n    "
 
 
@@ -126,12 +129,46 @@ def test_crash_of_an_agent_violates_no_characteristic(tmp_path: Path) -> None:
     assert finished.exit_status == 1 and not finished.result.bad
 
 
-def test_growing_number_of_datagrams_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+DIES = EVENT + "sys.exit(3)"
+
+
+def test_dead_program_does_not_end_the_run_for_others(tmp_path: Path) -> None:
+    finished = run_with(tmp_path, DIES, capture=True, clocks=WRONG, **BUSY)
+    assert finished.exit_status == 1
+    assert not finished.result.bad, "messages to a dead agent are not lost ones"
+    record = finished.record
+    assert record.mission_s is not None and record.mission_s >= 30
+    assert [(failure.at_s, failure.incarnation) for failure in record.agents["2"].failures] == [(12.5, 1)]
+    sentence = "ended by itself with status 3 when it was given an event at 12.5 s"
+    assert sentence in str(record.outcome_detail) and sentence in (tmp_path / "run/report.html").read_text()
+    for agent in ("1", "3"):
+        last = json.loads((tmp_path / f"run/agents/{agent}.trace.jsonl").read_text().splitlines()[-1])
+        assert record.agents[agent].outcome == "exported" and last["t"] > 15
+
+
+def test_reboot_starts_a_dead_program_again(tmp_path: Path) -> None:
+    reboot = [{"at_s": 16, "reboot": [2], "down_s": 2, "disk": "lost"}]
+    dies_before_the_reboot = EXPORT + EVENT + "sys.exit(3) if given['t'] < 16 else None"
+    finished = run_with(tmp_path, dies_before_the_reboot, timeline=reboot, **BUSY)
+    agent = finished.record.agents["2"]
+    assert (agent.outcome, [failure.incarnation for failure in agent.failures]) == ("exported", [1])
+    assert finished.exit_status == 1
+    assert finished.result.judgements["steps"].verdict == "not applicable"
+    assert "status 3" in finished.result.judgements["steps"].reason
+
+
+def test_program_that_dies_at_its_start_leaves_the_others(tmp_path: Path) -> None:
+    finished = run_with(tmp_path, "sys.exit(3)", **BUSY)
+    assert [finished.record.agents[agent].outcome for agent in "123"] == ["exported", "crashed", "exported"]
+    assert finished.record.mission_s is not None and finished.record.mission_s >= 30
+
+
+def test_agent_with_growing_number_of_datagrams_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of two agents answers each datagram with two datagrams."""
     monkeypatch.setattr(_foreign_agent, "MAX_SENT_PER_S", 200)
     code = EVENT + "said['sent'] = ['AA==']\nif 'datagram' in given:\n    said['sent'] = ['AA==', 'AA==']"
     one = played_by(small(tmp_path, code), **SHORT)
-    with pytest.raises(HarnessError, match=r"agent \d sent more than 200 datagrams within mission second 1\d"):
+    with pytest.raises(HarnessError, match=r"agent \d sent more than 200 datagrams within a second, at 1\d"):
         simulate(one, 1, tracing=True)
 
 
