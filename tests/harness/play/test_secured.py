@@ -56,3 +56,16 @@ def test_capture_shows_senders_and_types_of_sealed_messages(tmp_path: Path) -> N
     seen = list(read_captures(sorted((tmp_path / "run" / "capture").iterdir())).datagrams)
     assert {datagram.summary.message for datagram in seen} >= {"Block Add Request", "Commit Block"}
     assert all(datagram.summary.is_sealed for datagram in seen)
+
+
+def test_jammed_radio_separates_vehicles_only_while_it_lasts() -> None:
+    jam = [{"at_s": 100, "partition": [[1], [2], [3]]}, {"at_s": 300, "heal": True}]
+    events = {"mean_s": 5}
+    until = secured(scenario(agents=3, duration_s=300, timeline=jam[:1], events=events))
+    jammed = simulate(until, 1, tracing=True)
+    assert not jammed.result.bad
+    assert len({chain[-1] for chain in jammed.result.chains.values()}) == 3
+    after = secured(scenario(agents=3, duration_s=600, timeline=jam, events=events, final_reconcile=True))
+    united = simulate(after, 1, tracing=True)
+    assert not united.result.bad
+    assert united.result.characteristics["6"].verdict == "holds"

@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -77,6 +78,24 @@ def test_others_carry_it_and_cannot_read_it(swarm: SealedSwarm) -> None:
     for export in swarm.exports.values():
         for block in export["chain"]:
             assert LOGGED not in base64.b64decode(block["event_data"])
+
+
+def test_trace_shows_the_events_of_its_own_vehicle_only(swarm: SealedSwarm) -> None:
+    logged = {agent_id: f"logged by {agent_id}".encode() for agent_id in ROSTER}
+    air = Air(ROSTER)
+    bundles = swarm.home.bundles()
+    air.agents = {
+        agent_id: Agent(agent_id, ROSTER, swarm.initial_data, SETTINGS, seal=make_seal(bundle))
+        for agent_id, bundle in bundles.items()
+    }
+    for agent_id in ROSTER:
+        for _ in range(60):
+            air.log(agent_id, logged[agent_id])
+        air.settle()
+    for agent_id, runs in air.runs.items():
+        texts = re.findall('"([A-Za-z0-9+/]{8,}=*)"', "".join(run.to_line() for run in runs))
+        content = b"".join(base64.b64decode(text) for text in texts if len(text) % 4 == 0)
+        assert {other for other in ROSTER if logged[other] in content} == {agent_id}
 
 
 def test_the_judge_follows_agents_that_seal(swarm: SealedSwarm) -> None:

@@ -88,6 +88,20 @@ def test_signatures_decide_without_the_makers_trace(home: Path, run: Path) -> No
         assert "was signed by the agent that it names, with the public keys that --keys names" in judgement["reason"]
 
 
+def test_vehicle_without_files_counts_as_missing(run: Path, tmp_path: Path) -> None:
+    left = shutil.copytree(run, tmp_path / "left")
+    for path in (left / "agents").glob("3.*"):
+        path.unlink()
+    done = harness("check", left, "--keys", run, "--json")
+    found = json.loads(done.stdout)["characteristics"]
+    for number in "2356":
+        assert found[number]["verdict"] == "not applicable", found[number]
+        assert "agent 3 is missing" in found[number]["reason"]
+    chains = [json.loads(path.read_text())["chain"] for path in (left / "agents").glob("*.chain.json")]
+    assert all(any(block["agent_id"] == 3 for block in chain) for chain in chains)
+    assert found["4"]["verdict"] == "holds", "the others have its blocks, with its signatures"
+
+
 def test_keys_beside_the_exports_are_no_anchor(home: Path, tmp_path: Path) -> None:
     judgement = genuine(home)
     assert (judgement["verdict"], judgement["reason"][:12]) == ("not applicable", "not anchored")

@@ -12,8 +12,8 @@ from scapy.layers.l2 import Ether
 from scapy.packet import Raw
 
 from tests.ucp.datagrams import all_messages
-from tests.ucp.secure.swarm import KEYS, session
-from ucp.messages import ChainContainQuery, Message, encode
+from tests.ucp.secure.swarm import FULL, KEYS, agent, complete_a_block, session
+from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock, Message, encode
 from ucp.scapy import UCP, Sealed, SecuredUCP, message_of, opened
 from ucp.secure.bundle import KeySet
 from ucp.secure.envelope import CLEAR, CLEAR_FIELDS, MalformedDatagramError, read_clear_header
@@ -61,6 +61,22 @@ def test_opener_rejects_datagrams_of_other_keys_and_altered_datagrams(data: st.D
     altered = datagram[:place] + bytes([datagram[place] ^ 1]) + datagram[place + 1 :]
     with pytest.raises(MalformedDatagramError, match=r"not authentic|not signed by its sender"):
         opener().open(altered)
+
+
+def test_revoked_vehicle_still_reads_votes_and_unsealed_events() -> None:
+    two, revoked = agent(2), DatagramOpener(KEYS.bundle(3))
+    authority = Ed25519PrivateKey.from_private_bytes(KEYS.authority)
+    two.revoke(Revocation.signed(authority, KEYS.public.mission, 1, [3]).encode(), 0.0)
+    two.datagrams_to_send()
+    (request,) = complete_a_block(two)
+    assert type(revoked.open(request).datagram.message) is BlockAddRequest
+    ends = two.next_timer()
+    assert ends is not None
+    two.handle_timer(ends)
+    (commit,) = two.datagrams_to_send()
+    message = revoked.open(commit).datagram.message
+    assert type(message) is CommitBlock
+    assert FULL in message.block.event_data
 
 
 def test_opener_opens_later_epochs_and_rejects_earlier_and_far_ones() -> None:
