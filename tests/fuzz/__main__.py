@@ -1,18 +1,21 @@
 """`python -m tests.fuzz [TARGET ...] [--seconds 60] [--random] [--inputs N]`: give hostile input to all readers.
 
-`--seconds` is the time for each target. If `atheris` is installed (`pip install -e '.[test,fuzz]'`), coverage guides
-the mutations. Without it, or with `--random`, the stored inputs are mutated at random. New inputs that cover more code
-are stored in .fuzz for the next call. `--inputs` sets the number of random inputs for each target in place of a time.
-Failing inputs are stored in .fuzz/failures, and the exit status is then 1.
+`--seconds` is the time for each target, and `--inputs` is a number of inputs in place of a time. If `atheris` is
+installed (`pip install -e '.[test,fuzz]'`), coverage guides the mutations. Without it, or with `--random`, the stored
+inputs are mutated at random. New inputs that cover more code are stored in .fuzz for the next call. Failing inputs are
+stored in .fuzz/failures, and the exit status is then 1. Readers get their inputs as files in memory, because a disk
+would take most of the time.
 """
 
 import argparse
 import hashlib
+import os
 import re
 import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import traceback
 from importlib.util import find_spec
@@ -28,6 +31,7 @@ GROWN = Path(".fuzz")
 FAILURES = GROWN / "failures"
 MOST_BYTES = 65536
 MOST_MIB = 1024
+MEMORY = Path("/dev/shm")  # noqa: S108
 PATIENCE_S = 300
 """Additional seconds for the start and the last input of a target, on a busy machine."""
 
@@ -37,38 +41,41 @@ def main() -> int:
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"of {', '.join(NAMES)}; all if none is named")
     parser.add_argument("--seconds", type=int, default=60, help="for each target")
     parser.add_argument("--random", action="store_true", help="no coverage guidance")
-    parser.add_argument("--inputs", type=int, help="random inputs for each target, in place of a time")
+    parser.add_argument("--inputs", type=int, help="for each target, in place of a time")
     asked = parser.parse_args()
     if unknown := [name for name in asked.targets if name not in NAMES]:
         parser.error(f"there is no target {unknown[0]}: there are {', '.join(NAMES)}")
     FAILURES.mkdir(parents=True, exist_ok=True)
-    is_guided = not asked.random and asked.inputs is None and find_spec("atheris") is not None
-    failed = [
-        name
-        for name in asked.targets or NAMES
-        if not (_guided(name, asked.seconds) if is_guided else _at_random(name, asked.seconds, asked.inputs))
-    ]
+    is_guided = not asked.random and find_spec("atheris") is not None
+    fuzzed = _guided if is_guided else _at_random
+    with TemporaryDirectory(prefix="ucp-fuzz-", dir=MEMORY if os.access(MEMORY, os.W_OK) else None) as scratch:
+        tempfile.tempdir = scratch
+        failed = [name for name in asked.targets or NAMES if not fuzzed(name, asked.seconds, asked.inputs)]
     if failed:
         sys.stdout.write(f"failed: {', '.join(failed)}; the inputs are in {FAILURES}\n")
     return 1 if failed else 0
 
 
-def _guided(name: str, seconds: int) -> bool:
-    """Fuzz a target with coverage guidance, in a new process, because libFuzzer ends its process.
+def _guided(name: str, seconds: int, limit: int | None) -> bool:
+    """Fuzz a target with coverage guidance for some seconds, or with `limit` inputs. Return whether no input fails.
 
-    Return whether no input fails.
+    The target runs in a new process, because libFuzzer ends its process.
     """
     grown = GROWN / name
     grown.mkdir(exist_ok=True)
     log = GROWN / f"{name}.log"
-    options = [f"-max_total_time={seconds}", f"-timeout={MOST_S:.0f}", f"-rss_limit_mb={MOST_MIB}"]
+    options = [
+        f"-max_total_time={seconds}" if limit is None else f"-runs={limit}",
+        f"-timeout={MOST_S:.0f}",
+        f"-rss_limit_mb={MOST_MIB}",
+    ]
     options += [f"-max_len={MOST_BYTES}", "-print_final_stats=1", f"-artifact_prefix={FAILURES}/{name}-"]
     with TemporaryDirectory(prefix="ucp-fuzz-") as scratch, log.open("wb") as output:
         command = [sys.executable, "-m", "tests.fuzz.guided", name, *options, str(grown), str(FOLDER / name)]
         began = time.monotonic()
         running = subprocess.Popen(["env", f"TMPDIR={scratch}", *command], stdout=output, stderr=output)
         try:
-            status = running.wait(seconds + PATIENCE_S)
+            status = running.wait(seconds + PATIENCE_S if limit is None else None)
             problem = f"ended with status {status}" if status else ""
         except subprocess.TimeoutExpired:
             problem = "hangs"

@@ -23,10 +23,10 @@ def main(arguments: list[str]) -> None:
         from tests.fuzz.targets import named
 
         target = named(name)
+    chance = random.Random()
     kept = [path.read_bytes() for path in files_of(name)]
 
     def mutate(data: bytes, most_bytes: int, seed: int) -> bytes:
-        chance = random.Random(seed)
         if blind:
             return damaged(chance.choice(kept), chance)[:most_bytes]
         if chance.random() < 0.5:

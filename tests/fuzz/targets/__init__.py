@@ -1,6 +1,7 @@
 """List the fuzz targets by name. Each is a module with a function `run` for an input, and `seeds` for valid inputs.
 
-datagram    a datagram on the port: codec, scapy's layers, events in a block
+datagram    a datagram on the port: codec, clear header, events in a block
+layers      the same datagrams in scapy's layers
 agent       an agent in any state, with forged messages, timers, events and reboots
 store       a store after a brown-out
 mission     a mission file
@@ -36,7 +37,7 @@ from pathlib import Path
 from typing import Protocol
 
 NAMES = (
-    *("datagram", "agent", "store", "mission", "control", "answer", "virtual", "foreign"),
+    *("datagram", "layers", "agent", "store", "mission", "control", "answer", "virtual", "foreign"),
     *("telemetry", "scenario", "story", "trace", "events", "export", "run_record", "network"),
     *("tracks", "capture", "csv", "bag", "packed", "depot", "matrix", "by_hand", "keys"),
     *("secured", "signed", "flight_log"),

@@ -1,11 +1,13 @@
 """Fuzz target: key files (bundles, public keys, private keys, lists of excluded vehicles). They are refused, or
 reproduced by the writer.
 
-An input is a file, put in the place of one of those in a directory of good keys; its schema says of which.
+An input replaces a file in a directory with valid keys. The schema in the input selects the file. An input without a
+known schema replaces any file.
 """
 
 import json
 import shutil
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,12 +34,17 @@ def _home() -> Path:
 
 def run(data: bytes) -> None:
     with TemporaryDirectory() as directory:
-        for number, name in enumerate(NAMES):
-            home = Path(directory) / str(number)
-            shutil.copytree(_home(), home)
-            path = home / name
-            path.write_bytes(data)
-            _read(home, path)
+        home = Path(directory) / "home"
+        shutil.copytree(_home(), home)
+        path = home / _name(data)
+        path.write_bytes(data)
+        _read(home, path)
+
+
+def _name(data: bytes) -> str:
+    """Return the name of the file that an input replaces."""
+    names = [name for name in NAMES if json.loads((_home() / name).read_bytes())["schema"].encode() in data] or NAMES
+    return names[zlib.crc32(data) % len(names)]
 
 
 def _read(home: Path, path: Path) -> None:
