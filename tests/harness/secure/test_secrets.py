@@ -77,6 +77,18 @@ def test_files_of_a_failed_run_of_processes_contain_no_secret(
     assert told(secrets(home, EPOCHS), left) == []
 
 
+@pytest.mark.lab
+@pytest.mark.any_user
+def test_agent_as_a_process_reads_keys_of_other_agents(home: KeyDirectory, tmp_path: Path) -> None:
+    """Check a known limit, which the threat model states. Containers separate the agents."""
+    reads = """cat "$(sed -n 's/.*"bundle": *"\\([^"]*\\)".*/\\1/p' 1.mission.json)" > 2.read; exit 3"""
+    asked = scenario(tmp_path, home, agent_command={"2": ["sh", "-c", reads]}, capture=False, speedup=20, timeline=[])
+    status, left = run(asked, "--backend", "process")
+    assert status == 1, left[0]
+    others = {"private key of 1": secrets(home, 1)["private key of 1"]}
+    assert told(others, left) == [f"private key of 1 in {tmp_path / 'run/agents/2.read'}"]
+
+
 @pytest.mark.parametrize("tells", ["error", "version"])
 def test_virtual_agent_that_repeats_its_input_reveals_no_secret(home: KeyDirectory, tmp_path: Path, tells: str) -> None:
     """The agent refuses its mission with a copy of its input, or puts it into its status."""
