@@ -24,7 +24,7 @@ from tempfile import TemporaryDirectory
 
 from tests.fuzz.corpus import FOLDER, files_of
 from tests.fuzz.execute import executed, mutated
-from tests.fuzz.finding import MOST_S
+from tests.fuzz.finding import MOST_WALL_S
 from tests.fuzz.targets import NAMES, named
 
 GROWN = Path(".fuzz")
@@ -32,7 +32,7 @@ FAILURES = GROWN / "failures"
 MOST_BYTES = 65536
 MOST_MIB = 1024
 MEMORY = Path("/dev/shm")  # noqa: S108
-PATIENCE_S = 300
+PATIENCE_S = 900
 """Additional seconds for the start and the last input of a target, on a busy machine."""
 
 
@@ -66,7 +66,7 @@ def _guided(name: str, seconds: int, limit: int | None) -> bool:
     log = GROWN / f"{name}.log"
     options = [
         f"-max_total_time={seconds}" if limit is None else f"-runs={limit}",
-        f"-timeout={MOST_S:.0f}",
+        f"-timeout={MOST_WALL_S:.0f}",
         f"-rss_limit_mb={MOST_MIB}",
     ]
     options += [f"-max_len={MOST_BYTES}", "-print_final_stats=1", f"-artifact_prefix={FAILURES}/{name}-"]

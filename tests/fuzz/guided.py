@@ -23,8 +23,10 @@ def main(arguments: list[str]) -> None:
         from tests.fuzz.targets import named
 
         target = named(name)
+        kept = [path.read_bytes() for path in files_of(name)]
+        for data in kept:
+            target.run(data)  # instruments the modules that the target imports late
     chance = random.Random()
-    kept = [path.read_bytes() for path in files_of(name)]
 
     def mutate(data: bytes, most_bytes: int, seed: int) -> bytes:
         if blind:
