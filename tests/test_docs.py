@@ -109,7 +109,7 @@ def test_reference_page_has_keys_of_a_scenario(site: Path) -> None:
     text = (site / "reference/scenario-keys.html").read_text()
     for key in ("final_reconcile", "vote_timeout_s", "hold_until_s", "takeoff_altitude_m", "reboot"):
         assert f"<code>{key}</code>" in text
-    assert "Any program that follows ucp/contract/CONTRACT.md" in text  # a docstring in the source
+    assert "A program that follows ucp/contract/CONTRACT.md" in text  # a docstring in the source
 
 
 def test_commands_page_has_each_command_and_option(site: Path) -> None:

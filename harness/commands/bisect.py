@@ -85,7 +85,8 @@ def bisect_command(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     once: Annotated[
-        bool, typer.Option("--once", rich_help_panel=ONCE, help="Try one state of the code, for `git bisect run`.")
+        bool,
+        typer.Option("--once", rich_help_panel=ONCE, help="Test only the code in --repository, for `git bisect run`."),
     ] = False,
     expect: Annotated[
         Path | None,

@@ -31,7 +31,7 @@ def new_command(
     home: HomeArgument,
     agents: Annotated[str, typer.Option(help="Number of agents, or their IDs, such as 10,28,32.")],
     sealed: Annotated[
-        bool, typer.Option("--sealed/--open", help="Seal event data to a new depot key, or leave it open.")
+        bool, typer.Option("--sealed/--open", help="Encrypt event data for a new depot key, or leave it readable.")
     ] = True,
     epoch_s: Annotated[
         float, typer.Option(min=1, max=MAX_EPOCH_S, help="Mission seconds after which vehicles forget a group secret.")

@@ -43,7 +43,7 @@ def matrix_command(
     against: Annotated[
         Path | None,
         typer.Option(
-            metavar="BASELINE", rich_help_panel=NIGHTS, help="Earlier matrix.json; exit status 1 if a figure is worse."
+            metavar="BASELINE", rich_help_panel=NIGHTS, help="Earlier matrix.json; exit status 1 if a result is worse."
         ),
     ] = None,
     coverage: Annotated[
@@ -67,7 +67,7 @@ def matrix_command(
     bisect: Annotated[
         str | None,
         typer.Option(
-            metavar="TIME", rich_help_panel=NIGHTS, help="Find the commits of worse figures, for 20m at most."
+            metavar="TIME", rich_help_panel=NIGHTS, help="Find the commits that made results worse; time limit: 20m."
         ),
     ] = None,
     budget: Annotated[

@@ -24,7 +24,9 @@ LIMITS, WRONG = "Limits", "Wrong or captured agents"
 def prove_command(
     agents: Annotated[int, typer.Option(help="Number of agents.")] = 2,
     blocks: Annotated[int, typer.Option(help="Number of blocks that the agents complete in all.")] = 3,
-    network: Annotated[str, typer.Option(help="lossless, lossy, or any (late, repeated, in any order).")] = "lossy",
+    network: Annotated[
+        str, typer.Option(help="Network: lossless, lossy, or any (late, repeated, in any order).")
+    ] = "lossy",
     faults: Annotated[str, typer.Option(help="Faults: reboot, death and duplicate, separated by commas.")] = "",
     timers: Annotated[
         str,

@@ -32,7 +32,9 @@ def replay_command(
     step: Annotated[bool, typer.Option("--step", help="Stop at the first step, and read commands.")] = False,
     breaks: Annotated[
         list[str] | None,
-        typer.Option("--break", metavar="HANDLER|LINE|BLOCK", help="Stop there, and read commands; may be repeated."),
+        typer.Option(
+            "--break", metavar="HANDLER|LINE|BLOCK", help="Handler, line or block at which to stop; may be repeated."
+        ),
     ] = None,
     debug: Annotated[
         bool, typer.Option("--debug", help="Call the debugger at each --break, before the handler runs.")
