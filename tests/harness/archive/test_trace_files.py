@@ -193,7 +193,7 @@ def test_programs_are_judged_alike_if_their_traces_are_packed_meanwhile(
 
 
 def test_link_of_an_agent_never_frees_parts_of_another_file(tmp_path: Path) -> None:
-    """In containers, a link of the harness leads to the file of the agent, and the agent can replace its file."""
+    """A link of the harness leads to the file of the agent in a container, and the agent can replace this file."""
     own, other = tmp_path / "1-1" / NAMES[0], tmp_path / "other"
     own.parent.mkdir()
     other.write_bytes(b"x" * 4_000_000)
