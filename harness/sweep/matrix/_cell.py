@@ -37,6 +37,8 @@ class Run(CellRecord):
     seed: int
     figures: dict[str, float | int | None] = {}
     verdicts: dict[str, Verdict] = {}
+    deviates_in: str | None = None
+    """The handler of the first step that deviates. None without such a step."""
     steps: str = ""
     """The fingerprint of the run's handler runs. It exists in virtual time with traces. See `_run_steps`."""
     failed: str | None = None
@@ -61,7 +63,7 @@ class Cell(CellRecord):
 
     `estimates` contains an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` contains
     the seeds of the runs with a bad verdict, by check. `unfinished` contains the seeds of the runs in which the swarm
-    only needed more time.
+    only needed more time. `deviations` counts the runs in which a step deviates, by the handler of the first such step.
     """
 
     runs: int
@@ -70,6 +72,7 @@ class Cell(CellRecord):
     verdicts: dict[str, dict[Verdict, int]]
     violated: dict[str, list[int]]
     unfinished: list[int] = []
+    deviations: dict[str, int] = {}
     unsupported: int = 0
 
     @property
@@ -106,4 +109,5 @@ def sum_up(point: MatrixPoint, runs: Sequence[Run], *, grows: bool = False) -> C
         verdicts={key: dict(Counter(by_seed.values())) for key, by_seed in verdicts.items() if by_seed},
         violated={key: seeds for key, seeds in bad.items() if seeds},
         unfinished=unfinished,
+        deviations=dict(Counter(run.deviates_in for run in judged if run.deviates_in).most_common()),
     )

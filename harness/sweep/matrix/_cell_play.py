@@ -101,6 +101,7 @@ class RunPlayer:
             seed=task.seed,
             figures=figures,
             verdicts=verdicts,
+            deviates_in=_first_deviation(judged.result),
             steps=judged.steps,
             reached=reached,
         )
@@ -132,6 +133,12 @@ class RunPlayer:
         if not finished.result.bad and self.matrix.keep == "violated":
             shutil.rmtree(directory)
         return JudgedRun(finished.played, finished.result)
+
+
+def _first_deviation(result: Result) -> str | None:
+    """Return the handler of the first step that deviates. Return None without such a step."""
+    steps = result.beside.get("steps")
+    return steps.evidence[0].handler if steps is not None and steps.verdict == "deviates" else None
 
 
 def directory_name(task: MatrixTask) -> str:

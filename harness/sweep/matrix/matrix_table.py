@@ -147,7 +147,8 @@ def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
         if seeds:
             which = ", ".join(map(str, seeds[:NAMED])) + (", \u2026" if len(seeds) > NAMED else "")
             plural = "s" if len(seeds) > 1 else ""
-            yield f"{trouble} in {len(seeds)} of {cell.runs} runs, seed{plural} {which}"
+            first = _first_deviations(cell) if trouble == BAD_IN_WORDS["steps"] else ""
+            yield f"{trouble} in {len(seeds)} of {cell.runs} runs, seed{plural} {which}{first}"
     failed = [run for run in record.failed if run.point == cell.point]
     for run in failed[:NAMED]:
         yield f"seed {run.seed} failed: {run.reason}"
@@ -159,6 +160,12 @@ def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
     for culprit in record.against.culprits if record.against else ():
         if culprit.point == cell.point:
             yield from _say_culprit(culprit)
+
+
+def _first_deviations(cell: Cell) -> str:
+    """Return the handlers of the first steps that deviate, each with the number of its runs."""
+    handlers = [f"{handler} ({count})" for handler, count in cell.deviations.items()]
+    return f"; first in {', '.join(handlers)}" if handlers else ""
 
 
 def unsupported(record: MatrixRecord, cell: Cell) -> Iterable[str]:

@@ -44,6 +44,16 @@ def test_matrix_finds_one_chain_at_loss_0_and_no_mutual_chain_at_loss_1(tmp_path
     assert (float(alone["uniform"]), float(alone["mutual_share"]), float(alone["copies_mean"])) == (0, 0, 1)
 
 
+def test_matrix_names_the_handlers_of_the_first_deviations(tmp_path: Path) -> None:
+    often = {"source": "random", "mean_s": 5}
+    wrong = {"agents": 3, "duration_s": 200, "quirks": {"approve_everything": True}, "events": often}
+    asked = written(tmp_path, scenario=wrong, loss=[0.3], seeds=2)
+    done = harness("matrix", asked, "--backend", "sim", "--out", tmp_path / "out")
+    assert done.returncode == 1, done.stdout + done.stderr
+    first = "steps deviate in 2 of 2 runs, seeds 1, 2; first in receive_request_add_block (2)"
+    assert first in " ".join(done.stdout.split())
+
+
 def test_matrix_with_three_sizes_prints_and_draws_growth(tmp_path: Path) -> None:
     scenario = {"duration_s": 600, "events": {"source": "random"}}
     asked = written(tmp_path, scenario=scenario, agents=[3, 2, 5], seeds=2, loss=[0, 0.15])
