@@ -2,14 +2,14 @@
 
 import base64
 import math
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 from harness.archive.traces import TraceHeader
 from harness.checker._waiting import SLACK_WALL_S
 from harness.checker.reference.state import Settings as ReferenceSettings
 from ucp.block import MAX_AGENT_ID
-from ucp.core import Seal
 from ucp.settings import Settings
 
 EARLY_WALL_S = 0.001
@@ -43,7 +43,7 @@ class CheckedHeader:
     early_s: float
     late_s: float
     secured: bool = False
-    seal: Seal | None = field(default=None, repr=False, compare=False)
+    seal: Callable[[bytes, int], bytes] | None = field(default=None, repr=False, compare=False)
     """A function that returns the encrypted event data as far as the agent recorded it. None if the mission does not
     encrypt event data.
     """
@@ -59,7 +59,8 @@ def checked(header: TraceHeader) -> CheckedHeader:
     """
     try:
         initial_data = base64.b64decode(header.initial_data or "", validate=True)
-        settings = Settings(**{name: value for name, value in header.settings.items() if name in _SETTINGS})
+        given = {**asdict(ReferenceSettings()), **header.settings}  # the defaults of an edited core may be wrong
+        settings = Settings(**{name: value for name, value in given.items() if name in _SETTINGS})
     except (ValueError, TypeError) as error:
         raise ImpossibleHeaderError(f"the header of its trace has invalid settings: {str(error)[:200]}") from None
     if unknown := _unknown_to_reference(settings):
