@@ -115,7 +115,7 @@ def of_processes(number: int) -> Scenario:
         "agents": agents,
         "duration_s": 300,
         "vehicles": {"kind": "none"},
-        "network": {"loss": lost, "duplicate": draw.choice([0.0, 0.1])},
+        "network": {"loss": lost},
         "events": {"source": "random", "mean_s": 10},
         "timeline": [*_partition(draw, agents, 300), *_death(draw, agents, 300)],
         "final_reconcile": True,
@@ -123,7 +123,7 @@ def of_processes(number: int) -> Scenario:
     if draw.random() < 0.2:
         document["security"] = {}
     elif draw.random() < 0.2:
-        document["network"] = {"channel": {"preset": "wifi_1"}}
+        document |= {"network": {"channel": {"preset": "wifi_1"}}, "vehicles": {"kind": "embedded"}}
     return Scenario.model_validate(document)
 
 
