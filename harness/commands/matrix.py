@@ -95,17 +95,14 @@ def matrix_command(
         raise typer.BadParameter("--bisect needs --against: it searches the commits since the baseline")
     bisect_s = None if bisect is None else seconds_of("--bisect", bisect)
     budget_s = None if budget is None else seconds_of("--budget", budget)
-    if budget_s is not None and scheduler is not None:
-        raise typer.BadParameter(
-            "--budget excludes --scheduler, which distributes all runs at once: leave out one of them"
-        )
     if scheduler is None:
         spread = on_cores(request, jobs or cores(), shown=True)
     else:
-        spread = on_cluster(request, scheduler, shown=True)
+        spread = on_cluster(scheduler, shown=True)
     if variant is not None:
         _compare_with_variant(request, load_variant(variant), directory, spread, as_json)
-    finished = matrix.run_matrix(request, directory, spread, covers=coverage, budget_s=budget_s)
+    elsewhere = scheduler is not None
+    finished = matrix.run_matrix(request, directory, spread, covers=coverage, budget_s=budget_s, elsewhere=elsewhere)
     if baseline is not None:
         finished = name_changes(compare_with(finished, baseline), baseline, jobs or cores())
         if bisect_s is not None:

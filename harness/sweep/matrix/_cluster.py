@@ -10,7 +10,8 @@ import contextlib
 import logging
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sized
+from itertools import islice
 from typing import Any, TypeVar
 
 from harness.errors import HarnessError, MachineError, extra
@@ -26,17 +27,19 @@ SAME_VERSIONS = ("dask", "distributed", "ucp-harness")
 
 @contextlib.contextmanager
 def cluster(
-    tasks: Sequence[T], work: Callable[[T], R], address: str, *, what: str | None = None
+    tasks: Iterable[T], work: Callable[[T], R], address: str, *, what: str | None = None
 ) -> Iterator[Iterator[tuple[T, R | FailedTask]]]:
     """Yield (task, result) for each task in order of completion. `address` is the Dask scheduler (tcp://host:port).
 
     Results, errors and interrupts are treated as in `harness.run.parallel.sweep`. The workers must be able to import
-    `work`. At the end of the context, unfinished tasks are cancelled.
+    `work`. At the end of the context, unfinished tasks are cancelled. If the number of tasks is unknown, the next task
+    is taken only when a thread of a worker is free.
 
     Raises HarnessError for an invalid address. Raises MachineError if no scheduler answers, if it has no workers or
     different versions, or if the connection is lost.
     """
-    with sigterm_as_ctrl_c(), progress_bar(what, len(tasks)) as count, _connected(address) as client:
+    total = len(tasks) if isinstance(tasks, Sized) else None
+    with sigterm_as_ctrl_c(), progress_bar(what, total) as count, _connected(address) as client:
         yield _outcomes(client, tasks, work, address, count)
 
 
@@ -92,19 +95,24 @@ def _refuse_other_versions(versions: dict[str, dict[str, str | None]], address: 
 
 
 def _outcomes(
-    client: Any, tasks: Sequence[T], work: Callable[[T], R], address: str, count: Callable[[Any], Any]
+    client: Any, tasks: Iterable[T], work: Callable[[T], R], address: str, count: Callable[[Any], Any]
 ) -> Iterator[tuple[T, R | FailedTask]]:
     from distributed import as_completed
 
-    if not tasks:
-        return
     # `work` is a task of its own, so each worker receives it once. Dask recreates it if its worker is lost.
     shared = client.submit(_same, work, pure=False)
-    futures = client.map(outcome_of, [shared] * len(tasks), tasks, pure=False)
-    task_of = dict(zip(futures, tasks, strict=True))
-    ended = as_completed(futures, loop=client.loop)
-    del futures  # the references would keep all outcomes in memory
-    for future in ended:
+    waiting, task_of, ended = iter(tasks), dict[Any, T](), as_completed(loop=client.loop)
+    while True:
+        active = len(tasks) if isinstance(tasks, Sized) else sum(client.nthreads().values())
+        following = [*islice(waiting, max(0, active - len(task_of)))]
+        for future, task in zip(
+            client.map(outcome_of, [shared] * len(following), following, pure=False), following, strict=True
+        ):
+            task_of[future] = task
+            ended.add(future)
+        if not task_of:
+            return
+        future = next(ended)
         task = task_of.pop(future)
         try:
             outcome = future.result()
@@ -114,6 +122,7 @@ def _outcomes(
                     f"the scheduler at {address} was lost: the same command with the same --out goes on"
                 ) from None
             outcome = FailedTask(f"{type(error).__name__}: {error}")
+        del future  # the reference would keep its outcome in memory
         yield task, raise_error(count(outcome))
 
 

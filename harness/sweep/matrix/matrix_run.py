@@ -3,7 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ from harness.errors import InterruptedRunError, ScenarioError
 from harness.run.parallel import FailedTask, cores, sweep
 from harness.run.provenance import versions
 from harness.scenario import Scenario
+from harness.sweep.matrix._away import AwayPlayer, AwayRun
 from harness.sweep.matrix._budget import informative
 from harness.sweep.matrix._cell import Run, sum_up
 from harness.sweep.matrix._cell_play import Judge, RunPlayer, simulated
@@ -28,7 +29,7 @@ from harness.sweep.matrix.matrix_record import MatrixRecord, RunWithoutResult
 from harness.sweep.matrix.nights import BaselineNight
 
 Outcomes = Iterator[tuple[MatrixTask, Run | FailedTask]]
-Spread = Callable[[Iterable[MatrixTask], Callable[[MatrixTask], Run]], AbstractContextManager[Outcomes]]
+Spread = Callable[[Iterable[MatrixTask], RunPlayer], AbstractContextManager[Outcomes]]
 """A function that distributes tasks, and yields their results in order of completion."""
 
 
@@ -53,17 +54,15 @@ def on_cores(matrix: Matrix, jobs: int, *, shown: bool = False) -> Spread:
     return partial(sweep, jobs=jobs, what="runs" if shown else None, in_order=False)
 
 
-def on_cluster(matrix: Matrix, address: str, *, shown: bool = False) -> Spread:
-    """Return a function that distributes the runs over the workers of the Dask scheduler at `address`.
+def on_cluster(address: str, *, shown: bool = False) -> Spread:
+    """Return a function that distributes the runs over the workers of the Dask scheduler at `address`."""
 
-    Raises ScenarioError if a run needs processes.
-    """
-    if matrix.needs_processes:
-        raise ScenarioError(
-            "--scheduler is for virtual time: runs as processes leave their directories here, so play them without it, "
-            "or with --backend sim"
-        )
-    return partial(cluster, address=address, what="runs" if shown else None)
+    @contextmanager
+    def spread(tasks: Iterable[MatrixTask], play: RunPlayer) -> Iterator[Outcomes]:
+        with cluster(tasks, AwayPlayer(play), address, what="runs" if shown else None) as outcomes:
+            yield ((task, run.unpack(play.directory) if isinstance(run, AwayRun) else run) for task, run in outcomes)
+
+    return spread
 
 
 def run_matrix(
@@ -74,6 +73,7 @@ def run_matrix(
     *,
     covers: bool = False,
     budget_s: float | None = None,
+    elsewhere: bool = False,
 ) -> Finished:
     """Play every run of a matrix, and summarise the runs for each combination of values.
 
@@ -82,25 +82,32 @@ def run_matrix(
     - `spread`: the function that distributes runs. Without it, the runs use all cores of this machine.
     - `judge`: the function that plays and checks one run in virtual time. Without it, the simulation is used.
     - `budget_s`: no run begins after this time. The most uncertain cells come first. Without it, all runs are played.
+    - `elsewhere`: if true, the runs are played on other machines, and each of these checks that it can play them.
     - `covers`: if true, also measure the share of the protocol's states that the runs reach. This takes longer.
 
     Ctrl-C ends the matrix early, with the runs that have ended. Raises HarnessError if it cannot be played.
     """
     with opened((out or default_path(matrix.name)).absolute(), matrix) as results:
         judge = judge or partial(simulated, tracing=matrix.traces)
-        return _run_missing(matrix, results, spread or on_cores(matrix, cores()), judge, covers, budget_s)
+        play = RunPlayer(matrix, results.directory / "runs", judge, covers)
+        return _run_missing(matrix, results, spread or on_cores(matrix, cores()), play, budget_s, elsewhere)
 
 
 def _run_missing(
-    matrix: Matrix, results: MatrixResults, spread: Spread, judge: Judge, covers: bool, budget_s: float | None
+    matrix: Matrix,
+    results: MatrixResults,
+    spread: Spread,
+    play: RunPlayer,
+    budget_s: float | None,
+    elsewhere: bool,
 ) -> Finished:
     started = time.monotonic()
-    play = RunPlayer(matrix, results.directory / "runs", judge, covers)
     tasks = [task for task in matrix.tasks if task not in results.runs]
     if matrix.grows:  # the longest runs first, so that no core waits for a long run at the end
         tasks.sort(key=lambda task: _effort(matrix.scenario_at(task.point)), reverse=True)
-    play.refuse(dict.fromkeys(task.point for task in tasks))
-    interrupted, tally = False, CoverageTally() if covers else None
+    if not elsewhere:
+        play.refuse(dict.fromkeys(task.point for task in tasks))
+    interrupted, tally = False, CoverageTally() if play.covers else None
     try:
         chosen = tasks if budget_s is None else informative(tasks, results.runs, budget_s)
         with spread(chosen, play) as outcomes:

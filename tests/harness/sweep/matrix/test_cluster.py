@@ -3,12 +3,14 @@
 import contextlib
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -35,9 +37,9 @@ class Cluster:
         address: str = json.loads(self._file.read_text())["address"]
         return address
 
-    def start_worker(self, address: str, name: str) -> "subprocess.Popen[str]":
+    def start_worker(self, address: str, name: str, **env: str) -> "subprocess.Popen[str]":
         options = ("--nthreads", "1", "--no-nanny", "--local-directory", self._directory / name)
-        worker = self._start(name, "worker", address, *options)
+        worker = self._start(name, "worker", address, *options, **env)
         until(lambda: "Registered to" in (self._directory / f"{name}.log").read_text())
         return worker
 
@@ -169,16 +171,87 @@ def test_cluster_gives_the_outcomes_and_failures_of_a_sweep(dask: Cluster) -> No
     assert "IndexError" in found[4]
 
 
-def test_runs_of_processes_are_refused_on_a_cluster(tmp_path: Path) -> None:
-    done = harness(
-        "matrix",
-        written(tmp_path),
-        "--backend",
-        "process",
-        "--scheduler",
-        "tcp://127.0.0.1:1",
-        "--out",
-        tmp_path / "out",
-    )
-    assert done.returncode == 2
-    assert sentences(done.stderr)[0].startswith("--scheduler is for virtual time: ")
+def of_processes(directory: Path, **keys: Any) -> Path:
+    path = directory / "processes.yaml"
+    scenario = {
+        "agents": 2,
+        "duration_s": 200,
+        "speedup": 50,
+        "vehicles": {"kind": "none"},
+        "events": {"source": "random", "mean_s": 10},
+    }
+    scenario |= keys.pop("scenario", {})
+    asked = {"name": "away", "scenario": scenario, "loss": [0.1], "backend": "process", "seeds": 4, "keep": "all"}
+    path.write_text(json.dumps(asked | keys))
+    return path
+
+
+@pytest.mark.lab
+def test_killed_worker_loses_no_run_of_processes(tmp_path: Path, dask: Cluster) -> None:
+    """Each worker plays whole runs in its own directory, and their directories come back with the results."""
+    address = dask.start_scheduler()
+    doomed, _ = (dask.start_worker(address, name) for name in ("one", "two"))
+    asked, out = of_processes(tmp_path), tmp_path / "out"
+    command = [*COMMAND, "matrix", str(asked), "--scheduler", address, "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        until(lambda: any(tmp_path.glob("dask/one/**/agents/*.trace.jsonl")))
+        doomed.kill()
+        _, said = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 0, said
+    assert all(line.endswith(" runs") for line in sentences(said)), "nothing but progress"
+    runs = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()[1:]]
+    assert sorted(run["seed"] for run in runs) == [1, 2, 3, 4]
+    assert {run["verdicts"]["4"] for run in runs} == {"holds"}
+    for seed in (1, 2, 3, 4):
+        (directory,) = (out / "runs").glob(f"*-process-seed-{seed}")
+        assert harness("check", directory).returncode in (0, 4)
+
+
+@pytest.mark.lab
+def test_failed_run_of_a_worker_names_its_directory_here(tmp_path: Path, dask: Cluster) -> None:
+    address = dask.start_scheduler()
+    dask.start_worker(address, "one")
+    wrong = {"agent_command": {"1": ["python3", "-c", "raise SystemExit(7)"]}}
+    asked, out = of_processes(tmp_path, scenario=wrong, seeds=1), tmp_path / "out"
+    done = harness("matrix", asked, "--scheduler", address, "--out", out)
+    assert done.returncode == 1
+    (failed,) = json.loads((out / "matrix.json").read_text())["failed"]
+    directory = Path(failed["reason"].split("; see ")[-1])
+    assert directory.parent == out / "runs"
+    assert (directory / "run.json").is_file()
+
+
+def test_worker_that_cannot_play_a_run_ends_the_matrix(tmp_path: Path, dask: Cluster) -> None:
+    address = dask.start_scheduler()
+    dask.start_worker(address, "one", DOCKER_HOST="tcp://192.0.2.1:2375")
+    asked, out = of_processes(tmp_path, backend="docker", seeds=1), tmp_path / "out"
+    done = harness("matrix", asked, "--scheduler", address, "--out", out)
+    assert done.returncode == 3
+    assert re.match(r"the worker at tcp://\S+ cannot play a run: DOCKER_HOST is tcp", sentences(done.stderr)[-1])
+
+
+def test_budget_limits_the_runs_of_a_cluster(tmp_path: Path, dask: Cluster) -> None:
+    address = dask.start_scheduler()
+    dask.start_worker(address, "one")
+    out = tmp_path / "out"
+    done = harness("matrix", written(tmp_path), "--scheduler", address, "--budget", "2s", "--out", out)
+    assert done.returncode == 0, done.stderr
+    record = json.loads((out / "matrix.json").read_text())
+    assert (record["outcome"], record["budget_s"]) == ("completed", 2)
+    assert {cell["loss"] for cell in record["cells"]} <= {0.1, 0.3}
+
+
+def test_tasks_of_unknown_number_begin_when_a_worker_is_free(dask: Cluster) -> None:
+    address = dask.start_scheduler()
+    dask.start_worker(address, "one")
+    begun: list[int] = []
+
+    def tasks() -> Iterator[int]:
+        for task in range(5):
+            begun.append(task)
+            yield task
+
+    with cluster(tasks(), abs, address) as outcomes:
+        for count, _ in enumerate(outcomes, 1):
+            assert len(begun) == count
+    assert begun == [0, 1, 2, 3, 4]

@@ -1,0 +1,85 @@
+"""Play runs of a matrix on another machine, and bring their directories to this machine.
+
+A worker of a cluster plays a run with real programs in a scratch directory of its own. The directories of the runs that
+the matrix keeps come back with the results. They are small, because large traces are packed. The largest files are left
+out if a directory is still too large for a message.
+"""
+
+import io
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from harness.errors import HarnessError
+from harness.play.backends import BACKENDS
+from harness.run.parallel import FailedTask, outcome_of, raise_error
+from harness.sweep.matrix._cell import Run
+from harness.sweep.matrix._cell_play import RunPlayer, directory_name
+from harness.sweep.matrix._matrix_file import MatrixTask
+
+MAX_DIRECTORY_BYTES = 128 * 1024 * 1024
+
+
+@dataclass(frozen=True)
+class AwayRun:
+    """The outcome of a run on another machine. `archive` is its directory as a ZIP file, or empty."""
+
+    outcome: Run | FailedTask | HarnessError
+    archive: bytes
+
+    def unpack(self, directory: Path) -> Run | FailedTask:
+        """Write the directory of the run, and return the outcome. Raises the HarnessError that would end the matrix."""
+        if self.archive:
+            with zipfile.ZipFile(io.BytesIO(self.archive)) as archive:
+                archive.extractall(directory)
+        return raise_error(self.outcome)
+
+
+@dataclass(frozen=True)
+class AwayPlayer:
+    """Plays any run in a worker of a Dask cluster. `play` would play it on this machine."""
+
+    play: RunPlayer
+
+    def __call__(self, task: MatrixTask) -> AwayRun:
+        if BACKENDS[task.point.backend].plays_in_memory:
+            return AwayRun(outcome_of(self.play, task), b"")
+        from distributed import get_worker
+
+        worker: Any = get_worker()
+        with TemporaryDirectory(prefix="ucp-", dir=worker.local_directory) as scratch:
+            there = replace(self.play, directory=Path(scratch))
+            outcome = outcome_of(_checked(there), task)
+            archive = _pack(Path(scratch), directory_name(task))
+        if isinstance(outcome, FailedTask):
+            outcome = FailedTask(outcome.reason.replace(scratch, str(self.play.directory)))
+        elif isinstance(outcome, HarnessError):
+            outcome.args = (f"the worker at {worker.address} cannot play a run: {outcome}",)
+        return AwayRun(outcome, archive)
+
+
+def _checked(play: RunPlayer) -> Callable[[MatrixTask], Run]:
+    """Return a function that plays a run if this machine can."""
+
+    def checked(task: MatrixTask) -> Run:
+        play.refuse([task.point])
+        return play(task)
+
+    return checked
+
+
+def _pack(scratch: Path, name: str) -> bytes:
+    """Return the directory `name` in `scratch` as a ZIP file. Return no bytes if the matrix does not keep it."""
+    sizes = {path: path.stat().st_size for path in (scratch / name).rglob("*") if path.is_file()}
+    if not sizes:
+        return b""
+    content, left = io.BytesIO(), MAX_DIRECTORY_BYTES
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for path, size in sorted(sizes.items(), key=lambda item: item[1]):
+            if size <= left:
+                archive.write(path, path.relative_to(scratch))
+                left -= size
+    return content.getvalue()
