@@ -583,15 +583,17 @@ class RunRecord(JudgedRecord):
         """The expected results in the scenario. It is empty if the scenario has none."""
         return (self.scenario and self.scenario.expect) or Expect()
 
-    def unmet_expectations(self, chains: Mapping[int, Sequence[str]]) -> Iterator[tuple[str, list[str]]]:
+    def unmet_expectations(
+        self, chains: Mapping[int, Sequence[str]], top_chain_hashes: Mapping[int, str]
+    ) -> Iterator[tuple[str, list[str]]]:
         """Yield each kind of expectation except verdicts, with a sentence for each expectation of this kind that was
         not met.
 
-        `chains` has the block hashes of each agent's chain.
+        `chains` has the block hashes of each agent's chain, and `top_chain_hashes` its top.
         """
         found = [(finding.agent_id, finding.handler) for finding in (self.steps.evidence if self.steps else ())]
         figures: dict[str, float | None] = {name: self.figures.get(name) for name in self.expect.figures}
-        return self.expect.unmet(figures, chains, found)
+        return self.expect.unmet(figures, chains, top_chain_hashes, found)
 
     @property
     def judgements(self) -> dict[str, CharacteristicRecord | JudgementRecord]:

@@ -59,6 +59,8 @@ class Result:
     """One sentence for each file that could not be read completely."""
     chains: dict[int, tuple[str, ...]] = field(default_factory=dict)
     """Agent ID -> block hashes of its chain in hexadecimal, oldest first."""
+    top_chain_hashes: dict[int, str] = field(default_factory=dict)
+    """Agent ID -> hash of its whole chain in hexadecimal."""
 
     @property
     def judgements(self) -> dict[str, Judgement]:
@@ -106,15 +108,17 @@ def check(run: Evidence | RunArchive) -> Result:
     """
     evidence = gather(run) if isinstance(run, RunArchive) else run
     chains = {agent_id: export.chain_of_block_hashes for agent_id, export in evidence.exports.items()}
+    tops = {agent_id: export.top_chain_hash for agent_id, export in evidence.exports.items()}
     if evidence.record is not None and evidence.record.outcome == "not supported":
         reason = evidence.record.outcome_detail or "not supported by an agent"
         unjudged = {key: Judgement(name, "not applicable", reason) for key, name in ALL_CHECKS.items()}
         beside = {key: unjudged.pop(key) for key in FURTHER_CHECKS}
-        return Result(unjudged, figures(evidence), beside, evidence.errors, chains)
+        return Result(unjudged, figures(evidence), beside, evidence.errors, chains, tops)
     return Result(
         {number: in_doubt(number, judge(evidence), evidence.cached(cross_examine)) for number, judge in CHECKS.items()},
         figures(evidence),
         {key: judge(evidence) for key, judge in FURTHER_CHECKS.items()},
         evidence.errors,
         chains,
+        tops,
     )

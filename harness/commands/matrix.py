@@ -95,10 +95,7 @@ def matrix_command(
         raise typer.BadParameter("--bisect needs --against: it searches the commits since the baseline")
     bisect_s = None if bisect is None else seconds_of("--bisect", bisect)
     budget_s = None if budget is None else seconds_of("--budget", budget)
-    if scheduler is None:
-        spread = on_cores(request, jobs or cores(), shown=True)
-    else:
-        spread = on_cluster(scheduler, shown=True)
+    spread = on_cores(request, jobs or cores(), shown=True) if scheduler is None else on_cluster(scheduler, shown=True)
     if variant is not None:
         _compare_with_variant(request, load_variant(variant), directory, spread, as_json)
     elsewhere = scheduler is not None

@@ -60,7 +60,7 @@ def show_result(console: Console, result: checker.Result, record: RunRecord) -> 
     known = {name: value for name, value in result.figures.items() if value is not None}
     words = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in known.items())
     console.print(words, highlight=False, style="dim")
-    for _, unmet in record.unmet_expectations(result.chains):
+    for _, unmet in record.unmet_expectations(result.chains, result.top_chain_hashes):
         for sentence in unmet:
             complain(sentence)
 

@@ -11,7 +11,6 @@ from typing import cast
 
 import pytest
 
-from harness.archive.archive import RunArchive
 from harness.errors import HarnessError, MachineError, RunDirectoryError
 from harness.pytest_plugin._options import SessionOptions
 from harness.pytest_plugin.findings import JudgementInTest
@@ -67,10 +66,9 @@ class RunOfOneTest:
                 lines += JudgementInTest.of(key, judgement).lines()
                 lines += [f"    expected: {expected}"] if expected else []
         deviating = [(finding.agent_id, finding.handler) for finding in finished.result.beside["steps"].evidence]
-        lines += self._expect.out_of_range(finished.result.figures)
-        lines += self._expect.unexpected_common_blocks(finished.result.chains)
-        lines += self._expect.unexpected_deviations(deviating)
-        lines += self._other_chains(finished)
+        result = finished.result
+        kinds = self._expect.unmet(result.figures, result.chains, result.top_chain_hashes, deviating)
+        lines += [sentence for _, unmet in kinds for sentence in unmet]
         if not lines:
             return []
         wrong = ", ".join(quirks_in_words(self._quirks))
@@ -82,12 +80,6 @@ class RunOfOneTest:
         variant = [] if self._variant is None else ["--variant", str(self._variant)]
         command = ["ucp-harness", "run", str(finished.directory), "--backend", str(finished.record.backend), *variant]
         return [f"report: {finished.report}", f"again, with seed {finished.record.seed}: {shlex.join(command)}"]
-
-    def _other_chains(self, finished: Run) -> list[str]:
-        if not self._expect.chains:
-            return []
-        exports = RunArchive(finished.directory).exports.by_agent
-        return [*self._expect.unexpected_chains({agent: export.top_chain_hash for agent, export in exports.items()})]
 
 
 @contextmanager

@@ -49,11 +49,16 @@ class ReportSource:
         return {agent_id: export.chain_of_block_hashes for agent_id, export in self.exports.by_agent.items()}
 
     @property
+    def top_chain_hashes(self) -> dict[int, str]:
+        return {agent_id: export.top_chain_hash for agent_id, export in self.exports.by_agent.items()}
+
+    @property
     def unmet_expectations(self) -> list[str]:
         """Sentences about expected results that the run did not show. The expected verdicts are not included."""
         if not self.record.characteristics:
             return []
-        return [sentence for _, unmet in self.record.unmet_expectations(self.chains) for sentence in unmet]
+        kinds = self.record.unmet_expectations(self.chains, self.top_chain_hashes)
+        return [sentence for _, unmet in kinds for sentence in unmet]
 
     @property
     def chains_missing(self) -> list[str]:

@@ -143,7 +143,7 @@ def write(left: ReportSource) -> Path:
     """Write the report of a run whose files were already read. See `write_report`."""
     _write(left.run_dir / "chains.svg", ChainTreePicture(left.exports.by_agent, left.ink).standalone())
     _write(left.run_dir / "report.md", to_markdown(left))
-    _write(left.run_dir / "junit.xml", to_junit(left.record, left.chains))
+    _write(left.run_dir / "junit.xml", to_junit(left.record, left.chains, left.top_chain_hashes))
     page = left.run_dir / "report.html"
     _write(page, draw(left))
     return page

@@ -84,16 +84,19 @@ def _short(text: str) -> str:
     return escaped(text if len(text) <= TEXT_LENGTH else f"{text[: TEXT_LENGTH - 1]}\u2026")
 
 
-def to_junit(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> str:
+def to_junit(record: RunRecord, chains: Mapping[int, Sequence[str]], top_chain_hashes: Mapping[int, str]) -> str:
     """Return the run as JUnit XML. `chains` contains the block hashes of each agent's chain.
 
     A characteristic fails if it is violated, or if its verdict differs from the verdict that the scenario expects. A
     characteristic that is not applicable is skipped with its reason.
     """
-    return to_xml(facts.title(record), "ucp-run", record.started_at or "", record.wall_s, _cases(record, chains))
+    cases = _cases(record, chains, top_chain_hashes)
+    return to_xml(facts.title(record), "ucp-run", record.started_at or "", record.wall_s, cases)
 
 
-def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[JunitCase]:
+def _cases(
+    record: RunRecord, chains: Mapping[int, Sequence[str]], top_chain_hashes: Mapping[int, str]
+) -> Iterator[JunitCase]:
     judged, expect = verdicts(record), record.expect
     if record.outcome == "not supported":
         yield JunitCase("run", skipped=record.outcome_detail or record.outcome)
@@ -102,7 +105,7 @@ def _cases(record: RunRecord, chains: Mapping[int, Sequence[str]]) -> Iterator[J
         yield JunitCase("run", wrong)
     for verdict in judged:
         yield _characteristic(verdict, expect)
-    yield from (JunitCase(name, wrong) for name, wrong in record.unmet_expectations(chains))
+    yield from (JunitCase(name, wrong) for name, wrong in record.unmet_expectations(chains, top_chain_hashes))
 
 
 def _wrong_with_run(record: RunRecord) -> Iterator[str]:

@@ -220,16 +220,19 @@ class Expect(StrictModel):
         self,
         figures: Mapping[str, float | None],
         chains: Mapping[int, Sequence[str]],
+        top_chain_hashes: Mapping[int, str],
         found: Iterable[tuple[int, str | None]],
     ) -> Iterator[tuple[str, list[str]]]:
         """Yield each kind of expectation other than verdicts, with a sentence for each unmet expectation of this kind.
 
-        `chains` has the block hashes of each agent's chain. `found` has an agent and a handler for each deviation.
+        `chains` has the block hashes of each agent's chain, and `top_chain_hashes` its top. `found` has an agent and a
+        handler for each deviation.
         """
         if self.figures:
             yield "expected figures", list(self.out_of_range(figures))
-        if self.common:
-            yield "expected chains", list(self.unexpected_common_blocks(chains))
+        if self.chains or self.common:
+            tops = self.unexpected_chains(top_chain_hashes)
+            yield "expected chains", [*tops, *self.unexpected_common_blocks(chains)]
         if self.deviations:
             yield "expected deviations", list(self.unexpected_deviations(found))
 
@@ -242,9 +245,7 @@ class Expect(StrictModel):
                 yield f"{name.replace('_', ' ')} is {shown}, and should be {wanted.describe()}"
 
     def unexpected_chains(self, top_chain_hashes: Mapping[int, str]) -> Iterator[str]:
-        """Yield a sentence for each agent whose chain differs from the expected one. `top_chain_hashes` comes from the
-        exports.
-        """
+        """Yield a sentence for each agent whose chain differs from the expected one."""
         for agent_id, wanted in self.chains.items():
             ended = top_chain_hashes.get(agent_id)
             if ended is None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from harness.errors import HarnessError
 from harness.play.backends import BACKENDS
-from harness.run.parallel import FailedTask, outcome_of, raise_error
+from harness.run.parallel import FailedTask, outcome_of
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._cell_play import RunPlayer, directory_name
 from harness.sweep.matrix._matrix_file import MatrixTask
@@ -35,7 +35,9 @@ class AwayRun:
         if self.archive:
             with zipfile.ZipFile(io.BytesIO(self.archive)) as archive:
                 archive.extractall(directory)
-        return raise_error(self.outcome)
+        if isinstance(self.outcome, HarnessError):
+            raise self.outcome
+        return self.outcome
 
 
 @dataclass(frozen=True)

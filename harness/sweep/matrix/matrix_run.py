@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from harness.archive.directory import default_path
-from harness.errors import InterruptedRunError, ScenarioError
+from harness.errors import InterruptedRunError
 from harness.run.parallel import FailedTask, cores, sweep
 from harness.run.provenance import versions
 from harness.scenario import Scenario

@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 import pytest
 from rich.console import Console
 
+from harness import checker
 from harness.archive.archive import RunArchive
 from harness.archive.record_file import validate_leniently
 from harness.archive.run_record import RunRecord
@@ -25,7 +26,7 @@ Case = tuple[str, str, str] | None
 
 
 def suite_of(result: dict[str, Any]) -> ElementTree.Element:
-    (suite,) = ElementTree.fromstring(to_junit(validate_leniently(RunRecord, result)[0], {}))  # noqa: S314 - ours
+    (suite,) = ElementTree.fromstring(to_junit(validate_leniently(RunRecord, result)[0], {}, {}))  # noqa: S314 - ours
     return suite
 
 
@@ -121,15 +122,19 @@ def test_all_outputs_call_a_violation_expected(tmp_path: Path, capsys: pytest.Ca
 
 def test_page_and_terminal_report_unmet_expectations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = result_of([1, 2])
-    result["scenario"]["expect"] = {"figures": {"distinct_chains": 7}, "characteristics": {"6": "violated"}}
+    expect = {"figures": {"distinct_chains": 7}, "characteristics": {"6": "violated"}, "chains": {"2": "00" * 32}}
+    result["scenario"]["expect"] = expect
     run = write_run(tmp_path / "run", {1: "1.1", 2: "1.1"}, result)
     write_report(RunArchive(run))
     unmet = "distinct chains is 2, and should be 7"
     assert unmet in (run / "report.html").read_text()
     assert unmet in (run / "report.md").read_text()
-    show_result(Console(width=200), one_judgement("holds"), RunArchive(run).record)
+    show_result(Console(width=200), checker.check(RunArchive(run)), RunArchive(run).record)
     printed = capsys.readouterr()
     assert unmet in printed.err
+    other_chain = "but must end with 000000000000"
+    for text in ((run / "report.html").read_text(), (run / "junit.xml").read_text(), printed.err):
+        assert other_chain in text
     assert "holds, expected: violated" in printed.out
 
 
