@@ -1,14 +1,12 @@
-"""Play pack_field_test.yaml, damage its records as on real flights, and pack them into an archive.
+"""Play field_test_logs.yaml, damage its records as on real flights, and write them into a new directory.
 
-    python docs/generate/pack_field_test.py docs/field_test_2020.tar.xz
+    python docs/generate/field_test_logs.py logs
 
 The same scenario and seed give the same logs, to the last byte, for as long as runs in virtual time stay as they are.
 """
 
 import gzip
-import io
 import sys
-import tarfile
 import tempfile
 from pathlib import Path
 
@@ -44,16 +42,11 @@ def _flown(scenario: Scenario, directory: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in files}
 
 
-def packed(files: dict[str, bytes]) -> bytes:
-    """Return an archive of these files, in the directory `logs`."""
-    buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w:xz", format=tarfile.USTAR_FORMAT) as archive:
-        for name, content in sorted(files.items()):
-            member = tarfile.TarInfo(f"logs/{name}")
-            member.size = len(content)
-            archive.addfile(member, io.BytesIO(content))
-    return buffer.getvalue()
+def main(directory: Path) -> None:
+    for name, content in broken().items():
+        (directory / name).parent.mkdir(parents=True, exist_ok=True)
+        (directory / name).write_bytes(content)
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_bytes(packed(broken()))
+    main(Path(sys.argv[1]))
