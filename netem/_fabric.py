@@ -38,13 +38,13 @@ class VirtualSwitch:
         self.home = _namespaces.open_network()
         self.netlink = NetlinkSocket()
         self._namespaces = dict(networks)
-        _disable_ipv6()
+        disable_ipv6()
         _bypass_firewall()
         self.netlink.send([set_up("lo", _LO), bridge(BRIDGE, _BRIDGE_INDEX)])
         inside = {vehicle: self._namespace(vehicle) for vehicle in self.vehicles}
         self.netlink.send([self._cable(vehicle) for vehicle in self.vehicles])
         for vehicle, netlink in inside.items():
-            netlink.send(_configure(vehicle))
+            netlink.send(configure_vehicle(vehicle, _ETH0))
             netlink.close()
         self._wait_for_carrier()
 
@@ -70,7 +70,7 @@ class VirtualSwitch:
             _namespaces.unshare_network()
             self._namespaces[vehicle] = _namespaces.open_network()
         try:
-            _disable_ipv6()
+            disable_ipv6()
             return NetlinkSocket()
         finally:
             _namespaces.enter_network(self.home)
@@ -100,7 +100,7 @@ class VirtualSwitch:
                 return
 
 
-def _disable_ipv6() -> None:
+def disable_ipv6() -> None:
     """Disable IPv6 on new links. Otherwise the kernel would send IPv6 packets that no program requested."""
     _sysctl("ipv6/conf/default/disable_ipv6", b"1")
 
@@ -123,12 +123,13 @@ def _sysctl(name: str, value: bytes) -> None:
         os.close(fd)
 
 
-def _configure(vehicle: int) -> list[NetlinkRequest]:
+def configure_vehicle(vehicle: int, index: int) -> list[NetlinkRequest]:
+    """Return requests that give a vehicle its address. `index` is the number of its interface `eth0`."""
     where = f"vehicle {vehicle}"
     own = addresses.address(vehicle)
     return [
         set_up(f"{where}: lo", _LO),
-        set_up(f"{where}: eth0", _ETH0),
-        address(f"{where}: address {own}", _ETH0, own, addresses.PREFIX_LENGTH, addresses.BROADCAST),
-        default_route(f"{where}: default route", _ETH0),
+        set_up(f"{where}: eth0", index),
+        address(f"{where}: address {own}", index, own, addresses.PREFIX_LENGTH, addresses.BROADCAST),
+        default_route(f"{where}: default route", index),
     ]

@@ -25,7 +25,8 @@ _IFADDRMSG = struct.Struct("=4BI")  # family, prefix length, flags, scope, index
 _RTMSG = struct.Struct("=8BI")  # family, two prefix lengths, TOS, table, protocol, scope, type, flags
 
 _IFF_UP = 1
-_IFLA_ADDRESS, _IFLA_IFNAME, _IFLA_MASTER, _IFLA_PROTINFO, _IFLA_LINKINFO, _IFLA_NET_NS_FD = 1, 3, 10, 12, 18, 28
+_IFLA_ADDRESS, _IFLA_IFNAME, _IFLA_MTU, _IFLA_MASTER, _IFLA_PROTINFO, _IFLA_LINKINFO = 1, 3, 4, 10, 12, 18
+_IFLA_NET_NS_FD = 28
 _IFLA_INFO_KIND, _IFLA_INFO_DATA = 1, 2
 _IFLA_BR_FORWARD_DELAY, _IFLA_BR_STP_STATE, _IFLA_BR_MCAST_SNOOPING = 1, 5, 23
 _IFLA_BRPORT_STATE, _BR_STATE_FORWARDING = 1, 3
@@ -38,6 +39,13 @@ _RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST = 254, 4, 253, 1
 
 def set_up(what: str, index: int) -> NetlinkRequest:
     return NetlinkRequest(what, RTM_NEWLINK, _IFINFOMSG.pack(0, 0, index, _IFF_UP, _IFF_UP))
+
+
+def mtu(what: str, index: int, most_bytes: int) -> NetlinkRequest:
+    """Return a request that sets the largest packet of a link."""
+    return NetlinkRequest(
+        f"{what}: MTU", RTM_NEWLINK, _IFINFOMSG.pack(0, 0, index, 0, 0) + number(_IFLA_MTU, most_bytes)
+    )
 
 
 def bridge(name: str, index: int) -> NetlinkRequest:

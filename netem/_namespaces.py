@@ -19,6 +19,8 @@ from pathlib import Path
 
 CLONE_NEWNET = 0x40000000
 
+AS_ROOT = "as root"
+
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -92,7 +94,7 @@ def probe() -> tuple[bool, str]:
         except subprocess.TimeoutExpired:
             return False, "unshare did not come back within 10 s"
         if done.returncode == 0:
-            return True, "own user namespace, no root needed" if user_namespace else "as root"
+            return True, "own user namespace, no root needed" if user_namespace else AS_ROOT
         message = done.stderr.strip().splitlines()[-1] if done.stderr.strip() else f"status {done.returncode}"
     return False, message
 
