@@ -81,6 +81,9 @@ COMMANDS = {
     "shell": CommandEntry(
         "run", "harness.commands.tell:shell_command", "Open a shell in the network of a vehicle of an active run."
     ),
+    "join": CommandEntry(
+        "run", "harness.commands.join:join_command", "Let an agent on this computer take part in a run elsewhere."
+    ),
     "runs": CommandEntry(
         "look", "harness.commands.runs:runs_command", "List past runs with their verdicts, or open a report."
     ),

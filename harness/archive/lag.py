@@ -5,6 +5,7 @@ each agent's processes.
 """
 
 from bisect import bisect_left
+from collections import defaultdict
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -31,14 +32,18 @@ class LagLine(BaseModel):
     until_s: Annotated[float, Field(allow_inf_nan=False)]
     machine_s: _Seconds
     busy_s: dict[AgentKey, _Seconds]
+    computer_of: AgentKey | None = None
+    """The remote agent whose computer was measured. null for the machine of the harness."""
 
 
 class MeasuredLag:
     """The delays of the machine and the agents that were measured over the whole run."""
 
     def __init__(self, lines: list[LagLine]) -> None:
-        self._lines = sorted(lines, key=lambda line: line.until_s)
-        self._ends = [line.until_s for line in self._lines]
+        self._lines: dict[AgentKey | None, list[LagLine]] = defaultdict(list)
+        for line in sorted(lines, key=lambda line: line.until_s):
+            self._lines[line.computer_of].append(line)
+        self._ends = {computer: [line.until_s for line in lines] for computer, lines in self._lines.items()}
 
     def explains(self, agent_id: int, from_s: float, until_s: float) -> float | None:
         """Return the measured delay of a timer that expired at `from_s` and whose handler ran at `until_s`, in seconds
@@ -46,8 +51,10 @@ class MeasuredLag:
 
         Return None if the delays of the agent were not measured all the time.
         """
-        lines = self._lines[bisect_left(self._ends, from_s) : bisect_left(self._ends, until_s) + 1]
         agent = str(agent_id)
+        computer = agent if agent in self._ends else None
+        ends = self._ends.get(computer, [])
+        lines = self._lines[computer][bisect_left(ends, from_s) : bisect_left(ends, until_s) + 1]
         if not lines or lines[0].from_s > from_s or lines[-1].until_s < until_s:
             return None
         if any(agent not in line.busy_s for line in lines):

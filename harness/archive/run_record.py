@@ -27,6 +27,9 @@ messages after 2 to 50 ms.
 """
 
 
+UNKNOWN_DRIFT = 1e-4
+"""Relative error of a clock whose rate could not be measured. Quartz clocks are better than this."""
+
 AgentKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,4}$")]
 """The ID of an agent, or of its vehicle, as a JSON key."""
 
@@ -347,6 +350,55 @@ class DatagramsRead(_RecordModel):
     others: int = 0
 
 
+class CutOff(_RecordModel):
+    """The mission seconds in which a remote agent was cut off. `until_s` is null if it did not return."""
+
+    from_s: float
+    until_s: float | None = None
+
+
+class RemoteRecord(_RecordModel):
+    """An agent on another computer, with the measured clock of that computer and the delay of the connection. Times
+    are in seconds of wall time, except those in `cut_off`. null means unknown. The measurements are of the agent's last
+    incarnation.
+    """
+
+    host: str
+    """Address from which it joined last."""
+    command: list[str] = []
+    """Command of the agent on that computer."""
+    joins: int = 0
+    """Number of connections. Each incarnation of the agent has its own."""
+    epoch_us: int | None = None
+    """Mission second 0 in the time of that computer's clock."""
+    offset_s: float | None = None
+    """Time by which that clock was ahead."""
+    uncertainty_s: float | None = None
+    """Maximum error of `offset_s`: half of the shortest round trip."""
+    drift: float | None = None
+    """Relative error of the rate of that clock."""
+    delay_s: float | None = None
+    """Delay of the connection in one direction: the median half of a round trip."""
+    delay_p95_s: float | None = None
+    """One in twenty delays was longer."""
+    delay_most_s: float | None = None
+    """Longest delay in all incarnations."""
+    pings: int = 0
+    """Number of measured round trips."""
+    cut_off: list[CutOff] = []
+    lost: int = 0
+    """Number of datagrams of the agent that did not reach the lab, because the vehicle was cut off."""
+
+    def clock_error_s(self, lasted_s: float) -> float:
+        """Return the maximum difference between the mission times of the agent and of the harness, in seconds of wall
+        time, in a run that lasted `lasted_s` seconds.
+
+        A fault reaches the agent late by the delay of the connection, which therefore counts, too.
+        """
+        drift = UNKNOWN_DRIFT if self.drift is None else abs(self.drift)
+        return (self.uncertainty_s or 0.0) + drift * lasted_s + (self.delay_most_s or 0.0)
+
+
 class BlockHolders(_RecordModel):
     """The vehicles that held a block directly after a loss of vehicles (`holders`), and those that held it at the end
     of the run. Agent `agent_id` completed the block.
@@ -467,6 +519,8 @@ class JudgedRecord(_RecordModel):
     """Datagrams that each agent read. An agent is missing if another program on its vehicle uses UDP."""
     channel: ChannelRecord | None = None
     """The frames on the shared channel. null without a shared channel."""
+    remote: dict[AgentKey, RemoteRecord] = {}
+    """Agents on other computers."""
 
     @property
     def switched_off(self) -> dict[int, float]:

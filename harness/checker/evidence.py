@@ -21,7 +21,7 @@ from harness.archive.connectivity import Link
 from harness.archive.exports import Export, name_blocks
 from harness.archive.lag import MeasuredLag
 from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_files, read_captures
-from harness.archive.run_record import AgentRecord, Counters, JudgedRecord
+from harness.archive.run_record import AgentRecord, Counters, JudgedRecord, RemoteRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, UnknownNames, first_unknown, unknown_names
 from harness.checker._sent_times import sent_at, spread_of
@@ -346,6 +346,19 @@ class Evidence:
     def end_of(self, agent_id: int) -> float | None:
         """Return the mission second at which the agent ended. Return None if no record contains this time."""
         return self.record.end_of(agent_id) if self.record else None
+
+    def remote(self, agent_id: int) -> RemoteRecord | None:
+        """Return the record of an agent on another computer. Return None for any other agent."""
+        return self.record.remote.get(str(agent_id)) if self.record else None
+
+    def clock_error_s(self, agent_id: int) -> float:
+        """Return the maximum error of the agent's clock, in seconds of wall time, relative to that of the harness."""
+        remote = self.remote(agent_id)
+        speedup = self.traces[agent_id].header.clock.get("speedup")
+        if remote is None or not isinstance(speedup, int | float) or speedup <= 0:
+            return 0.0
+        lasted_s = (self.ended_at_s or 0.0) / speedup
+        return remote.clock_error_s(lasted_s)
 
     @property
     def busy(self) -> list[int]:

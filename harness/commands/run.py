@@ -22,8 +22,9 @@ from harness.play import progress
 from harness.play.backends import BACKENDS
 from harness.play.interventions import Interventions
 from harness.play.machine.uml_kernel import OUT, UmlKernel, run_inside
+from harness.play.remote.join import join_commands
 from harness.play.trace_space import space_sentence
-from harness.report.facts import gaps
+from harness.report.facts import cut_off, gaps
 from harness.report.live.server_process import live_page
 from harness.run.run import Run, run
 from harness.scenario import Scenario
@@ -67,6 +68,10 @@ def run_command(
             metavar="HOST:PORT", rich_help_panel=RARE, help="UDP address of a ground station for all vehicles."
         ),
     ] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS:PORT", rich_help_panel=RARE, help="Wait there for agents on other computers."),
+    ] = None,
     capture: Annotated[
         bool, typer.Option("--capture", help="Record each vehicle's frames in capture/ID.pcapng.")
     ] = False,
@@ -108,7 +113,8 @@ def run_command(
     """
     console = output()
     loaded, recorded_seed = load_recorded_scenario(scenario)
-    request = _with_options(loaded, speedup, vehicles, gcs, capture, image_from_host, programs_of(agents or ()))
+    programs = programs_of(agents or ())
+    request = _with_options(loaded, speedup, vehicles, gcs, listen, capture, image_from_host, programs)
     if secured:
         request = request.secured()
     directory = (out or default_path(request.name)).absolute()
@@ -135,6 +141,11 @@ def run_command(
                 "--gcs does not work with --kernel uml, because datagrams do not reach a ground "
                 "station outside User Mode Linux: leave out one of them"
             )
+        if request.remote is not None:
+            raise ScenarioError(
+                "`remote` does not work with --kernel uml, because other computers do not reach a run "
+                "inside User Mode Linux: leave out one of them"
+            )
         options = {"--seed": chosen_seed, "--speedup": speedup, "--vehicles": vehicles}
         given = [f"{option}={value}" for option, value in options.items() if value is not None]
         given += [f"{OUT}{directory.resolve()}"]
@@ -146,6 +157,8 @@ def run_command(
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
     if wrong := ", ".join(quirks_in_words(request.quirks)):
         console.print(f"deliberate mistakes: {wrong}", style="dim", highlight=False)
+    for command in join_commands(request):
+        console.print(f"on its computer: {command}", highlight=False, soft_wrap=True)
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")
     virtual = BACKENDS[backend].virtual_time
@@ -214,6 +227,7 @@ def _with_options(
     speedup: float | None,
     vehicles: VehicleKind | None,
     gcs: str | None,
+    listen: str | None,
     capture: bool,
     image_from_host: bool,
     programs: Programs,
@@ -228,6 +242,10 @@ def _with_options(
         document["vehicles"]["kind"] = vehicles.value
     if gcs is not None:
         document["gcs"] = gcs
+    if listen is not None:
+        if document["remote"] is None:
+            raise ScenarioError("--listen is for agents on other computers: name them in the scenario, in `remote`")
+        document["remote"]["listen"] = listen
     document["capture"] |= capture
     if image_from_host:
         document["docker"]["image_from_host"] = True
@@ -256,6 +274,8 @@ def _show_end(console: Console, finished: Run) -> None:
     captured = finished.played.capture or {}
     if lacks := gaps({vehicle: CapturedFrames.model_validate(frames) for vehicle, frames in captured.items()}):
         complain(f"{lacks}: choose a smaller --speedup")
+    for sentence in cut_off(finished.record):
+        complain(sentence)
     station = finished.record.ground_station
     if station is not None and station.dropped:
         complain(

@@ -7,6 +7,7 @@ have no effect.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import product
 
 from harness.scenario import Scenario
 from harness.scenario.changes import RANGE, NetworkChange
@@ -29,6 +30,7 @@ class RadioRange:
         self._radio: radio.Radio | None = model.radio() if model else None
         self._requested = NetworkConditions()
         self._losses: dict[frozenset[int], float] = {}
+        self._cut_off: frozenset[int] = frozenset()
 
     def change_timeline(self, change: NetworkChange) -> NetworkChange:
         """Return the network change of a timeline entry, combined with the radio losses at the vehicles' current
@@ -46,16 +48,28 @@ class RadioRange:
         if self._radio is None:
             return None
         losses = radio.links(self._radio, places)
-        if losses == self._losses:
-            return None
+        before = self._losses
         changed = self._set_losses(losses)
+        if self._losses == before:
+            return None
         conditions = self._conditions()
         return NetworkChange(
             at_s, RANGE, groups_text(radio.components(conditions, self._roster)), conditions, losses=changed
         )
 
+    def cut_off(self, at_s: float, vehicles: frozenset[int]) -> NetworkChange:
+        """Cut these vehicles off, and connect those that were cut off before. Return the network change."""
+        radio_losses = {pair: loss for pair, loss in self._losses.items() if not pair & self._cut_off}
+        self._cut_off = vehicles
+        changed = self._set_losses(radio_losses)
+        conditions = self._conditions()
+        groups = groups_text(radio.components(conditions, self._roster))
+        return NetworkChange(at_s, RANGE, groups, conditions, losses=changed)
+
     def _set_losses(self, losses: dict[frozenset[int], float]) -> dict[str, float]:
         """Set the radio losses. Return the losses that changed, with keys such as "1-3" for a pair of vehicles."""
+        cut = (frozenset(pair) for vehicle in self._cut_off for pair in product((vehicle,), self._roster))
+        losses = losses | {pair: 1.0 for pair in cut if len(pair) == 2}
         changed = {pair for pair in losses.keys() | self._losses.keys() if losses.get(pair) != self._losses.get(pair)}
         self._losses = losses
         return {"-".join(map(str, sorted(pair))): losses.get(pair, 0.0) for pair in sorted(changed, key=sorted)}

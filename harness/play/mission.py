@@ -9,7 +9,7 @@ from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from harness.archive.run_record import Cycle, FinalReconcile
+from harness.archive.run_record import Cycle, FinalReconcile, RemoteRecord
 from harness.errors import HarnessError, UnsupportedError
 from harness.scenario import Scenario
 from harness.scenario.changes import RANGE, Change, final_reconcile, timeline_of
@@ -44,6 +44,7 @@ class RunOutcome:
     agents: dict[str, Any] = field(default_factory=dict)
     vehicles: dict[str, Any] = field(default_factory=dict)
     ground_station: dict[str, Any] | None = None
+    remote: dict[str, RemoteRecord] = field(default_factory=dict)
     unmatched_fates: list[str] = field(default_factory=list)
 
     def end_early(self, outcome: Outcome, error: HarnessError) -> None:

@@ -16,6 +16,7 @@ from harness.present.colours import AgentColours
 from harness.report import (
     _map_section,
     _network_section,
+    _remote_section,
     _rogue_section,
     _survival_section,
     _swarm_section,
@@ -70,6 +71,7 @@ def draw(left: ReportSource) -> str:
         timeline=timeline_section,
         strip=_network_section.strip(left.network, record.faults, timeline.end_s(left), record.channel),
         channel=_network_section.channel(record),
+        remote=_remote_section.sentences(record),
         network=_network_section.initial_state(record.network),
         happened=_network_section.event_rows(record),
         ground_station=_network_section.ground_station(record),

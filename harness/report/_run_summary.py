@@ -8,7 +8,7 @@ from harness.present import text
 from harness.present import text as words
 from harness.present.junit import JunitCase, to_xml
 from harness.present.text import escaped, row
-from harness.report import _network_section, _rogue_section, _survival_section, facts
+from harness.report import _network_section, _remote_section, _rogue_section, _survival_section, facts
 from harness.report._report_source import ReportSource
 from harness.report.verdict_section import VerdictEntry, headline, verdicts
 from harness.scenario.expect import AS_EXPECTED, Expect
@@ -35,6 +35,7 @@ def to_markdown(left: ReportSource) -> str:
         lines += _listed(survived.sentences)
     lines += _happened(_network_section.event_rows(record))
     lines += _listed(_network_section.channel(record))
+    lines += _listed(_remote_section.sentences(record))
     lines += _listed([station] if (station := _network_section.ground_station(record)) else [])
     lines += _listed(_rogue_section.sentences(record.rogue))
     if record.scenario is not None:

@@ -89,6 +89,17 @@ def figures(record: RunRecord) -> list[tuple[str, str]]:
     return [(FIGURES.get(key, text.label(key)), text.value(figure)) for key, figure in record.figures.items()]
 
 
+def cut_off(record: RunRecord) -> list[str]:
+    """Return a sentence for each time in which a remote agent was cut off, because its connection was lost."""
+    return [
+        f"agent {agent_id} was cut off from {cut.from_s:.0f} s "
+        f"{'until the end' if cut.until_s is None else f'to {cut.until_s:.0f} s'}, because the connection to its "
+        f"computer {found.host} was lost"
+        for agent_id, found in record.remote.items()
+        for cut in found.cut_off
+    ]
+
+
 def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
     """Return a sentence about frames that packet captures lack. Return None if no frames are missing."""
     lacking = sorted(int(vehicle) for vehicle, frames in captured.items() if frames.dropped)

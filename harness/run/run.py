@@ -193,6 +193,7 @@ class RunRecording:
             channel=played.channel,
             capture=played.capture,
             ground_station=played.ground_station,
+            remote=played.remote,
             keys_fingerprint=self.directory.keys_fingerprint,
         )
 

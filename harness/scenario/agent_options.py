@@ -13,9 +13,11 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, WithJsonSchema, model_validator
+from pydantic import BeforeValidator, Field, WithJsonSchema, field_validator, model_validator
 
 from harness.scenario.strict_model import Data, MissionSecond, Seconds, StrictModel, VehicleId, VehicleKey
+from sitl.address import ListenAddress
+from sitl.vehicle import VehicleError
 from ucp.block import MAX_AGENT_ID
 from ucp.events import MAX_MEAN_S, LoggableEvent
 from ucp.quirks import QUIRKS, Quirks, check_quirk
@@ -24,6 +26,7 @@ from ucp.short_value import shown
 from ucp.telemetry import DEFAULT_LOG, EVENT_KINDS, EventKind
 
 MAX_WORDS = 100
+MAX_REMOTE = 100
 
 Command = Annotated[list[str], Field(min_length=1, max_length=MAX_WORDS)]
 """A program that follows ucp/contract/CONTRACT.md, and its arguments. The harness appends the path of the mission
@@ -233,6 +236,32 @@ class EventOptions(StrictModel):
         if self.script and self.source != "scripted":
             raise ValueError(f"`script` needs `source: scripted`, not {self.source}")
         return self
+
+
+class RemoteOptions(StrictModel):
+    """Agents that run on other computers, and join a run with processes from there."""
+
+    agents: Annotated[list[VehicleId], Field(min_length=1, max_length=MAX_REMOTE)]
+    """IDs of the agents that run on other computers."""
+    secret_file: Annotated[str, Field(min_length=1, max_length=4000)]
+    """File with the secret that the other computers also have. `ucp-harness join --new-secret FILE` makes one."""
+    listen: Annotated[str, Field(max_length=300)] | None = None
+    """ADDRESS:PORT at which the harness waits for them. Default: the run needs the option `--listen`."""
+
+    @field_validator("listen")
+    @classmethod
+    def _is_an_address(cls, listen: str | None) -> str | None:
+        try:
+            return listen and str(ListenAddress.parse(listen))
+        except VehicleError:
+            raise ValueError(f"must be ADDRESS:PORT, for example 192.168.7.1:14700, not {shown(listen)}") from None
+
+    @field_validator("agents")
+    @classmethod
+    def _names_each_agent_once(cls, agents: list[int]) -> list[int]:
+        if len(set(agents)) < len(agents):
+            raise ValueError("names an agent twice")
+        return agents
 
 
 MIN_MEMORY_MIB = 6

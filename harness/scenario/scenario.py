@@ -15,6 +15,7 @@ from harness.scenario.agent_options import (
     EventOptions,
     QuirkOfAgents,
     QuirkValues,
+    RemoteOptions,
     SecurityOptions,
     Stagger,
     check_quirks,
@@ -102,6 +103,8 @@ class Scenario(StrictModel):
     """A program that follows ucp/contract/CONTRACT.md, with its arguments. A list is the command of all agents. A
     mapping has a command for each listed agent ID. All other agents are the harness's own.
     """
+    remote: RemoteOptions | None = None
+    """Agents that run on other computers. Only the backend `process` plays them."""
     docker: DockerOptions = DockerOptions()
     """Image and resource limits of containers. Only the backend `docker` uses them."""
     settings: Settings = Settings()
@@ -278,6 +281,8 @@ class Scenario(StrictModel):
         yield from (("lateness", vehicle) for vehicle in self.lateness)
         if isinstance(self.agent_command, dict):
             yield from (("agent_command", agent) for agent in self.agent_command)
+        if self.remote is not None:
+            yield from (("remote.agents", agent) for agent in self.remote.agents)
         for index, datagram in enumerate(self.datagrams):
             yield from ((f"datagrams.{index}.reaches", vehicle) for vehicle in datagram.reaches)
         for name, asked in self.quirks.items():
@@ -377,6 +382,27 @@ class Scenario(StrictModel):
                 schedule.steps(self.roster, self.duration_s)
             except (ConditionsError, ValueError) as error:
                 raise ValueError(f"{where}: {error}") from None
+        return self
+
+    @model_validator(mode="after")
+    def _remote_agents_can_be_played(self) -> "Scenario":
+        if self.remote is None:
+            return self
+        for agent in self.remote.agents:
+            if self.command_of(agent) is not None:
+                raise ValueError(
+                    f"agent {agent} is in `remote.agents`, so its command is that of its own computer: leave it out of "
+                    "`agent_command`"
+                )
+        if self.security is not None:
+            raise ValueError(
+                "`remote` and `security` do not work together, because the connection to another computer would reveal "
+                "the keys: leave out one of them"
+            )
+        if self.vehicles.kind != "none" and self.events.source == "mavlink":
+            raise ValueError(
+                "an agent in `remote.agents` cannot read the telemetry of its vehicle: add `events: {source: random}`"
+            )
         return self
 
     @model_validator(mode="after")

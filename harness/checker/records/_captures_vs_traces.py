@@ -107,7 +107,7 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
         counted = record.counters.receivers.get(str(agent_id)) if record.counters else None
         if counted is None or counted.passed is None or counted.lost is None or counted.cut is None:
             continue
-        by = record.mission_s - slack_s(trace)
+        by = record.mission_s - slack_s(evidence, trace)
         heard = sum(isinstance(run.trigger, MessageTrigger) for run in trace.runs if run.t < by)
         if heard > counted.passed:
             detail = f"it handled {heard} messages, but the kernel counted {counted.passed} messages to its vehicle"
@@ -123,7 +123,7 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
 def _sent_by(evidence: Evidence, agent_id: int, mission_s: float) -> int:
     """Return the minimum number of messages that the agent had sent when the kernel's counters were read."""
     trace = evidence.traces[agent_id]
-    by = mission_s - slack_s(trace)
+    by = mission_s - slack_s(evidence, trace)
     spread_s = spread_of(trace)
     sent = (sent_at(run, message, spread_s) for run in trace.runs for message in run.sent)
     return sum(sent_s < by for sent_s in sent) - _not_sent(evidence, agent_id)

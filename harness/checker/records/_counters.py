@@ -27,7 +27,7 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
             continue
         incarnations = evidence.incarnations[agent_id]
         yield from _incarnations(agent_id, recorded, incarnations)
-        yield from _handler_runs(agent_id, recorded, trace, incarnations)
+        yield from _handler_runs(evidence, agent_id, recorded, trace, incarnations)
         yield from _counted(evidence, agent_id, recorded, trace, incarnations)
         export = evidence.exports.get(agent_id)
         if (
@@ -66,7 +66,7 @@ def _incarnations(
 
 
 def _handler_runs(
-    agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[ReplayedIncarnation]
+    evidence: Evidence, agent_id: int, recorded: AgentRecord, trace: Trace, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
     """Yield a contradiction if the number of lines in the trace differs from the number of handler runs that the agent
     counted.
@@ -82,7 +82,7 @@ def _handler_runs(
     for incarnation, counted in zip(incarnations, recorded.handler_runs, strict=True):
         if counted is None:
             continue
-        at_least, at_most = _lines_by(incarnation, counted)
+        at_least, at_most = _lines_by(evidence, incarnation, counted)
         if not at_least <= counted.counted <= at_most:
             lines = at_most if counted.counted > at_most else at_least
             detail = (
@@ -92,11 +92,11 @@ def _handler_runs(
             yield of_agent(agent_id, detail, "1", short=counted.counted > at_most)
 
 
-def _lines_by(incarnation: ReplayedIncarnation, counted: HandlerRuns) -> tuple[int, int]:
+def _lines_by(evidence: Evidence, incarnation: ReplayedIncarnation, counted: HandlerRuns) -> tuple[int, int]:
     """Return the minimum and maximum number of trace lines that existed when the agent reported its counters."""
     if in_virtual_time(incarnation.trace):
         return len(incarnation.runs), len(incarnation.runs)
-    slack = ROUNDED_S + (slack_s(incarnation.trace) if counted.from_s < counted.until_s else 0.0)
+    slack = ROUNDED_S + (slack_s(evidence, incarnation.trace) if counted.from_s < counted.until_s else 0.0)
     return (
         bisect_left(incarnation.runs, counted.from_s - slack, key=lambda run: run.t),
         bisect_right(incarnation.runs, counted.until_s + slack, key=lambda run: run.t),
@@ -137,7 +137,7 @@ def _counted(
             yield of_agent(agent_id, detail)
     if recorded.chain_changed_at_s is not None and not any(incarnation.unknown for incarnation in incarnations):
         changed_at_s = _chain_changed_at(incarnations[-1])
-        if abs(recorded.chain_changed_at_s - changed_at_s) > ROUNDED_S + slack_s(trace):
+        if abs(recorded.chain_changed_at_s - changed_at_s) > ROUNDED_S + slack_s(evidence, trace):
             detail = (
                 f"its chain changed last at {recorded.chain_changed_at_s:g} s according to run.json, but at "
                 f"{changed_at_s:g} s according to its trace"

@@ -171,7 +171,7 @@ def finding(evidence: Evidence, agent_id: int, observation: TraceObservation) ->
 def _between_incarnations(
     evidence: Evidence, agent_id: int, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
-    slack = slack_s(evidence.traces[agent_id])
+    slack = slack_s(evidence, evidence.traces[agent_id])
     now = 0.0
     for incarnation in incarnations:
         if incarnation.runs and incarnation.runs[0].t < now - slack:

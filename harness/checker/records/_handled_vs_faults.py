@@ -42,7 +42,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         return
     cuts = _cuts(evidence)
     for agent_id, trace in evidence.traces.items():
-        stops = stopped(evidence, agent_id, _clock_slack_s(trace))
+        stops = stopped(evidence, agent_id, _clock_slack_s(evidence, trace))
         if cuts is None and not stops:
             continue
         for incarnation in evidence.incarnations[agent_id]:
@@ -52,11 +52,14 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                         yield Contradiction(finding(evidence, agent_id, TraceObservation(line, run, what)), "1")
 
 
-def _clock_slack_s(trace: Trace) -> float:
+def _clock_slack_s(evidence: Evidence, trace: Trace) -> float:
     speedup = trace.header.clock.get("speedup")
+    remote = evidence.remote(trace.header.agent_id)
+    if remote is not None and remote.cut_off:
+        return inf  # a fault may have reached it when its connection was back
     if in_virtual_time(trace) or not isinstance(speedup, int | float):
         return SAME_TIME_S
-    return SAME_TIME_S + CLOCK_SLACK_WALL_S * speedup
+    return SAME_TIME_S + (CLOCK_SLACK_WALL_S + evidence.clock_error_s(trace.header.agent_id)) * speedup
 
 
 def stopped(evidence: Evidence, agent_id: int, slack_s: float) -> list[Stop]:
@@ -136,7 +139,7 @@ def _cuts(evidence: Evidence) -> _CutIntervals | None:
         return None
     if not any(loss == 1.0 for _, losses in evidence.link_losses for loss in losses.values()):
         return None
-    slack = max(map(slack_s, evidence.traces.values()), default=ROUNDED_S)
+    slack = max((slack_s(evidence, trace) for trace in evidence.traces.values()), default=ROUNDED_S)
     return _CutIntervals(evidence.link_losses, max(slack, SAME_TIME_S))
 
 

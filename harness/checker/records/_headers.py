@@ -2,7 +2,7 @@
 the handler's name.
 
 With the key `stagger`, a scenario gives each agent a different addition to its timers. The comparison therefore
-subtracts this addition.
+subtracts this addition. The clock of another computer shows another time at mission second 0, which run.json contains.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,13 @@ def compare_headers(evidence: Evidence) -> Iterator[Contradiction]:
         header = trace.header
         expected: dict[str, object] = {"roster": sorted(header.roster)}
         expected |= {f"settings.{name}": value for name, value in _in_common(evidence, agent_id).items()}
-        expected |= {name: header.clock.get(name) for name in ("epoch_us", "speedup")}
+        expected["speedup"] = header.clock.get("speedup")
+        remote = evidence.remote(agent_id)
+        if remote is None or remote.epoch_us is None:
+            expected["epoch_us"] = header.clock.get("epoch_us")
+        elif remote.epoch_us != header.clock.get("epoch_us"):
+            detail = f"its trace has {_short(header.clock.get('epoch_us'))} as {WORDS['epoch_us']}, but run.json has "
+            yield of_agent(agent_id, f"{detail}{remote.epoch_us} for the clock of its computer")
         if header.initial_data is not None:
             expected["initial_data"] = header.initial_data
         for name, value in expected.items():

@@ -22,7 +22,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield each handled message that differs from the sent message, that was handled before it was sent, or that was
     handled twice.
     """
-    slack = max(map(slack_s, evidence.traces.values()), default=0.0)
+    slack = max((slack_s(evidence, trace) for trace in evidence.traces.values()), default=0.0)
     sendings = evidence.sendings
     once = not _may_duplicate(evidence)
     for agent_id, incarnations in evidence.incarnations.items():

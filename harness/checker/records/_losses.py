@@ -151,7 +151,7 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
 
     If `over_cuts` is given, it contains the minimum and maximum loss probability for messages over cut links.
     """
-    slack = max([SAME_TIME_S, *map(slack_s, evidence.traces.values())])
+    slack = max([SAME_TIME_S, *(slack_s(evidence, trace) for trace in evidence.traces.values())])
     history = _LossHistory(evidence.link_losses, slack)
     known = {link for _, losses in evidence.link_losses for link in losses}
     expected: dict[int, _ExpectedDeliveries] = {}

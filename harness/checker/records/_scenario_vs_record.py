@@ -57,7 +57,7 @@ def _compare_changes(
 ) -> Iterator[Contradiction]:
     """Yield each planned change that the record lacks at its time, and each recorded change that was not planned."""
     first = min(record.roster, default=0)
-    latest = max(map(slack_s, evidence.traces.values()), default=ROUNDED_S)
+    latest = max((slack_s(evidence, trace) for trace in evidence.traces.values()), default=ROUNDED_S)
     late_s = 0.0 if any(map(in_virtual_time, evidence.traces.values())) else LATE_WALL_S * scenario.speedup
     planned = timeline_of(scenario)
     recorded: dict[Made, list[NetworkState | FaultRecord]] = {}

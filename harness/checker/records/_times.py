@@ -31,7 +31,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     for agent_id, trace in evidence.traces.items():
         end_s = evidence.end_of(agent_id)
         if end_s is not None:
-            earliest_s, latest_s = _around_the_end(trace, end_s)
+            earliest_s, latest_s = _around_the_end(evidence, trace, end_s)
             yield from _compare_runs(evidence, agent_id, latest_s)
             export = evidence.exports.get(agent_id)
             if export is not None:
@@ -40,14 +40,14 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
             yield from _compare_events(evidence, agent_id, trace)
 
 
-def _around_the_end(trace: Trace, end_s: float) -> tuple[float, float]:
+def _around_the_end(evidence: Evidence, trace: Trace, end_s: float) -> tuple[float, float]:
     """Return the earliest possible time of the export, and the latest possible time of the export and of
     handler runs.
     """
     speedup = trace.header.clock.get("speedup")
     if in_virtual_time(trace) or not isinstance(speedup, int | float):
         return end_s - SAME_TIME_S, end_s + SAME_TIME_S
-    return end_s - ROUNDED_END_S - slack_s(trace), end_s + END_WALL_S * speedup
+    return end_s - ROUNDED_END_S - slack_s(evidence, trace), end_s + END_WALL_S * speedup
 
 
 def _compare_runs(evidence: Evidence, agent_id: int, latest_s: float) -> Iterator[Contradiction]:
@@ -76,7 +76,7 @@ def _has_recorded_events(evidence: Evidence) -> bool:
 
 
 def _compare_events(evidence: Evidence, agent_id: int, trace: Trace) -> Iterator[Contradiction]:
-    slack = max(slack_s(trace), SAME_TIME_S)
+    slack = max(slack_s(evidence, trace), SAME_TIME_S)
     for incarnation in evidence.incarnations[agent_id]:
         for line, run in incarnation.numbered_runs():
             if not isinstance(run.trigger, EventTrigger):

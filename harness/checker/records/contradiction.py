@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from harness.archive.traces import Trace, TraceHeader
 from harness.checker._waiting import SLACK_WALL_S
+from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from ucp.clock import MICROSECONDS
 
@@ -35,14 +36,14 @@ def in_virtual_time(trace: Trace) -> bool:
     return trace.header.clock.get("epoch_us") == 0
 
 
-def slack_s(trace: Trace) -> float:
+def slack_s(evidence: Evidence, trace: Trace) -> float:
     """Return the tolerance, in mission seconds, for differences between clocks. A simulated run has one clock and needs
-    none.
+    none. The clock of another computer has its measured error in addition.
     """
     speedup = trace.header.clock.get("speedup")
     if in_virtual_time(trace) or not isinstance(speedup, int | float):
         return ROUNDED_S
-    return SLACK_WALL_S * speedup
+    return (SLACK_WALL_S + evidence.clock_error_s(trace.header.agent_id)) * speedup
 
 
 def mission_s(timestamp_us: int, header: TraceHeader) -> float | None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from harness.archive.directory import RunDirectory
 from harness.backend_names import BackendName
+from harness.errors import ScenarioError
 from harness.play.process._process_backend import ProcessBackend
 from harness.scenario import Scenario
 
@@ -28,6 +29,8 @@ class DockerBackend(ProcessBackend):
         from harness.play.containers._container_preflight import check_debuggers, check_docker, refuse_variants
         from harness.play.process.process_preflight import refuse_unplayable
 
+        if scenario.remote is not None:
+            raise ScenarioError("`remote` does not work with containers: use --backend process, or leave it out")
         refuse_variants()
         check_debuggers(scenario)
         refuse_unplayable(scenario)

@@ -35,7 +35,7 @@ from harness.play.agent_control import (
     last_line,
     resolve_command,
 )
-from harness.play.process._run_lab import MissionLab
+from harness.play.process._run_lab import LabProgram, MissionLab
 from harness.play.process.agent_mission import mission_file
 from harness.play.process.controlled_program import ControlledProgram, ProgramEndedError
 from harness.play.trace_space import trace_quota
@@ -95,13 +95,23 @@ class _ProcessIncarnation:
 class AgentProcess:
     """The process of one agent. The object also keeps the files and results of its earlier processes."""
 
-    def __init__(self, agent_id: int, rundir: RunDirectory, command: Sequence[str], now: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        agent_id: int,
+        rundir: RunDirectory,
+        command: Sequence[str],
+        now: Callable[[], float],
+        *,
+        controlled: Callable[[LabProgram], LabProgram] = lambda program: program,
+    ) -> None:
         """Create the object without starting the process. `command` starts the agent with its mission file as last
-        argument. `now` returns mission seconds.
+        argument. `now` returns mission seconds. `controlled` returns the program to control in place of the started
+        one, for a remote agent.
         """
         self.agent_id = agent_id
         self._command = command
         self._now = now
+        self._controlled = controlled
         self.outcome = "not started"
         """The state of the agent as one or two words. `run.json` records it after the run, together with `detail`."""
         self.detail: str | None = None
@@ -169,7 +179,7 @@ class AgentProcess:
         path = self._rundir.write_mission(incarnation.directory, self.agent_id, mission)
         try:
             self._program = await ControlledProgram.start(
-                partial(lab.spawn, self.agent_id, role="agent"),
+                partial(self._spawn, lab),
                 [*self._command, path.name],
                 directory=incarnation.directory,
                 control=self._control_path,
@@ -188,6 +198,9 @@ class AgentProcess:
         except AgentSilentError as error:
             raise self._failure("hung", str(error)) from None
         self.outcome = "running"
+
+    async def _spawn(self, lab: MissionLab, argv: Sequence[str], /, **options: Any) -> LabProgram:
+        return self._controlled(await lab.spawn(self.agent_id, argv, role="agent", **options))
 
     def _begin_incarnation(self) -> _ProcessIncarnation:
         directory = self._rundir.agent(self.agent_id, len(self._incarnations) + 1)

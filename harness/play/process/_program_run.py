@@ -12,6 +12,7 @@ import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any, Self
 
 from harness.archive.directory import RunDirectory
@@ -31,6 +32,7 @@ from harness.play.process._run_lab import MissionLab, OpenLab
 from harness.play.process._watchers import MissionTasks, open_unless_interrupted
 from harness.play.process.process_preflight import add_rogue_listener
 from harness.play.progress import ProgressDisplay, SwarmSnapshot
+from harness.play.remote._remote_agents import RemoteAgents
 from harness.scenario import Scenario
 from harness.scenario.changes import Change, NetworkChange, TimedInjection, describe, silent_injections
 from harness.scenario.fates import Fate
@@ -96,8 +98,12 @@ class ProgramRun:
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
+        self._remote = RemoteAgents(scenario, rundir, self.clock.now)
         self.agents = [
-            AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now) for agent_id in scenario.roster
+            AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now)
+            if agent_id not in self._remote
+            else self._remote_agent(agent_id)
+            for agent_id in scenario.roster
         ]
         self._keys: KeyDirectories
         self._capture: LiveCapture | None = None
@@ -125,8 +131,10 @@ class ProgramRun:
             if (keys := self._keys.keys) is not None:
                 self.rundir.write_public_keys(keys.public)
                 self.initial_data = keys.add_depot_key(self.initial_data)
-            async with self._in_lab():
-                yield self
+            async with self._remote.opened():
+                await open_unless_interrupted(self._remote.wait(self._show), self.interrupted)
+                async with self._in_lab():
+                    yield self
 
     @asynccontextmanager
     async def _in_lab(self) -> AsyncIterator[None]:
@@ -175,6 +183,7 @@ class ProgramRun:
             await self._channel.start(self._lab.network)
             self._watchers.start(self._channel.watch())
         await self.apply(first)
+        self._remote.when_cut_off = lambda: self._watchers.start(self._cut_off())
         if self.scenario.capture:
             self._capture = await LiveCapture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
             self._watchers.start(self._capture.watch())
@@ -230,7 +239,8 @@ class ProgramRun:
             await self._rogue.begin(epoch_us, bundle)
         self.clock.start(epoch_us)
         self._udp_before_start = await self._lab.network.datagrams()
-        namespaces = {agent_id: self._lab.network.networks[agent_id] for agent_id in self.scenario.roster}
+        local = [agent_id for agent_id in self.scenario.roster if agent_id not in self._remote]
+        namespaces = {agent_id: self._lab.network.networks[agent_id] for agent_id in local}
         self._lag = await LagMeter.start(self.rundir.lag, epoch_us, self.scenario.speedup, namespaces)
 
     async def apply(self, change: Change) -> None:
@@ -341,7 +351,7 @@ class ProgramRun:
         """
         async with self._changing_network:  # apply changes in the order of their requests
             conditions = add_rogue_listener(change.conditions, self.scenario)
-            applied = await self._lab.apply(conditions.at_speed(self.scenario.speedup))
+            applied = await self._lab.apply(self._remote.compensated(conditions.at_speed(self.scenario.speedup)))
             if self._channel is not None:
                 await (self._channel.clear() if change.clears_all else self._channel.apply(change.conditions))
         self.network = change.detail
@@ -350,6 +360,15 @@ class ProgramRun:
         if asked is not None:
             record |= {"asked": asked.to_json(), "applied": self._without_rogue(applied)}
         self.rundir.append_network(record)
+
+    def _remote_agent(self, agent_id: int) -> AgentProcess:
+        controlled = partial(self._remote.program, agent_id)
+        command = self._remote.stand_in_command()
+        return AgentProcess(agent_id, self.rundir, command, self.clock.now, controlled=controlled)
+
+    async def _cut_off(self) -> None:
+        """Cut off the vehicles whose connections are lost, and connect those that are back."""
+        await self._apply_conditions(self._reach.cut_off(self.clock.now(), self._remote.cut_off))
 
     def _without_rogue(self, applied: AppliedConditions) -> dict[str, Any]:
         """Return the network conditions and packet counters as JSON, without the links of the rogue node."""
@@ -428,9 +447,10 @@ class ProgramRun:
         await asyncio.gather(*(agent.export() for agent in self._awake()))
         for agent in self.agents:
             agent.collect_files()
-        agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+        agents, remote = self._agent_records(), self._remote.records()
         channel = await self._channel.totals() if self._channel is not None else None
-        return replace(self.played, mission_s=round(self.clock.now(), 1), agents=agents, channel=channel)
+        mission_s = round(self.clock.now(), 1)
+        return replace(self.played, mission_s=mission_s, agents=agents, channel=channel, remote=remote)
 
     def _awake(self) -> list[AgentProcess]:
         """Return the agents that are neither dead nor paused."""
@@ -466,6 +486,7 @@ class ProgramRun:
         """
         self._show("exporting")
         self.played.mission_s = round(self.clock.now(), 1)
+        self._remote.end()
         if self._lag is not None:
             await self._lag.stop()
         exported = await asyncio.gather(*(agent.export_at_end() for agent in self.agents), return_exceptions=True)
@@ -497,13 +518,24 @@ class ProgramRun:
             await lab.close()
         except NetemError as error:
             self._end_early(MachineError(str(error)))
-        self.played.agents = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+        self.played.agents, self.played.remote = self._agent_records(), self._remote.records()
+
+    def _agent_records(self) -> dict[str, Any]:
+        """Return the record of each agent. The command of a remote agent is that on its own computer."""
+        records = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+        for agent_id, remote in self._remote.records().items():
+            records[agent_id]["command"] = remote.command
+        return records
 
     def _datagram_counters(self, counted: Mapping[int, UdpCounters]) -> dict[str, dict[str, int]]:
         """Return the datagram counters of the agents for run.json. Omit agents whose vehicle program also uses UDP,
-        because their counters contain its datagrams.
+        because their counters contain its datagrams. Omit agents that were cut off from their stand-ins, too.
         """
-        agents = [agent for agent in self._udp_before_start if agent in self.scenario.roster]
+        agents = [
+            agent
+            for agent in self._udp_before_start
+            if agent in self.scenario.roster and not self._remote.was_cut_off(agent)
+        ]
         return {
             str(agent): {
                 "read": counted[agent].read,

@@ -39,6 +39,7 @@ class SimulationBackend(Backend):
             "vehicles.kind: ardupilot": scenario.vehicles.kind == "ardupilot",
             "vehicles.binary": scenario.vehicles.binary is not None,
             **{f"vehicles.{key}": True for key in _of_real_vehicles(scenario)},
+            "remote": scenario.remote is not None,
         }
         keys = [f"`{key}`" for key, needed in asked.items() if needed]
         if keys:

@@ -251,6 +251,19 @@ def test_appended_trace_of_another_run_is_not_read(directory: Path, tmp_path: Pa
     assert not [number for number in "123" if result.characteristics[number].verdict == "holds"]
 
 
+@pytest.mark.parametrize(("recorded_us", "verdict"), [(7, "agree"), (8, "contradict")])
+def test_clock_of_another_computer_is_compared_with_run_json(directory: Path, recorded_us: int, verdict: str) -> None:
+    """Mission second 0 is at 7 us of the clock of agent 2, and at 0 us of all other clocks."""
+    edit_lines(
+        trace(directory, 2), lambda lines: [line["clock"].update(epoch_us=7) for line in lines if "clock" in line]
+    )
+    remote = {"2": {"host": "192.168.7.2", "epoch_us": recorded_us, "uncertainty_s": 0.001}}
+    edit(directory / "run.json", lambda run: run.update(remote=remote))
+    records = judged(directory).judgements["records"]
+    assert records.verdict == verdict, records.evidence
+    assert verdict == "agree" or "8 for the clock of its computer" in records.evidence[0].detail
+
+
 def test_trace_of_a_newer_version_is_an_error(directory: Path) -> None:
     edit_lines(trace(directory, 2), lambda lines: lines[0].update(schema="ucp-trace/9"))
     (error,) = judged(directory).errors

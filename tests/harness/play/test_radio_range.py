@@ -121,3 +121,25 @@ def test_invalid_radio_is_one_sentence(radio: dict[str, object], word: str, tmp_
 def test_radio_needs_vehicles() -> None:
     with pytest.raises(ValueError, match=r"`network.radio` needs vehicles, but `vehicles.kind` is none"):
         scenario(vehicles={"kind": "none"})
+
+
+def test_cut_off_vehicle_stays_away_whatever_the_timeline_does() -> None:
+    reach = RadioRange(scenario(network={"loss": 0.2}))
+    reach.change_timeline(change_to(NetworkConditions(LinkConditions(0.2))))
+    away = reach.cut_off(1.0, frozenset({3}))
+    assert (away.what, away.detail, away.losses) == (RANGE, "1 2 | 3", {"1-3": 1.0, "2-3": 1.0})
+    assert away.conditions.link(3, 1).loss == 1.0 and away.conditions.link(1, 2).loss == 0.2
+    cleared = reach.change_timeline(final_reconcile(9.0))
+    assert cleared.conditions.link(3, 1).loss == 1.0 and cleared.conditions.link(1, 2).loss == 0.0
+    back = reach.cut_off(10.0, frozenset())
+    assert back.conditions == NetworkConditions() and back.losses == {"1-3": 0.0, "2-3": 0.0}
+
+
+def test_cut_off_vehicle_returns_to_the_losses_of_the_radio() -> None:
+    reach = RadioRange(scenario())
+    reach.move(1.0, at(0, 50, 200))
+    reach.cut_off(2.0, frozenset({2}))
+    assert reach.move(3.0, at(0, 50, 200)) is None, "the radio has not changed"
+    reach.cut_off(4.0, frozenset())
+    moved = reach.move(5.0, at(0, 50, 200))
+    assert moved is None or moved.detail == "1 2 | 3"

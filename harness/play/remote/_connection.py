@@ -1,0 +1,48 @@
+"""Send and receive the messages of one TCP connection in an event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Callable
+
+from harness.play.remote._wire import Channel, Kind, Message, WireError
+
+
+class Connection(asyncio.Protocol):
+    """One TCP connection between a stand-in and a far end. `lost` is called when it has ended."""
+
+    def __init__(self, channel: Channel, receive: Callable[[Message], None], lost: Callable[[Connection], None]):
+        self._channel, self._receive, self._lost = channel, receive, lost
+        self._transport: asyncio.WriteTransport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.WriteTransport)
+        self._transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        try:
+            for message in self._channel.decode(data):
+                self._receive(message)
+        except WireError as error:
+            sys.stderr.write(f"the connection ends: {error}\n")
+            self.close()
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._transport = None
+        self._lost(self)
+
+    def send(self, kind: Kind, payload: bytes = b"") -> bool:
+        """Send a message. Return false if the connection has ended."""
+        if self._transport is None:
+            return False
+        self._transport.write(self._channel.encode(kind, payload))
+        return True
+
+    @property
+    def unsent(self) -> int:
+        return 0 if self._transport is None else self._transport.get_write_buffer_size()
+
+    def close(self) -> None:
+        if self._transport is not None:
+            self._transport.abort()

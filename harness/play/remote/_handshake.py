@@ -1,0 +1,138 @@
+"""Prove to both ends of a new connection that the other end knows the secret, before anything else happens.
+
+    harness -> agent    CHALLENGE || nonce of the harness
+    agent -> harness    length || hello || nonce of the agent || HMAC(secret, "UCP hello" || both nonces || hello)
+    harness -> agent    length || welcome || HMAC(secret, "UCP welcome" || both nonces || hello || welcome)
+
+`hello` and `welcome` are JSON objects. A refusal is a `welcome` with the key `refused`, one sentence. The keys of the
+connection follow from the secret and both nonces. All parts have a maximum size, and the handshake has a time limit.
+The hash is HMAC-SHA256. The secret has 256 random bits, so a recorded handshake does not reveal it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import secrets
+import socket
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+from harness.play.remote._wire import Channel
+from ucp.plain_file import parse_json
+
+PROTOCOL = "ucp-join/1"
+HANDSHAKE_LIMIT_S = 5.0
+MAX_TEXT_BYTES = 4096
+_CHALLENGE = b"UCPJOIN1"
+_NONCE_BYTES = 32
+_LENGTH = struct.Struct("!H")
+_TAG_BYTES = 32
+
+
+class HandshakeError(Exception):
+    """An error: the other end has another secret or protocol. The message is one sentence without a subject."""
+
+
+class RefusedError(Exception):
+    """An error: the harness refused the agent. The message is the harness's sentence."""
+
+
+@dataclass(frozen=True)
+class Hello:
+    """A far end that knows the secret. `words` is its JSON object."""
+
+    words: dict[str, Any]
+    connection: socket.socket
+    _secret: bytes
+    _nonces: bytes
+    _hello: bytes
+
+    async def answer(self, welcome: dict[str, Any]) -> Channel:
+        """Send the last message of the handshake. Return the channel of the connection. Raises OSError."""
+        data = json.dumps(welcome).encode()
+        tag = _mac(self._secret, b"UCP welcome", self._nonces, self._hello, data)
+        loop = asyncio.get_running_loop()
+        await loop.sock_sendall(self.connection, _LENGTH.pack(len(data)) + data + tag)
+        to_agent, to_lab = _keys(self._secret, self._nonces)
+        return Channel(to_agent, to_lab)
+
+
+async def receive_hello(connection: socket.socket, secret: bytes) -> Hello:
+    """Challenge a new connection, and return its checked hello. Raises HandshakeError or OSError."""
+    loop = asyncio.get_running_loop()
+    own = secrets.token_bytes(_NONCE_BYTES)
+    async with asyncio.timeout(HANDSHAKE_LIMIT_S):
+        await loop.sock_sendall(connection, _CHALLENGE + own)
+        hello = await _text(connection)
+        rest = await _exactly(connection, _NONCE_BYTES + _TAG_BYTES)
+        nonces = own + rest[:_NONCE_BYTES]
+        if not hmac.compare_digest(rest[_NONCE_BYTES:], _mac(secret, b"UCP hello", nonces, hello)):
+            data = json.dumps({"refused": "the secret is wrong"}).encode()
+            await loop.sock_sendall(connection, _LENGTH.pack(len(data)) + data + bytes(_TAG_BYTES))
+            raise HandshakeError("has another secret")
+    return Hello(_parsed(hello), connection, secret, nonces, hello)
+
+
+async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, Any]) -> tuple[Channel, dict[str, Any]]:
+    """Answer the challenge of the harness. Return the channel and the welcome.
+
+    Raises RefusedError, HandshakeError or OSError.
+    """
+    loop = asyncio.get_running_loop()
+    async with asyncio.timeout(HANDSHAKE_LIMIT_S):
+        challenge = await _exactly(connection, len(_CHALLENGE) + _NONCE_BYTES)
+        if not challenge.startswith(_CHALLENGE):
+            raise HandshakeError("is no harness of this version")
+        own, words = secrets.token_bytes(_NONCE_BYTES), json.dumps(hello).encode()
+        nonces = challenge[len(_CHALLENGE) :] + own
+        tag = _mac(secret, b"UCP hello", nonces, words)
+        await loop.sock_sendall(connection, _LENGTH.pack(len(words)) + words + own + tag)
+        data = await _text(connection)
+        answered = await _exactly(connection, _TAG_BYTES)
+    if not hmac.compare_digest(answered, _mac(secret, b"UCP welcome", nonces, words, data)):
+        raise HandshakeError("has another secret: copy the secret file of the harness to this computer")
+    welcome = _parsed(data)
+    if "refused" in welcome:
+        raise RefusedError(str(welcome["refused"]))
+    to_agent, to_lab = _keys(secret, nonces)
+    return Channel(to_lab, to_agent), welcome
+
+
+def _mac(secret: bytes, *parts: bytes) -> bytes:
+    """Return the tag of these parts. Each part has its length in front, so that parts cannot be moved."""
+    return hmac.digest(secret, b"".join(struct.pack("!I", len(part)) + part for part in parts), "sha256")
+
+
+def _keys(secret: bytes, nonces: bytes) -> tuple[bytes, bytes]:
+    return _mac(secret, b"UCP to agent", nonces), _mac(secret, b"UCP to lab", nonces)
+
+
+def _parsed(data: bytes) -> dict[str, Any]:
+    try:
+        value = parse_json(data)
+    except ValueError:
+        value = None
+    if not isinstance(value, dict):
+        raise HandshakeError("sent no JSON object")
+    return value
+
+
+async def _text(connection: socket.socket) -> bytes:
+    (length,) = _LENGTH.unpack(await _exactly(connection, _LENGTH.size))
+    if length > MAX_TEXT_BYTES:
+        raise HandshakeError(f"sent {length} bytes, and at most {MAX_TEXT_BYTES} are allowed")
+    return await _exactly(connection, length)
+
+
+async def _exactly(connection: socket.socket, count: int) -> bytes:
+    loop = asyncio.get_running_loop()
+    data = b""
+    while len(data) < count:
+        part = await loop.sock_recv(connection, count - len(data))
+        if not part:
+            raise HandshakeError("closed the connection during the handshake")
+        data += part
+    return data

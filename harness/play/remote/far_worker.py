@@ -1,0 +1,402 @@
+"""Run one agent on a far computer: `python -m harness.play.remote.far_worker FD DIRECTORY COMMAND...`.
+
+The program is the first process of a private network (see `netem.far_network`), so its end also ends each process that
+the agent started. The process outside (`harness.play.remote.join`) sends it connected sockets through the socket FD.
+The program waits for the message `begin`, runs one incarnation of the agent, and ends. If the connection is lost
+meanwhile, the agent goes on. The program then asks the process outside for another connection by sending `lost`, and
+continues where it was.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import resource
+import signal
+import socket
+import sys
+from collections import deque
+from collections.abc import Coroutine
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from harness.play.remote._connection import Connection
+from harness.play.remote._far_clock import pong
+from harness.play.remote._wire import (
+    ADDRESS_BYTES,
+    MAX_MESSAGE_BYTES,
+    NUMBER_BYTES,
+    SILENT_S,
+    Channel,
+    Kind,
+    Message,
+    WireError,
+    take_over,
+)
+from netem.far_network import FarNetwork, vehicle_at
+from ucp.agent_files import write_json_atomically
+from ucp.plain_file import open_plain_file, read_plain_file
+
+POLL_S = 0.05
+"""Wall seconds between two reads of the agent's files, in addition to the reads before each datagram and answer."""
+READY_POLL_S = 0.02
+END_LIMIT_S = 5.0
+FRAMES_PER_TURN = 64
+MAX_READ_BYTES = 1 << 20
+MAX_ANSWER_BYTES = 2 << 20
+MAX_UNSENT_BYTES = 4 << 20
+"""Maximum number of bytes that wait for a slow connection. Further datagrams are lost, and the trace waits."""
+LAG_PROBE = Path(__file__).parents[1] / "process" / "_lag_probe.py"
+
+
+class FileTail:
+    """A file of the agent that grows, and the number of its bytes that were read."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.position = 0
+        self._file: Any = None
+
+    def read(self) -> bytes:
+        """Return the bytes after the position. They are empty if there are none, or no file yet."""
+        if self._file is None:
+            try:
+                self._file = open_plain_file(self._path)
+            except OSError:
+                return b""
+        self._file.seek(self.position)
+        data: bytes = self._file.read(MAX_READ_BYTES)
+        self.position += len(data)
+        return data
+
+
+class FarWorker:
+    """The agent on this computer, its network, and the connection to its stand-in."""
+
+    def __init__(self, outside: socket.socket, directory: Path, command: list[str]) -> None:
+        self._outside, self._directory, self._command = outside, directory, command
+        self._loop = asyncio.get_running_loop()
+        self._over = asyncio.Event()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._connection: Connection | None = None
+        self._in_step = False
+        """The stand-in and this program agree on the positions in the agent's files, so more can be sent."""
+        self._pinged_s = self._loop.time()
+        self._frames = 0
+        """Number of datagrams that the agent has sent, whether or not they left this computer."""
+        self._incarnation: str | None = None
+        self._agent_id = 0
+        self._home = directory
+        self._network: FarNetwork | None = None
+        self._process: asyncio.subprocess.Process | None = None
+        self._control: asyncio.StreamWriter | None = None
+        self._asked: deque[bytes] = deque()
+        """The numbers of the requests that the agent has not answered, oldest first."""
+        self._lag: asyncio.subprocess.Process | None = None
+        self._speedup = 1.0
+        self._store: Path | None = None
+        self._tails: dict[Kind, FileTail] = {}
+        self._ended: dict[str, Any] | None = None
+        """How the agent ended."""
+
+    async def run(self) -> None:
+        """Run until the incarnation is over. At the end of this process, the kernel ends the agent."""
+        self._loop.add_reader(self._outside, self._take_over)
+        await self._over.wait()
+
+    def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        task = self._loop.create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._finished)
+
+    def _finished(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            sys.stderr.write(f"the agent cannot be played: {error}\n")
+            self._over.set()
+
+    # The connection
+
+    def _take_over(self) -> None:
+        taken = take_over(self._outside)
+        if taken is None:
+            self._over.set()
+            return
+        connection, state = taken
+        self._start(self._connect(connection, Channel.from_json(state)))
+
+    async def _connect(self, connection: socket.socket, channel: Channel) -> None:
+        protocol = Connection(channel, self._receive, self._lost)
+        before, self._connection = self._connection, protocol
+        self._in_step = False
+        if before is not None:
+            before.close()
+        await self._loop.create_connection(lambda: protocol, sock=connection)
+
+    def _lost(self, connection: Connection) -> None:
+        if connection is not self._connection:
+            return
+        self._connection = None
+        if self._incarnation is None:
+            self._over.set()  # no agent has begun, so another worker can take its place
+            return
+        with contextlib.suppress(OSError):
+            self._outside.send(b"lost")
+
+    def _send(self, kind: Kind, payload: bytes = b"") -> None:
+        if self._connection is not None and (self._in_step or kind is Kind.PONG):
+            self._connection.send(kind, payload)
+
+    def _receive(self, message: Message) -> None:
+        match message.kind:
+            case Kind.PING:
+                self._pinged_s = self._loop.time()
+                self._send(Kind.PONG, pong(message.payload, self._frames))
+            case Kind.DATAGRAM:
+                self._arrive(message.payload)
+            case Kind.REQUEST:
+                self._request(message.payload)
+            case Kind.SIGNAL:
+                self._signal(int(message.document()["number"]))
+            case Kind.BEGIN if self._incarnation is None:
+                self._start(self._begin(message.document()))
+            case Kind.RESUME:
+                self._resume(message.document())
+            case Kind.IDLE if self._incarnation is not None:
+                self._over.set()  # its stand-in is dead, or knows how the agent ended
+            case Kind.IDLE:
+                pass
+            case _:
+                raise WireError(f"a message {message.kind.name} at the wrong time")
+
+    def _resume(self, state: dict[str, Any]) -> None:
+        self._in_step = True
+        if self._incarnation is None or state["incarnation"] != self._incarnation:
+            self._send(Kind.EXIT, json.dumps({"gone": True}).encode())
+            return
+        for kind, tail in self._tails.items():
+            tail.position = int(state["positions"][kind.name])
+        self._asked = deque(b"" for _ in self._asked)  # the stand-in expects none of these answers
+        self._pinged_s = self._loop.time()
+        if self._control is not None:
+            self._send(Kind.READY)
+        if self._ended is not None:
+            self._report_end(self._ended)
+
+    # The agent
+
+    async def _begin(self, order: dict[str, Any]) -> None:
+        self._in_step = True
+        mission = order["mission"]
+        self._incarnation, self._agent_id = _name(order["incarnation"]), int(mission["agent_id"])
+        self._speedup = float(mission["speedup"])
+        self._home = self._directory / self._incarnation
+        self._home.mkdir()
+        if order["store"] is not None:
+            disks = self._directory / "disks"
+            disks.mkdir(exist_ok=True)
+            self._store = disks / _name(order["store"])
+            mission["store"] = os.path.relpath(self._store, self._home)
+        path = self._home / f"{self._agent_id}.mission.json"
+        write_json_atomically(path, mission)
+        log = self._home / f"{self._agent_id}.log"
+        self._tails = {
+            Kind.TRACE: FileTail(self._home / f"{self._agent_id}.trace.jsonl"),
+            Kind.LOG: FileTail(log),
+            Kind.LAG: FileTail(self._home / "lag.jsonl"),
+        }
+        self._network = FarNetwork(self._agent_id, int(mission["network"]["port"]))
+        most = order["max_file_bytes"]
+        with log.open("ab") as output:
+            try:
+                self._process = await asyncio.create_subprocess_exec(
+                    *self._command,
+                    path.name,
+                    cwd=self._home,
+                    stdin=asyncio.subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    start_new_session=True,
+                    preexec_fn=None if most is None else partial(_limit_files, int(most)),
+                )
+            except OSError as error:
+                output.write(f"{self._command[0]} cannot be started: {error.strerror}\n".encode())
+                self._end({"status": 1, "left_behind": []})
+                return
+        self._loop.add_reader(self._network.descriptor, self._leave)
+        self._start(self._follow_files())
+        self._start(self._wait_for_end(self._process))
+        await self._connect_control(self._process)
+        if self._control is not None:
+            self._send(Kind.READY)
+            if mission["epoch_us"] is not None:
+                await self._measure_lag(int(mission["epoch_us"]))
+
+    async def _connect_control(self, process: asyncio.subprocess.Process) -> None:
+        """Connect to the control socket of the agent as soon as it exists."""
+        path = self._home / f"{self._agent_id}.control"
+        while process.returncode is None:
+            try:
+                reader, self._control = await asyncio.open_unix_connection(path, limit=MAX_ANSWER_BYTES)
+            except OSError:
+                await asyncio.sleep(READY_POLL_S)
+                continue
+            self._start(self._forward_answers(reader))
+            return
+
+    def _request(self, payload: bytes) -> None:
+        """Forward a request to the agent: a number of 4 bytes, and a line."""
+        number, line = payload[:NUMBER_BYTES], payload[NUMBER_BYTES:]
+        if self._control is None:
+            self._send(Kind.ANSWER, number)
+            return
+        self._asked.append(number)
+        self._control.write(line)
+        with contextlib.suppress(ValueError, RecursionError, AttributeError):
+            request = json.loads(line)
+            if request.get("command") == "start" and isinstance(request.get("epoch_us"), int) and self._lag is None:
+                self._start(self._measure_lag(request["epoch_us"]))
+
+    async def _forward_answers(self, reader: asyncio.StreamReader) -> None:
+        """Send each answer of the agent, after the lines of the trace and the export that belong to it."""
+        with contextlib.suppress(OSError, ValueError):  # the agent closed the socket, or sent an endless line
+            while (line := await reader.readline()).endswith(b"\n") and self._asked:
+                self._send_new_lines()
+                if b'"path"' in line:
+                    self._send_file(Kind.EXPORT, self._home / f"{self._agent_id}.chain.json")
+                self._send(Kind.ANSWER, self._asked.popleft() + line)
+        self._control = None
+        while self._asked:
+            self._send(Kind.ANSWER, self._asked.popleft())
+
+    def _signal(self, number: int) -> None:
+        if self._process is None or self._process.returncode is not None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, number)
+            if number == signal.SIGTERM:  # a stopped process cannot react to SIGTERM
+                os.killpg(self._process.pid, signal.SIGCONT)
+
+    async def _wait_for_end(self, process: asyncio.subprocess.Process) -> None:
+        status = await process.wait()
+        if self._lag is not None and self._lag.stdin is not None:
+            self._lag.stdin.close()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._lag.wait(), END_LIMIT_S)
+        assert self._network is not None
+        self._loop.remove_reader(self._network.descriptor)
+        self._leave()
+        own = {os.getpid(), *([self._lag.pid] if self._lag else [])}
+        left = [] if status == -signal.SIGKILL else _other_processes(own)
+        self._end({"status": status, "left_behind": left})
+
+    def _end(self, how: dict[str, Any]) -> None:
+        self._ended = how
+        self._report_end(how)
+
+    def _report_end(self, how: dict[str, Any]) -> None:
+        self._send_new_lines()
+        if self._connection is not None:
+            self._send_file(Kind.EXPORT, self._home / f"{self._agent_id}.chain.json")
+            if self._store is not None:
+                self._send_file(Kind.STORE, self._store)
+            self._send(Kind.EXIT, json.dumps(how).encode())
+
+    # Datagrams and files
+
+    def _leave(self) -> None:
+        """Send the datagrams that the agent broadcast. Its trace has their lines already."""
+        assert self._network is not None
+        for _ in range(FRAMES_PER_TURN):
+            try:
+                data = self._network.read()
+            except OSError:
+                return
+            if data is None:
+                continue
+            self._frames += 1
+            silent = self._loop.time() - self._pinged_s > SILENT_S
+            if self._can_send() and not silent:  # else the vehicle is cut off
+                self._send_new(Kind.TRACE)
+                self._send(Kind.DATAGRAM, data)
+
+    def _arrive(self, payload: bytes) -> None:
+        """Let a datagram from the lab arrive: the sender's address of 4 bytes, and the data."""
+        sender = vehicle_at(socket.inet_ntoa(payload[:ADDRESS_BYTES]))
+        if self._network is not None and sender is not None:
+            with contextlib.suppress(OSError):
+                self._network.write(sender, payload[ADDRESS_BYTES:])
+
+    async def _follow_files(self) -> None:
+        while self._ended is None:
+            self._send_new_lines()
+            await asyncio.sleep(POLL_S)
+
+    def _send_new_lines(self) -> None:
+        for kind in self._tails:
+            self._send_new(kind)
+
+    def _send_new(self, kind: Kind) -> None:
+        while self._can_send() and (data := self._tails[kind].read()):
+            self._send(kind, data)
+
+    def _can_send(self) -> bool:
+        return self._connection is not None and self._in_step and self._connection.unsent <= MAX_UNSENT_BYTES
+
+    def _send_file(self, kind: Kind, path: Path) -> None:
+        with contextlib.suppress(OSError):  # the agent wrote no such file
+            self._send(kind, read_plain_file(path, MAX_MESSAGE_BYTES - 1))
+
+    async def _measure_lag(self, epoch_us: int) -> None:
+        """Measure the delays of this computer, as the harness does on its own machine."""
+        network = Path("/proc/self/ns/net").stat().st_ino
+        self._lag = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-I", "-S", str(LAG_PROBE), str(self._home / "lag.jsonl")),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.DEVNULL,
+        )
+        assert self._lag.stdin is not None
+        request = {"epoch_us": epoch_us, "speedup": self._speedup, "networks": {str(network): str(self._agent_id)}}
+        self._lag.stdin.write(json.dumps(request).encode() + b"\n")
+
+
+def _name(text: object) -> str:
+    """Return the name of a file or directory that the harness chose. Raises WireError for a path."""
+    if not isinstance(text, str) or not text.isalnum():
+        raise WireError("a name has other characters than letters and digits")
+    return text
+
+
+def _limit_files(most_bytes: int) -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+
+
+def _other_processes(own: set[int]) -> list[str]:
+    """Return the names of the processes in this network, except for those in `own`."""
+    names = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) not in own:
+            with contextlib.suppress(OSError):
+                if (entry / "cmdline").read_bytes():  # not a process that has ended
+                    names.append((entry / "comm").read_text(encoding="utf-8", errors="replace").strip())
+    return sorted(names)
+
+
+def main() -> None:
+    outside = socket.socket(fileno=int(sys.argv[1]))
+    outside.setblocking(False)
+    outside.set_inheritable(False)
+
+    async def run() -> None:
+        await FarWorker(outside, Path(sys.argv[2]), sys.argv[3:]).run()
+
+    asyncio.run(run())
+
+
+if __name__ == "__main__":
+    main()

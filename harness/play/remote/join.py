@@ -1,0 +1,250 @@
+"""Let an agent on this computer join the labs of a harness on another computer.
+
+For each incarnation, this process connects to the harness, proves that it knows the secret, and starts a process in a
+private network (`harness.play.remote.far_worker`). It hands the connection over, and makes another one when the worker
+asks for it. The worker runs the agent.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import secrets
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness.errors import HarnessError, MachineError
+from harness.play.remote._handshake import PROTOCOL, HandshakeError, RefusedError, introduce
+from harness.play.remote._wire import Channel, hand_over, prepare
+from harness.scenario import Scenario
+from netem import far_network
+from netem.errors import LabUnavailable
+from sitl.address import ListenAddress
+from ucp.features import CONTRACT
+
+CONNECT_LIMIT_S = 5.0
+RETRY_S = 1.0
+REJOIN_LIMIT_S = 60.0
+"""Wall seconds after which a lost connection ends the incarnation of the agent."""
+END_LIMIT_S = 5.0
+
+
+class JoinError(HarnessError):
+    """An error: the agent cannot join a lab."""
+
+
+@dataclass(frozen=True)
+class JoinRequest:
+    """The request of the user: the address of the harness, the agent's ID and command, and the secret."""
+
+    host: str
+    port: int
+    agent_id: int
+    secret: bytes
+    command: Sequence[str]
+    service: bool
+    """Join every run, until the user ends the program."""
+
+    @property
+    def address(self) -> str:
+        return f"{self.host}:{self.port}"
+
+
+@dataclass(frozen=True)
+class _Connected:
+    """A connection whose other end knows the secret."""
+
+    connection: socket.socket
+    channel: Channel
+    run: str
+    name: str
+
+
+def join_commands(scenario: Scenario) -> list[str]:
+    """Return the commands that let the remote agents of a scenario join."""
+    remote = scenario.remote
+    if remote is None or remote.listen is None:
+        return []
+    address = ListenAddress.parse(remote.listen)
+    host = "ADDRESS-OF-THIS-COMPUTER" if address.host in ("0.0.0.0", "::") else address.host  # noqa: S104
+    where = str(ListenAddress(host, address.port))
+    return [f"ucp-harness join {where} --as {agent} --secret-file FILE -- COMMAND" for agent in remote.agents]
+
+
+class _RunOverError(Exception):
+    """No harness listens any more."""
+
+
+def join(request: JoinRequest, say: Callable[[str], None]) -> None:
+    """Play incarnations of the agent until the run is over, or for ever as a service.
+
+    Raises MachineError without private networks, and JoinError if no harness listens or if it refuses the agent.
+    """
+    try:
+        first_process = far_network.first_process([sys.executable, "-P", "-m", "harness.play.remote.far_worker"])
+    except LabUnavailable as error:
+        raise MachineError(str(error)) from None
+    asyncio.run(_Joining(request, first_process, say).run())
+
+
+class _Joining:
+    """A far end that plays one incarnation of its agent after another."""
+
+    def __init__(self, request: JoinRequest, first_process: Sequence[str], say: Callable[[str], None]) -> None:
+        self._request, self._first_process, self._say = request, first_process, say
+        self._session = secrets.token_hex(8)
+        self._said = ""
+
+    async def run(self) -> None:
+        ended = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            loop.add_signal_handler(number, ended.set)
+        with tempfile.TemporaryDirectory(prefix="ucp-join-") as directory:
+            playing = asyncio.create_task(self._play(Path(directory)))
+            waiting = asyncio.create_task(ended.wait())
+            await asyncio.wait({playing, waiting}, return_when=asyncio.FIRST_COMPLETED)
+            waiting.cancel()
+            playing.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await playing
+
+    async def _play(self, directory: Path) -> None:
+        joined = False
+        run = ""
+        while True:
+            try:
+                connected = await self._connect()
+            except _RunOverError as error:
+                if self._request.service:
+                    self._say_once(f"waits for a harness at {self._request.address}")
+                    await asyncio.sleep(RETRY_S)
+                    continue
+                if joined:
+                    self._say("the run is over")
+                    return
+                raise JoinError(f"{error}: start the run first, or add --service") from None
+            except JoinError as error:
+                if not self._request.service:
+                    raise
+                self._say_once(str(error))
+                await asyncio.sleep(RETRY_S)
+                continue
+            if connected.run != run:
+                run = connected.run
+                shutil.rmtree(directory / "disks", ignore_errors=True)
+            joined = True
+            self._say_once(f"agent {self._request.agent_id} has joined {connected.name!r} at {self._request.address}")
+            await self._play_incarnation(connected, directory)
+
+    def _say_once(self, sentence: str) -> None:
+        if sentence != self._said:
+            self._said = sentence
+            self._say(sentence)
+
+    async def _play_incarnation(self, connected: _Connected, directory: Path) -> None:
+        """Run a worker with this connection until it ends, and give it another connection when it asks for one."""
+        own_end, inside = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with own_end:
+            own_end.setblocking(False)
+            with inside:
+                worker = await self._start_worker(inside, directory)
+            try:
+                hand_over(own_end, connected.connection, connected.channel.to_json())
+                ended = asyncio.create_task(worker.wait())
+                while await self._asks(own_end, ended):
+                    self._say_once("the connection is lost; the agent goes on, and this program connects again")
+                    if (again := await self._reconnect(connected.run, ended)) is None:
+                        break
+                    hand_over(own_end, again.connection, again.channel.to_json())
+                    self._say_once("the connection is back")
+            except OSError:  # the worker has ended
+                pass
+            finally:
+                if worker.returncode is None:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.killpg(worker.pid, signal.SIGKILL)
+                    await worker.wait()
+
+    async def _start_worker(self, inside: socket.socket, directory: Path) -> asyncio.subprocess.Process:
+        path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
+        return await asyncio.create_subprocess_exec(
+            *(*self._first_process, str(inside.fileno()), str(directory), *self._request.command),
+            stdin=asyncio.subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": path},
+            pass_fds=[inside.fileno()],
+            start_new_session=True,
+        )
+
+    async def _asks(self, own_end: socket.socket, ended: asyncio.Task[int]) -> bool:
+        """Wait until the worker asks for a connection, or ends. Return true if it asks."""
+        asking = asyncio.create_task(asyncio.get_running_loop().sock_recv(own_end, 16))
+        await asyncio.wait({asking, ended}, return_when=asyncio.FIRST_COMPLETED)
+        if not asking.done():
+            asking.cancel()
+            return False
+        return bool(asking.result())
+
+    async def _reconnect(self, run: str, ended: asyncio.Task[int]) -> _Connected | None:
+        """Connect again. Return None if the incarnation is over: after `REJOIN_LIMIT_S`, or without its run."""
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + REJOIN_LIMIT_S
+        while loop.time() < deadline and not ended.done():
+            try:
+                connected = await self._connect()
+            except _RunOverError:
+                return None
+            except JoinError:
+                await asyncio.sleep(RETRY_S)
+                continue
+            if connected.run == run:
+                return connected
+            connected.connection.close()
+            return None
+        return None
+
+    async def _connect(self) -> _Connected:
+        """Connect to the harness. Raises _RunOverError if none listens, and JoinError for any other problem."""
+        request, loop = self._request, asyncio.get_running_loop()
+        where = f"the harness at {request.address}"
+        hello: dict[str, Any] = {
+            "protocol": PROTOCOL,
+            "contract": CONTRACT,
+            "agent": request.agent_id,
+            "session": self._session,
+            "command": list(request.command),
+        }
+        connection = None
+        try:
+            async with asyncio.timeout(CONNECT_LIMIT_S):
+                found = await loop.getaddrinfo(request.host, request.port, type=socket.SOCK_STREAM)
+                family, kind, protocol, _, place = found[0]
+                connection = socket.socket(family, kind, protocol)
+                prepare(connection)
+                await loop.sock_connect(connection, place)
+            channel, welcome = await introduce(connection, request.secret, hello)
+            return _Connected(connection, channel, str(welcome["run"]), str(welcome["name"]))
+        except BaseException as error:
+            if connection is not None:
+                connection.close()
+            match error:
+                case ConnectionRefusedError():
+                    raise _RunOverError(f"no harness listens at {request.address}") from None
+                case RefusedError():
+                    raise JoinError(f"{where} refused agent {request.agent_id}: {error}") from None
+                case HandshakeError():
+                    raise JoinError(f"{where} {error}") from None
+                case TimeoutError():
+                    raise JoinError(f"{where} does not answer: check the address and the firewall") from None
+                case OSError():
+                    why = error.strerror or error
+                    raise JoinError(f"{where} cannot be reached ({why}): check the address") from None
+            raise

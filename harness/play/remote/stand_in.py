@@ -1,0 +1,470 @@
+"""Stand in for an agent on another computer: `python -m harness.play.remote.stand_in SOCKET MISSION_FILE`.
+
+The program runs in the network of a vehicle and follows the agent contract. It carries datagrams, requests and files
+between the lab and the far end, which runs the agent. SOCKET belongs to the harness, which sends connected sockets
+through it (see `harness.play.remote._remote_agents`), and receives measurements.
+
+- The trace, the log and the export arrive before the datagrams and answers that depend on them.
+- If the connection is lost, the vehicle is cut off. The agent goes on, and so does this program: it answers `status`
+  with the last answer of the agent, and waits for another connection.
+- SIGUSR1 and SIGUSR2 suspend and resume the agent, and SIGQUIT kills it, as SIGSTOP, SIGCONT and SIGKILL would.
+- The program ends as the agent ended, by the same signal or with the same exit status.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import os
+import resource
+import secrets
+import signal
+import socket
+import sys
+from pathlib import Path
+from typing import Any
+
+from harness.play.remote._connection import Connection
+from harness.play.remote._far_clock import FarClock, ping
+from harness.play.remote._wire import (
+    NUMBER_BYTES,
+    SILENT_S,
+    Channel,
+    Kind,
+    Message,
+    WireError,
+    connect_path,
+    take_over,
+)
+from ucp.agent_files import write_atomically
+from ucp.clock import MICROSECONDS
+from ucp.mission import MAX_MISSION_BYTES
+from ucp.plain_file import parse_json, read_json
+
+PINGS_BEFORE_START = 8
+PING_EVERY_S = 0.5
+KILL_LIMIT_S = 2.0
+ANSWER_LIMIT_S = 9.0
+"""Wall seconds for an answer of the agent. The harness waits for 10 s."""
+STEP_LIMIT_S = 0.05
+"""Greatest step of the far clock between two incarnations. All incarnations have the same mission second 0."""
+MAX_REQUEST_BYTES = 65_536
+MAX_DATAGRAM_BYTES = 65_536
+DATAGRAMS_PER_TURN = 64
+MAX_UNSENT_BYTES = 4 << 20
+FAILED = 1
+
+
+class StandIn:
+    """One incarnation of an agent on another computer, as the lab sees it."""
+
+    def __init__(self, outside: socket.socket, mission: dict[str, Any], directory: Path) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._outside, self._mission, self._directory = outside, mission, directory
+        self._agent_id = int(mission["agent_id"])
+        self._incarnation = secrets.token_hex(8)
+        self._over: asyncio.Future[int] = self._loop.create_future()
+        self._connection: Connection | None = None
+        self._clock = FarClock()
+        self._pongs = 0
+        """Number of pongs on the current connection."""
+        self._ponged_s = self._loop.time()
+        self._begun = False
+        self._offset_s: float | None = None
+        """Seconds by which the far clock is ahead, for mission second 0. The first incarnation sets it."""
+        self._cut_off = False
+        self._server: asyncio.Server | None = None
+        self._udp: socket.socket | None = None
+        self._paused = False
+        self._released = 0
+        """Number of the agent's datagrams that this program sent to the lab."""
+        self._lost = 0
+        self._trace = (directory / f"{self._agent_id}.trace.jsonl").open("ab", buffering=0)
+        self._trace_problem: str | None = None
+        self._positions = {"TRACE": 0, "LOG": 0, "LAG": 0}
+        self._lag = b""
+        self._waiting: dict[int, asyncio.Future[bytes]] = {}
+        self._requests = 0
+        self._status: dict[str, Any] | None = None
+        self._stop_events = False
+
+    async def run(self) -> int:
+        """Run until the agent has ended, and return its exit status or the negative number of a signal."""
+        self._tell({"agent": self._agent_id})
+        self._loop.add_reader(self._outside, self._take_over)
+        for number, handler in {
+            signal.SIGTERM: self._terminate,
+            signal.SIGINT: self._terminate,
+            signal.SIGUSR1: self._pause,
+            signal.SIGUSR2: self._resume,
+            signal.SIGQUIT: self._kill,
+        }.items():
+            self._loop.add_signal_handler(number, handler)
+        pinging = self._loop.create_task(self._ping())
+        status = await self._over
+        pinging.cancel()
+        self._report()
+        (self._directory / f"{self._agent_id}.control").unlink(missing_ok=True)
+        return status
+
+    def _end(self, status: int, why: str = "") -> None:
+        if not self._over.done():
+            if why:
+                sys.stderr.write(f"{why}\n")
+            self._over.set_result(status)
+
+    def _tell(self, what: dict[str, Any]) -> None:
+        """Send a message to the harness. Without the harness, the lab ends too."""
+        with contextlib.suppress(OSError):
+            self._outside.send(json.dumps(what).encode())
+
+    # The connection
+
+    def _take_over(self) -> None:
+        try:
+            taken = take_over(self._outside)
+        except BlockingIOError:
+            return
+        if taken is None:
+            self._end(FAILED, "the harness has ended")
+            return
+        connection, state = taken
+        self._offset_s = state["offset_s"] if self._offset_s is None else self._offset_s
+        self._pongs = 0
+        before, self._connection = self._connection, Connection(Channel.from_json(state), self._receive, self._ended)
+        if before is not None:
+            before.close()
+        task = self._loop.create_task(self._connect(self._connection, connection))
+        self._connecting = task
+
+    async def _connect(self, protocol: Connection, connection: socket.socket) -> None:
+        await self._loop.create_connection(lambda: protocol, sock=connection)
+        protocol.send(Kind.PING, ping())
+
+    def _ended(self, connection: Connection) -> None:
+        if connection is self._connection:
+            self._connection = None
+            self._cut()
+
+    async def _ping(self) -> None:
+        while True:
+            await asyncio.sleep(PING_EVERY_S)
+            if self._connection is not None and self._begun:
+                self._connection.send(Kind.PING, ping())
+                if self._loop.time() - self._ponged_s > SILENT_S:
+                    self._cut()
+            self._report()
+
+    def _report(self) -> None:
+        if self._clock.samples:
+            self._tell({"clock": self._clock.to_json(), "lost": self._lost})
+
+    def _receive(self, message: Message) -> None:
+        match message.kind:
+            case Kind.PONG:
+                self._pong(message.payload)
+            case Kind.DATAGRAM:
+                self._release(message.payload)
+            case Kind.TRACE:
+                self._write_trace(message.payload)
+            case Kind.LOG:
+                self._positions["LOG"] += len(message.payload)
+                os.write(sys.stdout.fileno(), message.payload)
+            case Kind.LAG:
+                self._forward_lag(message.payload)
+            case Kind.READY:
+                self._open()
+            case Kind.ANSWER:
+                self._answer(message.payload)
+            case Kind.EXPORT:
+                self._write_file(f"{self._agent_id}.chain.json", message.payload)
+            case Kind.STORE:
+                if self._mission.get("store"):
+                    with contextlib.suppress(OSError):
+                        (self._directory / self._mission["store"]).write_bytes(message.payload)
+            case Kind.EXIT:
+                self._exit(message.document())
+            case _:
+                raise WireError(f"a message {message.kind.name} at the wrong time")
+
+    def _pong(self, payload: bytes) -> None:
+        sent = self._clock.receive(payload)
+        self._ponged_s = self._loop.time()
+        self._lost = max(self._lost, sent - self._released)
+        self._pongs += 1
+        assert self._connection is not None
+        if self._pongs < PINGS_BEFORE_START:
+            self._connection.send(Kind.PING, ping())
+        elif not self._begun:
+            self._begin(self._connection)
+        elif self._pongs == PINGS_BEFORE_START:
+            state = {"incarnation": self._incarnation, "positions": self._positions}
+            self._connection.send(Kind.RESUME, json.dumps(state).encode())
+        if self._begun and self._cut_off:
+            self._return()
+
+    def _begin(self, connection: Connection) -> None:
+        """Send the mission to the far end, with its beginning in the time of the far clock."""
+        self._begun = True
+        mission = dict(self._mission)
+        if mission["epoch_us"] is not None:
+            mission["epoch_us"] = self._far_us(mission["epoch_us"])
+        store = mission["store"] and (self._directory / mission["store"]).resolve()
+        order = {
+            "incarnation": self._incarnation,
+            "mission": mission,
+            # The far end names the disk after its path here, because a reboot names the same path.
+            "store": store and hashlib.sha256(str(store).encode()).hexdigest()[:16],
+            "max_file_bytes": None if (most := resource.getrlimit(resource.RLIMIT_FSIZE)[0]) < 0 else most,
+        }
+        connection.send(Kind.BEGIN, json.dumps(order).encode())
+
+    def _far_us(self, epoch_us: int) -> int:
+        """Return the time that the far clock shows at this time of the harness's clock."""
+        now_s = self._clock.offset_s
+        if self._offset_s is None:
+            self._offset_s = now_s
+            self._tell({"offset_s": now_s})
+        elif abs(now_s - self._offset_s) > STEP_LIMIT_S:
+            self._end(
+                FAILED,
+                f"the clock of the far computer was set by {now_s - self._offset_s:.3g} s during the run: "
+                "switch off its time synchronisation, or wait until it has synchronised",
+            )
+        far_us = epoch_us + round(self._offset_s * MICROSECONDS)
+        self._tell({"epoch_us": far_us})
+        return far_us
+
+    # Cut off
+
+    def _cut(self) -> None:
+        """Note that the far computer is silent. Requests get answers without the agent from now on."""
+        if self._cut_off or not self._begun:
+            return
+        self._cut_off = True
+        self._tell({"cut_off": True})
+        for future in self._waiting.values():
+            if not future.done():
+                future.set_exception(ConnectionError())
+        self._waiting.clear()
+
+    def _return(self) -> None:
+        self._cut_off = False
+        self._tell({"cut_off": False})
+        if self._stop_events:
+            self._loop.create_task(self._ask(b'{"command": "stop_events"}\n'))
+            self._stop_events = False
+        if self._paused:
+            self._send_signal(signal.SIGSTOP)
+
+    # Datagrams
+
+    def _open(self) -> None:
+        """Open the mission's port and the control socket. The agent is ready."""
+        if self._udp is not None:
+            return
+        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._udp.setblocking(False)
+        self._udp.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._udp.bind(("", self._mission["network"]["port"]))
+        self._loop.add_reader(self._udp, self._arrive)
+        self._opening = self._loop.create_task(self._serve())
+
+    def _arrive(self) -> None:
+        """Send the datagrams that arrived at the vehicle to the agent."""
+        assert self._udp is not None
+        for _ in range(DATAGRAMS_PER_TURN):
+            try:
+                data, (address, _) = self._udp.recvfrom(MAX_DATAGRAM_BYTES)
+            except OSError:
+                return
+            if address == self._mission["network"]["address"]:
+                continue  # the echo of the agent's own broadcast
+            if self._connection is not None and not self._cut_off and self._connection.unsent < MAX_UNSENT_BYTES:
+                self._connection.send(Kind.DATAGRAM, socket.inet_aton(address) + data)
+
+    def _release(self, data: bytes) -> None:
+        """Broadcast a datagram of the agent in the lab."""
+        self._released += 1
+        if self._udp is not None:
+            network = self._mission["network"]
+            with contextlib.suppress(OSError):
+                self._udp.sendto(data, (network["broadcast"], network["port"]))
+
+    # Files
+
+    def _write_trace(self, data: bytes) -> None:
+        self._positions["TRACE"] += len(data)
+        if self._trace_problem is None:
+            try:
+                self._trace.write(data)
+            except OSError as error:
+                self._trace_problem = error.strerror
+
+    def _write_file(self, name: str, data: bytes) -> None:
+        try:
+            write_atomically(self._directory / name, data.decode(errors="replace"))
+        except OSError as error:
+            sys.stderr.write(f"{name} cannot be written: {error.strerror}\n")
+
+    def _forward_lag(self, data: bytes) -> None:
+        self._positions["LAG"] += len(data)
+        *lines, self._lag = (self._lag + data).split(b"\n")
+        for line in lines:
+            self._tell({"lag": line.decode("ascii", "replace")})
+
+    # Requests
+
+    async def _serve(self) -> None:
+        """Create the control socket."""
+        name = f"{self._agent_id}.control"
+        temporary = f".{name}.{os.getpid()}"
+        self._server = await asyncio.start_unix_server(self._serve_client, temporary, limit=MAX_REQUEST_BYTES)
+        Path(temporary).rename(name)
+
+    async def _serve_client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            while (line := await reader.readline()).endswith(b"\n"):
+                if not (answer := await self._handle(line)):
+                    break
+                writer.write(answer)
+                await writer.drain()
+        writer.close()
+
+    async def _handle(self, line: bytes) -> bytes:
+        """Return the answer to a request. Empty if the agent closed its control socket."""
+        try:
+            request = parse_json(line)
+        except ValueError:
+            request = None
+        request = request if isinstance(request, dict) else {}
+        command = request.get("command")
+        if command == "start" and type(request.get("epoch_us")) is int:
+            line = json.dumps({**request, "epoch_us": self._far_us(request["epoch_us"])}).encode() + b"\n"
+        if self._cut_off:
+            return self._handle_alone(command)
+        try:
+            answer = await self._ask(line)
+        except (ConnectionError, TimeoutError):
+            return self._handle_alone(command)
+        if not answer or command not in ("status", "export"):
+            return answer
+        return self._edited(command, answer)
+
+    async def _ask(self, line: bytes) -> bytes:
+        """Send a request to the agent and return its answer. Raises ConnectionError or TimeoutError."""
+        if self._connection is None:
+            raise ConnectionError
+        self._requests += 1
+        number = self._requests
+        future = self._waiting[number] = self._loop.create_future()
+        self._connection.send(Kind.REQUEST, number.to_bytes(NUMBER_BYTES, "big") + line)
+        try:
+            return await asyncio.wait_for(future, ANSWER_LIMIT_S)
+        finally:
+            self._waiting.pop(number, None)
+
+    def _answer(self, payload: bytes) -> None:
+        future = self._waiting.get(int.from_bytes(payload[:NUMBER_BYTES], "big"))
+        if future is not None and not future.done():
+            future.set_result(payload[NUMBER_BYTES:])
+
+    def _edited(self, command: str, answer: bytes) -> bytes:
+        """Return the answer with the numbers and paths that hold in the lab."""
+        try:
+            document = parse_json(answer)
+        except ValueError:
+            return answer
+        if not isinstance(document, dict) or document.get("ok") is not True:
+            return answer
+        if command == "export":
+            document["path"] = str(self._directory / f"{self._agent_id}.chain.json")
+        else:
+            self._status = document
+            failures = document.get("send_failures")
+            if type(failures) is int:
+                document["send_failures"] = failures + self._lost
+            document["trace_problem"] = document.get("trace_problem") or self._trace_problem
+        return json.dumps(document).encode() + b"\n"
+
+    def _handle_alone(self, command: object) -> bytes:
+        """Return an answer while the vehicle is cut off."""
+        if command == "status" and self._status is not None:
+            answer = self._status
+        elif command == "stop_events":
+            self._stop_events = True  # sent when the vehicle is back
+            answer = {"ok": True}
+        else:
+            why = "the connection to its computer is lost: run `ucp-harness join` there again"
+            answer = {"ok": False, "error": why}
+        return json.dumps(answer).encode() + b"\n"
+
+    # The end
+
+    def _send_signal(self, number: int) -> None:
+        if self._connection is not None:
+            self._connection.send(Kind.SIGNAL, json.dumps({"number": int(number)}).encode())
+
+    def _terminate(self) -> None:
+        if self._connection is None or self._cut_off or not self._begun:
+            self._end(FAILED, "the connection to the far computer is lost, so the agent could not export its chain")
+        else:
+            self._send_signal(signal.SIGTERM)
+
+    def _pause(self) -> None:
+        """Suspend the agent. Datagrams wait in the socket of this program, as they would in the agent's socket."""
+        self._paused = True
+        if self._udp is not None:
+            self._loop.remove_reader(self._udp)
+        self._send_signal(signal.SIGSTOP)
+
+    def _resume(self) -> None:
+        self._paused = False
+        self._send_signal(signal.SIGCONT)
+        if self._udp is not None:
+            self._loop.add_reader(self._udp, self._arrive)
+
+    def _kill(self) -> None:
+        """Kill the agent, and wait for the rest of its trace."""
+        if self._connection is None or self._cut_off:
+            self._end(-signal.SIGKILL)
+            return
+        self._send_signal(signal.SIGKILL)
+        self._loop.call_later(KILL_LIMIT_S, self._end, -signal.SIGKILL)
+
+    def _exit(self, how: dict[str, Any]) -> None:
+        if how.get("gone"):
+            self._end(FAILED, "the far computer has started anew, and the agent of this incarnation is gone")
+            return
+        if self._connection is not None:
+            self._connection.send(Kind.IDLE)  # the far end may end
+        self._tell({"left_behind": how["left_behind"]})
+        self._end(int(how["status"]))
+
+
+def main() -> None:
+    path = Path(sys.argv[2])
+    mission = read_json(path, MAX_MISSION_BYTES)
+    outside = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        connect_path(outside, Path(sys.argv[1]))
+    except OSError as error:
+        sys.exit(f"the harness cannot be reached: {error.strerror}")
+    outside.setblocking(False)
+
+    async def run() -> int:
+        return await StandIn(outside, mission, Path.cwd()).run()
+
+    status = asyncio.run(run())
+    if status >= 0:
+        sys.exit(status)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if -status != signal.SIGKILL:
+        signal.signal(-status, signal.SIG_DFL)
+    os.kill(os.getpid(), -status)
+
+
+if __name__ == "__main__":
+    main()
