@@ -1,7 +1,8 @@
 """Check the requirements of tests that need more than Python. A test is skipped if a requirement is missing.
 
 The environment variable `UCP_REQUIRE` lists requirements that must not be missing, separated by commas: "lab", "netem",
-"nftables", "uml", "cc", "browser", "tshark", "docker", "tlc", "jq" and "ros". If one is missing, the test fails.
+"nftables", "uml", "cc", "browser", "tshark", "docker", "tlc", "jq", "zizmor" and "ros". If one is missing, the test
+fails.
 """
 
 from __future__ import annotations

