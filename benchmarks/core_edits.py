@@ -21,10 +21,10 @@ import yaml
 ROOT = Path(__file__).parents[1]
 EDITS = Path(__file__).with_name("core_edits.yaml")
 MISSION = {
-    "duration_s": 800,
+    "duration_s": 500,
     "network": {"loss": 0.3, "duplicate": 0.1},
     "vehicles": {"kind": "none"},
-    "events": {"source": "random", "mean_s": 8},
+    "events": {"source": "random", "mean_s": 12},
     "final_reconcile": True,
 }
 FILES = {
@@ -37,7 +37,7 @@ import pytest
 
 @pytest.mark.swarm(**{ ({key: value for key, value in MISSION.items() if key != "duration_s"})!r})
 def test_swarm(swarm):
-    swarm.run_for(800)
+    swarm.run_for(500)
     swarm.final_reconcile()
 """,
 }

@@ -48,7 +48,10 @@ def in_words(proof: Proof) -> Iterator[str]:
         yield f"  a shortest path to it, {example.instants} instants: {example.replay}"
         if proof.flaw is not None and PLAYED[proof.flaw.kind] not in example.judged:
             yield "    not confirmed: the simulation takes another path"
-        yield from _played(example)
+        if proof.flaw is None and not example.judged:
+            yield "    played: a run cannot show that no path leads to one chain"
+        else:
+            yield from _played(example)
 
 
 def _tighter(bounds: Bounds) -> list[str]:

@@ -61,6 +61,7 @@ def test_violation_after_further_votes_is_a_printed_reason(tmp_path: Path) -> No
     assert done.returncode == 1, done.stderr
     assert "✘ not shown, one chain" in done.stdout
     assert "after further votes a violation ended a path: Algorithm 3, receive_request_add_block" in done.stdout
+    assert "played: a run cannot show that no path leads to one chain" in done.stdout
 
 
 def test_agent_that_depends_on_a_counter_is_refused(tmp_path: Path) -> None:
