@@ -301,12 +301,12 @@ class _Link:
             self._bad = before._bad and conditions == before.conditions
             self._last, self._departures = before._last, before._departures
 
-    def enqueue(self, now: float, bits: int, lots: _Copy, second: _Copy | None = None) -> tuple[float, ...]:
+    def enqueue(self, now: float, bits: int, draws: _Copy, second: _Copy | None = None) -> tuple[float, ...]:
         """Send a packet at the time `now`. Return the delays in seconds of the copies that arrive: of the packet, and
         of its duplicate if it has one.
         """
         conditions = self.conditions
-        loss, turn, corruption, reordering, latency = lots
+        loss, turn, corruption, reordering, latency = draws
         lost = self._loses(loss, turn)
         if lost and second is None:
             return ()
@@ -319,12 +319,12 @@ class _Link:
             return copies
         return (delay_s, *copies)
 
-    def _loses(self, lot: float, turn: float) -> bool:
+    def _loses(self, draw: float, turn: float) -> bool:
         loss, bad = self.conditions.loss, self._bad
         if not isinstance(loss, GilbertElliott):
-            return lot < loss
+            return draw < loss
         self._bad = turn >= loss.r if bad else turn < loss.p
-        return lot < (loss.loss_bad if bad else loss.loss_good)
+        return draw < (loss.loss_bad if bad else loss.loss_good)
 
     def _wait(self, now: float, bits: int, latency: float) -> float:
         """Put a packet into the queue of the link, and return its delay in seconds."""

@@ -298,8 +298,8 @@ class PilotLink(asyncio.Protocol):
         # firmware older than 4.0 does not report its pre-arm checks; it is asked to arm and says no
         reports = message.onboard_control_sensors_present & check
         self.state.ready_to_arm = not reports or bool(message.onboard_control_sensors_health & check)
-        tells = message.onboard_control_sensors_present & mavlink.MAV_SYS_STATUS_AHRS
-        self._estimate_is_good = not tells or bool(message.onboard_control_sensors_health & tells)
+        estimator_bit = message.onboard_control_sensors_present & mavlink.MAV_SYS_STATUS_AHRS
+        self._estimate_is_good = not estimator_bit or bool(message.onboard_control_sensors_health & estimator_bit)
         voltage, left = message.voltage_battery, message.battery_remaining
         self.state.battery = Battery(None if voltage == 0xFFFF else voltage / 1e3, None if left < 0 else left / 100)
 

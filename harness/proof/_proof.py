@@ -187,7 +187,7 @@ class Proof:
             "crossing": bounds.crossing,
             "settings": dict(bounds.settings),
             "stagger": dict(bounds.stagger),
-            **(self._captors_json() if bounds.captured is not None else {}),
+            **(self._attacker_json() if bounds.captured is not None else {}),
             "quirks": dict(bounds.quirks),
             "reduced": bounds.reduced,
             "steps_judged": bounds.steps,
@@ -206,7 +206,7 @@ class Proof:
             "example": None if self.example is None else self.example.to_json(),
         }
 
-    def _captors_json(self) -> dict[str, Any]:
+    def _attacker_json(self) -> dict[str, Any]:
         return {
             "captured": self.bounds.captured,
             "lies": None if self.bounds.network == "any" else self.bounds.lies,
@@ -343,9 +343,9 @@ def _show(proof: Proof, graph: StateGraph, path: Path, name: str) -> None:
 
 
 def _example(graph: StateGraph, number: int, sentence: str, path: Path, name: str) -> ViolationExample:
-    way = graph.path(number)
-    script = PathScript(graph, way)
+    states = graph.path(number)
+    script = PathScript(graph, states)
     played = play(script.document(name))
-    said = [f"{sentence[:1].upper()}{sentence[1:]}: {len(way) - 1} instants after the beginning."]
+    said = [f"{sentence[:1].upper()}{sentence[1:]}: {len(states) - 1} instants after the beginning."]
     said += [f"This path needs a condition: it happens only {NO_CLOCKS}."] if script.contradictory else []
-    return keep(played, path, graph.swarm.bounds, len(way) - 1, said)
+    return keep(played, path, graph.swarm.bounds, len(states) - 1, said)

@@ -291,7 +291,7 @@ def _track_paths(segments: Sequence[TrackSegment], to_px: MapProjection) -> Mark
     """
     lines = thin([[to_px(fix) for fix in segment.fixes] for segment in segments], MAX_POINTS)
     classes = [css_class(segment.division, segment.vehicle) for segment in segments]
-    drawn = sorted(zip(classes, segments, lines, strict=True), key=lambda way: TRACK_CLASSES.index(way[0]))
+    drawn = sorted(zip(classes, segments, lines, strict=True), key=lambda track: TRACK_CLASSES.index(track[0]))
     return Markup("\n").join(
         Markup('<path class="way {}" d="M{}"><title>{}</title></path>').format(
             which, "L".join(f"{n(x)} {n(y)}" for x, y in line), _segment_tip(segment)

@@ -51,8 +51,8 @@ def mission_s(timestamp_us: int, header: TraceHeader) -> float | None:
     describe the clock.
     """
     clock = header.clock
-    told = [clock.get("epoch_us"), clock.get("offset_s", 0), clock.get("drift", 0)]
-    epoch_us, offset_s, drift = (float(part) if isinstance(part, int | float) else None for part in told)
+    values = [clock.get("epoch_us"), clock.get("offset_s", 0), clock.get("drift", 0)]
+    epoch_us, offset_s, drift = (float(part) if isinstance(part, int | float) else None for part in values)
     if epoch_us is None or offset_s is None or drift is None or drift <= -1:
         return None
     return ((timestamp_us - epoch_us) / MICROSECONDS - offset_s) / (1 + drift)

@@ -46,7 +46,7 @@ class AdoptingCore(_Core):
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Any) -> None:
         super().__init__(agent_id, initial_data, settings)
-        self.told_sealed: bytes | None = None
+        self.recorded_seal: bytes | None = None
         """The encrypted event data of this step, as the agent recorded it. The core cannot encrypt it without the
         agent's keys.
         """
@@ -59,7 +59,7 @@ class AdoptingCore(_Core):
         that the agent recorded.
         """
         events = bytes(self.current_block)
-        sealed = self.told_sealed
+        sealed = self.recorded_seal
         return sealed if self._seals and sealed and len(sealed) == len(events) + SEAL_BYTES else events
 
     def changed(self, operation: str, block: Block) -> None:
@@ -106,16 +106,20 @@ class AdoptingCore(_Core):
         """Return true if the last step sent exactly these messages."""
         if len(sent) != len(self.outbox):
             return False
-        for number, told in enumerate(sent):
+        for number, recorded in enumerate(sent):
             sequence, message = self.outbox[number]
             try:
-                datagram = decoded(told.datagram)
+                datagram = decoded(recorded.datagram)
             except MalformedDatagramError:
                 return False
             if datagram.message != message or datagram.sequence != sequence or datagram.sender != self.agent_id:
                 return False
             about = block_named(message)
-            if told.message != message.NAME or told.seq != sequence or told.block != (about.hex() if about else None):
+            if (
+                recorded.message != message.NAME
+                or recorded.seq != sequence
+                or recorded.block != (about.hex() if about else None)
+            ):
                 return False
         return True
 

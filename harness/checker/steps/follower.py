@@ -168,7 +168,7 @@ class StepComparer:
             else:
                 handler, inputs = self._input(line, run, now)
                 core.running = handler
-                core.told_sealed = sealed_of(run.sealed)
+                core.recorded_seal = sealed_of(run.sealed)
                 if self.stops_before_handler:
                     breakpoint()
                 branch = handler.run(core, *inputs)

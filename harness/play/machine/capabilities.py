@@ -167,10 +167,11 @@ def _found(answer: Estimate, factor: float) -> tuple[str, str, str]:
 
 def _lateness(measured: EngineMeasurement) -> str:
     late = measured.to_json()["lateness"]
-    way, timers = (
+    latency, timers = (
         f"{late[key]['median_s'] * 1000:.2g} ms (1 in 100: {late[key]['p99_s'] * 1000:.2g} ms or more)"
         for key in ("way", "timers")
     )
     return (
-        f"{measured.engine}: without conditions, packets took {way} on this machine, and its timers were {timers} late"
+        f"{measured.engine}: without conditions, packets took {latency} on this machine, and its "
+        f"timers were {timers} late"
     )

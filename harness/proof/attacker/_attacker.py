@@ -65,7 +65,7 @@ class Attacker:
         self._knowledge: dict[int, _KnowledgeFromAgent] = {}
         self._forgeries: dict[tuple[int, ForgeryMaterial], tuple[int, ...]] = {}
 
-    def lies(self, locals_: tuple[int, ...]) -> Iterator[tuple[AgentAction, ...]]:
+    def forged_messages(self, locals_: tuple[int, ...]) -> Iterator[tuple[AgentAction, ...]]:
         """Yield the attacker's actions that have an effect: each message, combined with each set of receivers that it
         affects.
         """
@@ -91,18 +91,18 @@ class Attacker:
         """Yield the index of each living agent, and the blocks and hashes from which the attacker can form messages to
         it.
         """
-        looks = {place: self._look(local) for place, local in enumerate(locals_) if local != DEAD}
-        blocks = self._own.union(*(look.committed for look in looks.values()))
-        named = frozenset(block.block_hash for block in blocks).union(*(look.named for look in looks.values()))
-        for place in looks:
-            others = frozenset(look.asked for other, look in looks.items() if other != place)
+        knowledge = {place: self._known_from(local) for place, local in enumerate(locals_) if local != DEAD}
+        blocks = self._own.union(*(agent.committed for agent in knowledge.values()))
+        named = frozenset(block.block_hash for block in blocks).union(*(agent.named for agent in knowledge.values()))
+        for place in knowledge:
+            others = frozenset(agent.asked for other, agent in knowledge.items() if other != place)
             yield place, ForgeryMaterial(blocks, named, others - {PendingQuestions()}, self._times_us)
 
-    def _look(self, local: int) -> _KnowledgeFromAgent:
-        look = self._knowledge.get(local)
-        if look is None:
-            look = self._knowledge[local] = looked_at(self._local.state(local))
-        return look
+    def _known_from(self, local: int) -> _KnowledgeFromAgent:
+        known = self._knowledge.get(local)
+        if known is None:
+            known = self._knowledge[local] = looked_at(self._local.state(local))
+        return known
 
     def _to(self, local: int, material: ForgeryMaterial) -> Iterable[int]:
         key = local, material

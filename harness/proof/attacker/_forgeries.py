@@ -59,29 +59,29 @@ def asked(state: AgentState) -> PendingQuestions:
     )
 
 
-def forgeries(state: AgentState, captor: int, material: ForgeryMaterial) -> Iterator[Message]:
-    """Yield the messages in the name of vehicle `captor` that have an effect.
+def forgeries(state: AgentState, captured: int, material: ForgeryMaterial) -> Iterator[Message]:
+    """Yield the messages in the name of vehicle `captured` that have an effect.
 
     A message can affect the agent that receives it, or other agents through its answer.
     """
-    yield from _answers(state, captor, material)
+    yield from _answers(state, captured, material)
     if not state.reconcile_in_progress:
         yield from _commits(state, material.blocks)
         yield ChainHashSuccessorQuery(NOBODYS)
         yield from _questions(state, material.others)
 
 
-def _answers(state: AgentState, captor: int, material: ForgeryMaterial) -> Iterator[Message]:
+def _answers(state: AgentState, captured: int, material: ForgeryMaterial) -> Iterator[Message]:
     """Yield forged answers to the agent's own queries. An agent counts only one answer of each sender."""
     waits = asked(state)
-    if waits.vote is not None and captor not in state.voters:
+    if waits.vote is not None and captured not in state.voters:
         block_hash, chain_hash = waits.vote
         for approve in (False, True):
             yield BlockAddResponse(block_hash, approve, chain_hash if state.settings.vote_names_chain else None)
-    if waits.contains is not None and captor not in state.reconcile_responders:
+    if waits.contains is not None and captured not in state.reconcile_responders:
         for contained in (False, True):
             yield ChainContainResponse(waits.contains, contained)
-    if waits.successor is not None and captor not in state.reconcile_responders:
+    if waits.successor is not None and captured not in state.reconcile_responders:
         for candidate in (None, *sorted(material.named)):
             known = state.reconcile_response_dictionary.get(candidate or b"")
             for timestamp_us in material.times_us if known is None else known[1:]:

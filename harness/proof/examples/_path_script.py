@@ -101,7 +101,7 @@ class PathScript:
         self._late: dict[int, dict[int, float]] = defaultdict(dict)
         self._end_s = 0.0
         self._latency_s = LATENCY_S
-        attacker = self._swarm.captor
+        attacker = self._swarm.attacker
         self._attack_entries = (
             None if attacker is None else AttackEntries(self._swarm.local, attacker.captured, attacker.made)
         )
@@ -202,8 +202,8 @@ class PathScript:
                 now = max(nominal_s, earliest)
                 if now > nominal_s + 1e-9:
                     self._late[agent.agent_id][number] = now - nominal_s
-                self._ages.require_older(*self._swarm.local.older(agent.local, action.number, action.way))
-                step = self._swarm.local.end_timer(agent.local, action.number, action.way)
+                self._ages.require_older(*self._swarm.local.older(agent.local, action.number, action.result))
+                step = self._swarm.local.end_timer(agent.local, action.number, action.result)
             else:
                 now = other_s
                 if action.what != "lie":  # all receivers get a lie at the same moment
@@ -212,8 +212,8 @@ class PathScript:
             acted_s = max(acted_s, now)
             air += self._apply(agent, step, now)
         self._end_s = max(self._end_s, acted_s)
-        for wave in _waves_in_order(move.wave):
-            air = self._hear(wave, self._in_wave_order(wave, air), acted_s)
+        for message_round in _rounds_in_order(move.last_round):
+            air = self._hear(message_round, self._in_round_order(message_round, air), acted_s)
         self._ages.renumber(move.blocks)
         self._agents = [self._agents[old] for old in move.places]
         for agent, local in zip(self._agents, move.state[AGENTS:], strict=True):
@@ -257,21 +257,25 @@ class PathScript:
             flights.append(_BroadcastOnPath(agent.agent_id, message, name, self._sent[agent.agent_id, name], now))
         return flights
 
-    def _in_wave_order(self, wave: MessageRound, flights: Sequence[_BroadcastOnPath]) -> list[_BroadcastOnPath]:
-        """Return the broadcasts in the order in which the round `wave` lists them."""
+    def _in_round_order(
+        self, message_round: MessageRound, flights: Sequence[_BroadcastOnPath]
+    ) -> list[_BroadcastOnPath]:
+        """Return the broadcasts in the order in which the round `message_round` lists them."""
         left, ordered = list(flights), []
-        for place, message in wave.air:
+        for place, message in message_round.air:
             sender = self._agents[place].agent_id
             flight = next(flight for flight in left if (flight.sender, flight.message) == (sender, message))
             left.remove(flight)
             ordered.append(flight)
         return ordered
 
-    def _hear(self, wave: MessageRound, air: Sequence[_BroadcastOnPath], acted_s: float) -> list[_BroadcastOnPath]:
-        """Deliver the messages of the round `wave` to each agent, and return the answers."""
+    def _hear(
+        self, message_round: MessageRound, air: Sequence[_BroadcastOnPath], acted_s: float
+    ) -> list[_BroadcastOnPath]:
+        """Deliver the messages of the round `message_round` to each agent, and return the answers."""
         answers: dict[int, list[_BroadcastOnPath]] = {}
         received: set[int] = set()
-        for place, heard in enumerate(wave.heard):
+        for place, heard in enumerate(message_round.heard):
             agent = self._agents[place]
             answers[place] = []
             if agent.local == DEAD:
@@ -280,7 +284,7 @@ class PathScript:
                 if flight.sender != agent.agent_id and number not in heard:
                     flight.lost_by.append(agent.agent_id)
                     self.losses += 1
-            order_matters = self._swarm.order_matters(agent.local, place, wave, heard)
+            order_matters = self._swarm.order_matters(agent.local, place, message_round, heard)
             last_s = acted_s
             for number in heard:
                 received.add(number)
@@ -294,7 +298,7 @@ class PathScript:
                     self._fate(flight, agent.agent_id, delay_s=round(arrives_s - flight.sent_s, 6))
                 last_s = arrives_s
                 self._end_s = max(self._end_s, arrives_s)
-                sender = self._swarm.name_of(wave.air[number][0], place)
+                sender = self._swarm.name_of(message_round.air[number][0], place)
                 answers[place] += self._apply(
                     agent, self._swarm.local.hear(agent.local, sender, flight.message), last_s
                 )
@@ -304,7 +308,7 @@ class PathScript:
             else:
                 for agent_id in flight.lost_by:
                     self._fate(flight, agent_id, drop=True)
-        return [flight for place in range(len(wave.heard)) for flight in answers[place]]
+        return [flight for place in range(len(message_round.heard)) for flight in answers[place]]
 
     def _fate(self, flight: _BroadcastOnPath, receiver: int | None, **what: Any) -> None:
         whom = {} if receiver is None else {"receiver": receiver}
@@ -318,9 +322,9 @@ class PathScript:
                     self._late[agent.agent_id][number] = self._end_s + MOMENT_S - ends_s
 
 
-def _waves_in_order(last: MessageRound | None) -> list[MessageRound]:
-    waves = []
+def _rounds_in_order(last: MessageRound | None) -> list[MessageRound]:
+    rounds = []
     while last is not None:
-        waves.append(last)
+        rounds.append(last)
         last = last.before
-    return waves[::-1]
+    return rounds[::-1]

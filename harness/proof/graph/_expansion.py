@@ -18,7 +18,7 @@ _Following = dict[Actions, dict[int, None]]
 
 
 class StateExpansion(NamedTuple):
-    """The successors of one state of the swarm. `ways` is the number of transitions from the state to its successors.
+    """The successors of one state of the swarm. `transitions` is the number of transitions from this state.
 
     The other fields contain only successors without a lost message and without a new block. For each timer that may
     expire next, `by_timer` contains the possible successors: the timer expires alone, or timers that must expire at the
@@ -26,7 +26,7 @@ class StateExpansion(NamedTuple):
     at once.
     """
 
-    ways: int
+    transitions: int
     by_timer: tuple[tuple[int, ...], ...]
     crossing: tuple[int, ...]
 
@@ -36,21 +36,21 @@ def expanded(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpan
     its number.
     """
     lossy = swarm.bounds.network == "lossy"
-    ways = 0
+    transitions = 0
     losing_nothing: _Following = {}
     ending = [*swarm.ending(state)]
     for actions in swarm.actions(state, ending):
         numbers = [number_of(after) for after in swarm.after(state, actions, lossy)]
-        ways += len(numbers)
+        transitions += len(numbers)
         if not lossy:
             losing_nothing[actions] = dict.fromkeys(numbers)
-    return _quiet(swarm, state, number_of, ending, losing_nothing)._replace(ways=ways)
+    return _quiet(swarm, state, number_of, ending, losing_nothing)._replace(transitions=transitions)
 
 
 def quiet(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
     """Return those successors of a state that are reached without a lost message and without a new block.
 
-    The field `ways` of the result is 0.
+    The field `transitions` of the result is 0.
     """
     return _quiet(swarm, state, number_of, [*swarm.ending(state)], {})
 

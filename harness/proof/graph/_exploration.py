@@ -68,7 +68,7 @@ class StateGraph:
         the state numbers.
         """
         number = len(self.quiet)
-        self.transitions += expansion.ways
+        self.transitions += expansion.transitions
         self.quiet.append(expansion.by_timer)
         if expansion.crossing:
             self.crossing[number] = expansion.crossing

@@ -257,7 +257,7 @@ class _WorkerHandle:
             for _ in range(new):
                 numbers.append(add(next(fresh), parent))
             yield StateExpansion(
-                expansion.ways,
+                expansion.transitions,
                 tuple(tuple(numbers[reported] for reported in after) for after in expansion.by_timer),
                 tuple(numbers[reported] for reported in expansion.crossing),
             )

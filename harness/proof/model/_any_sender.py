@@ -164,7 +164,7 @@ class _BlockDistribution:
                         busy = True
                         self._hear(states[position], said)
                     heard[key] = len(states)
-                    self._captor_hears(said)
+                    self._attacker_hears(said)
                     yield ExplorationProgress(
                         earlier + len(self._came_from),
                         collected.looked_at + self._looked_at,
@@ -226,7 +226,7 @@ class _BlockDistribution:
         if step.local != local or step.sent or step.started:
             self._go(state, step, f"it hears a {self.local.messages[said[1]].NAME} from agent {said[0]}")
 
-    def _captor_hears(self, said: Said) -> None:
+    def _attacker_hears(self, said: Said) -> None:
         if self._heard is not None:
             self._heard.hears(said[0], self.local.messages[said[1]])
 
@@ -237,12 +237,12 @@ class _BlockDistribution:
         if self._heard is None:
             return False
         material, before = self._heard.material(agent_id), self._lied.get(agent_id)
-        told = 0 if before is None or before[0] != material else before[1]
-        for state in states[told:]:
+        done = 0 if before is None or before[0] != material else before[1]
+        for state in states[done:]:
             for message in self._heard.forgeries(self.local.state(state[1]), material):
                 self._lie(state, self.local.message(message))
         self._lied[agent_id] = material, len(states)
-        return told < len(states)
+        return done < len(states)
 
     def _lie(self, state: Alone, message: int) -> None:
         agent_id, local, _, completed = state

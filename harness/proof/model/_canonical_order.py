@@ -109,25 +109,29 @@ class CanonicalOrder:
         """
         known, pattern = self._local.known, self._local.pattern
         bounds = self._zones.bounds(zone) if zone else [()]
-        looks: list[tuple[Any, ...]] = [
+        descriptions: list[tuple[Any, ...]] = [
             (DEAD,) if local == DEAD else (known[pattern(local)].anonymous, *bounds[own.start : own.stop])
             for local, own in zip(locals_, timers, strict=True)
         ]
-        groups = _groups(looks)
+        groups = _groups(descriptions)
         some_named = any(local != DEAD and known[local].names_others for local in locals_)
         if all(len(group) == 1 or (not some_named and self._are_one(group, locals_, timers)) for group in groups):
             yield tuple(chain.from_iterable(groups))
             return
         if self._local.bounds.blocks_alike:
-            looks = self._with_blocks(locals_, looks)
+            descriptions = self._with_blocks(locals_, descriptions)
         named: list[list[set[int]]] = []
         if some_named:
             named = [self._named(local, place) for place, local in enumerate(locals_)]
-            looks = [
+            descriptions = [
                 (
-                    looks[place],
+                    descriptions[place],
                     *sorted(
-                        (looks[other], *(place in part for part in named[other]), *(other in part for part in here))
+                        (
+                            descriptions[other],
+                            *(place in part for part in named[other]),
+                            *(other in part for part in here),
+                        )
                         for other in range(len(locals_))
                         if other != place
                     ),
@@ -136,7 +140,7 @@ class CanonicalOrder:
             ]
         orders = [
             _unlike(group, locals_) if self._change_places_freely(group, timers, named) else permutations(group)
-            for group in _groups(looks)
+            for group in _groups(descriptions)
         ]
         for chosen in product(*orders):
             yield tuple(place for group in chosen for place in group)
@@ -145,18 +149,18 @@ class CanonicalOrder:
         """Return true if these agents are in the same state and have no running timers."""
         return not timers[group[0]] and len({locals_[place] for place in group}) == 1
 
-    def _with_blocks(self, locals_: Sequence[int], looks: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    def _with_blocks(self, locals_: Sequence[int], descriptions: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Return the description of each agent, extended with the positions of its blocks in the states of
         all agents.
         """
-        ranks = {look: rank for rank, look in enumerate(sorted(set(looks)))}
+        ranks = {description: rank for rank, description in enumerate(sorted(set(descriptions)))}
         where: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        for local, look in zip(locals_, looks, strict=True):
+        for local, description in zip(locals_, descriptions, strict=True):
             for position, block in enumerate(self._local.about(local)):
-                where[block].append((ranks[look], position))
+                where[block].append((ranks[description], position))
         return [
-            (look, *[tuple(sorted(where[block])) for block in self._local.about(local)])
-            for local, look in zip(locals_, looks, strict=True)
+            (description, *[tuple(sorted(where[block])) for block in self._local.about(local)])
+            for local, description in zip(locals_, descriptions, strict=True)
         ]
 
     def _change_places_freely(
@@ -213,12 +217,12 @@ class CanonicalOrder:
         return self._local.renamed(local, tuple(names))
 
 
-def _groups(looks: Sequence[Any]) -> list[list[int]]:
+def _groups(descriptions: Sequence[Any]) -> list[list[int]]:
     """Group the agents by equal descriptions. Return the positions of each group. The groups are in ascending order of
     their descriptions.
     """
-    in_order = sorted(range(len(looks)), key=looks.__getitem__)
-    return [list(group) for _, group in groupby(in_order, looks.__getitem__)]
+    in_order = sorted(range(len(descriptions)), key=descriptions.__getitem__)
+    return [list(group) for _, group in groupby(in_order, descriptions.__getitem__)]
 
 
 def _unlike(group: Sequence[int], locals_: Sequence[int]) -> Iterator[Places]:

@@ -55,13 +55,13 @@ class SwarmTransition(NamedTuple):
     """A transition between two states of the swarm: its actions, the new state, and the previous positions of the
     agents.
 
-    `wave` is the last round of messages in the transition.
+    `last_round` is the last round of messages in the transition.
     """
 
     actions: Actions
     state: State
     places: Places
-    wave: MessageRound | None
+    last_round: MessageRound | None
     started: tuple[Started, ...]
     """The timers that were started. Agents are identified by their positions before the transition."""
     blocks: Ordinals
@@ -71,14 +71,14 @@ class SwarmTransition(NamedTuple):
 class _InstantResult(NamedTuple):
     """The states of all agents after one instant: simultaneous actions, and all messages that they cause.
 
-    `running` contains the previous number of each running timer. `started` and `way` describe the events that led to
+    `running` contains the previous number of each running timer. `started` and `ending` describe the events that led to
     this result.
     """
 
     agents: tuple[int, ...]
     running: tuple[int, ...]
     started: tuple[Started, ...]
-    way: FinalMessageRound
+    ending: FinalMessageRound
 
 
 class _InstantResults(NamedTuple):
@@ -113,7 +113,7 @@ class ModelSwarm:
         self._as_they_are = tuple(range(bounds.agents))
         own = [1] * bounds.agents if bounds.alike else range(1, bounds.agents + 1)
         faults = sum(1 << ONCE.index(name) for name in bounds.faults if name != "duplicate")
-        self.captor = None if bounds.captured is None else Attacker(bounds, self.local)
+        self.attacker = None if bounds.captured is None else Attacker(bounds, self.local)
         if bounds.captured is not None:
             faults += (1 << ONCE.index("captured")) + bounds.lies * LIES
         faults += (bounds.coincidences or 0) * COINCIDENCES + (bounds.losses or 0) * LOSSES
@@ -134,8 +134,8 @@ class ModelSwarm:
             running = tuple([running[first - 1] for first in self.zones.firsts(state[ZONE])])
         return [
             [
-                AgentAction(place, "timer", timer, way)
-                for way in range(len(self.local.ends(state[AGENTS + place], timer)))
+                AgentAction(place, "timer", timer, result)
+                for result in range(len(self.local.ends(state[AGENTS + place], timer)))
             ]
             for place, timer in running
         ]
@@ -198,18 +198,18 @@ class ModelSwarm:
             if state[LEFT] >> bit & 1:
                 singly += [AgentAction(place, fault) for place in alive]
         yield from ((action,) for action in singly if self._may_coincide(state, (action,)))
-        if self.captor is not None:
-            yield from self._of_the_captor(self.captor, state)
+        if self.attacker is not None:
+            yield from self._of_the_attacker(self.attacker, state)
 
-    def _of_the_captor(self, captor: Attacker, state: State) -> Iterator[Actions]:
+    def _of_the_attacker(self, attacker: Attacker, state: State) -> Iterator[Actions]:
         """Yield the actions of the attacker: the capture of a vehicle, and later each forged message with any set of
         receivers.
         """
-        assert self.bounds.captured is not None, "it has somebody's keys"
+        assert self.bounds.captured is not None, "the attacker has the keys of a vehicle"
         if state[LEFT] >> ONCE.index("captured") & 1:
             yield (AgentAction(self.bounds.captured - 1, "captured"),)
         elif _lies(state):
-            yield from captor.lies(state[AGENTS:])
+            yield from attacker.forged_messages(state[AGENTS:])
 
     def _may_coincide(self, state: State, actions: Sequence[AgentAction]) -> bool:
         if self.bounds.coincidences is None:
@@ -243,9 +243,9 @@ class ModelSwarm:
             return
         seen = set()
         for places in choices:
-            looks = tuple(place if known[locals_[place]].running else -1 - locals_[place] for place in places)
-            if looks not in seen:
-                seen.add(looks)
+            described = tuple(place if known[locals_[place]].running else -1 - locals_[place] for place in places)
+            if described not in seen:
+                seen.add(described)
                 yield places
 
     # Results of an instant
@@ -259,23 +259,25 @@ class ModelSwarm:
         if instant is None:
             if len(self._known) >= MOST_KNOWN:
                 self._known.clear()
-            instant = self._known[key] = self._instant(*key, tell=False)
+            instant = self._known[key] = self._instant(*key, with_rounds=False)
         if self._can_be(state, instant):
             left = self._left(state, actions, instant)
             for outcome, there in zip(instant.outcomes, self._ordered(state, instant, left), strict=True):
-                still = left - outcome.way.lost * LOSSES
+                still = left - outcome.ending.lost * LOSSES
                 yield (state[BLOCKS] + instant.completed, still, there.zone, *there.agents)
 
     def moves(self, state: State, actions: Actions, lossy: bool) -> Iterator[SwarmTransition]:
         """Yield the transitions that these simultaneous actions can cause."""
-        instant = self._instant(state[AGENTS:], actions, self._most_lost(state, lossy), tell=True)
+        instant = self._instant(state[AGENTS:], actions, self._most_lost(state, lossy), with_rounds=True)
         if self._can_be(state, instant):
             left = self._left(state, actions, instant)
             ordered = self._ordered(state, instant, left)
             for outcome, there in zip(instant.outcomes, ordered, strict=True):
-                still = left - outcome.way.lost * LOSSES
+                still = left - outcome.ending.lost * LOSSES
                 after = (state[BLOCKS] + instant.completed, still, there.zone, *there.agents)
-                yield SwarmTransition(actions, after, there.places, outcome.way.wave, outcome.started, there.blocks)
+                yield SwarmTransition(
+                    actions, after, there.places, outcome.ending.last_round, outcome.started, there.blocks
+                )
 
     def _most_lost(self, state: State, lossy: bool) -> int:
         """Return the maximum number of messages that may be lost at one moment."""
@@ -314,7 +316,9 @@ class ModelSwarm:
             left -= self.coincidences(state, actions) * COINCIDENCES
         return left
 
-    def _instant(self, locals_: tuple[int, ...], actions: Actions, most_lost: int, *, tell: bool) -> _InstantResults:
+    def _instant(
+        self, locals_: tuple[int, ...], actions: Actions, most_lost: int, *, with_rounds: bool
+    ) -> _InstantResults:
         at = {timer: index + 1 for index, timer in enumerate(self._running(locals_))}
         left = ALL_LEFT
         for action in actions:
@@ -326,8 +330,12 @@ class ModelSwarm:
             left,
             int(any(action.what == "lie" for action in actions)),
             tuple(
-                _InstantResult(there.locals, self._running_after(at, there), there.started if tell else (), way)
-                for there, way in self._instants.outcomes(locals_, actions, most_lost, tell=tell).items()
+                _InstantResult(
+                    there.locals, self._running_after(at, there), there.started if with_rounds else (), ending
+                )
+                for there, ending in self._instants.outcomes(
+                    locals_, actions, most_lost, with_rounds=with_rounds
+                ).items()
             ),
         )
 
@@ -367,11 +375,11 @@ class ModelSwarm:
         """Return the ID by which the agent at position `place` knows the agent at position `other`."""
         return self._instants.name_of(other, place)
 
-    def order_matters(self, local: int, place: int, wave: MessageRound, heard: Sequence[int]) -> bool:
+    def order_matters(self, local: int, place: int, message_round: MessageRound, heard: Sequence[int]) -> bool:
         """Return true if the state of the agent at `place` depends on the order of the messages that it receives in
         this round.
         """
-        return self._instants.order_matters(local, place, wave, heard)
+        return self._instants.order_matters(local, place, message_round, heard)
 
     # Properties of a state
 

@@ -41,13 +41,13 @@ class AgentAction(NamedTuple):
     """An action of one agent: "timer" with the timer's number, "complete" with the block's number, or a fault.
 
     It can also be an action of the attacker: the agent is "captured", or receives a "lie", a forged message with this
-    number. If a timer has several possible results because any block may be the older one, `way` selects the result.
+    number. If a timer has several possible results because any block may be the older one, `result` selects the result.
     """
 
     place: int
     what: str
     number: int = 0
-    way: int = 0
+    result: int = 0
 
 
 Actions = tuple[AgentAction, ...]
@@ -81,7 +81,7 @@ class FinalMessageRound(NamedTuple):
     """
 
     lost: int
-    wave: MessageRound | None
+    last_round: MessageRound | None
 
 
 _Said = tuple[tuple[int, int], ...]
@@ -121,20 +121,23 @@ class InstantOutcomes:
         """Return the ID that the agent at position `place` uses for the agent at position `other`."""
         return self._names[place][other]
 
-    def order_matters(self, local: int, place: int, wave: MessageRound, heard: Sequence[int]) -> bool:
+    def order_matters(self, local: int, place: int, message_round: MessageRound, heard: Sequence[int]) -> bool:
         """Return true if the state of the agent at `place` depends on the order in which it receives the messages of
         this round.
         """
-        reached = tuple((self.name_of(wave.air[number][0], place), wave.air[number][1]) for number in sorted(heard))
-        return len(self._outcomes_of(local, reached, lossy=False, answered=wave.before is not None)) > 1
+        reached = tuple(
+            (self.name_of(message_round.air[number][0], place), message_round.air[number][1])
+            for number in sorted(heard)
+        )
+        return len(self._outcomes_of(local, reached, lossy=False, answered=message_round.before is not None)) > 1
 
     def outcomes(
-        self, locals_: tuple[int, ...], actions: Sequence[AgentAction], most_lost: int, *, tell: bool
+        self, locals_: tuple[int, ...], actions: Sequence[AgentAction], most_lost: int, *, with_rounds: bool
     ) -> dict[AgentStates, FinalMessageRound]:
         """Return the possible results of these actions. If the same result can be reached in several ways, keep the one
         with the fewest lost messages.
 
-        If `tell` is true, the result includes the rounds of messages.
+        If `with_rounds` is true, the result includes the rounds of messages.
         """
         agents, started = list(locals_), [()] * len(locals_)  # type: list[int], list[Started]
         air: list[tuple[int, int]] = []
@@ -154,26 +157,26 @@ class InstantOutcomes:
         while waiting:
             rounds += 1
             after: dict[tuple[AgentStates, _Said], FinalMessageRound] = {}
-            for (there, said), way in waiting.items():
+            for (there, said), ending in waiting.items():
                 if not said or not flawed.isdisjoint(there.locals):
-                    _keep(silent, there, way)
+                    _keep(silent, there, ending)
                     continue
-                for heard, answers, orders, lost in self._hear(there, said, most_lost - way.lost, rounds):
+                for heard, answers, orders, lost in self._hear(there, said, most_lost - ending.lost, rounds):
                     known = after.get((heard, answers))
-                    if known is None or way.lost + lost < known.lost:
-                        wave = MessageRound(way.wave, said, orders) if tell else None
-                        after[heard, answers] = FinalMessageRound(way.lost + lost, wave)
+                    if known is None or ending.lost + lost < known.lost:
+                        message_round = MessageRound(ending.last_round, said, orders) if with_rounds else None
+                        after[heard, answers] = FinalMessageRound(ending.lost + lost, message_round)
             waiting = after
         if not self._bounds.settles:
             return silent
         settled: dict[AgentStates, FinalMessageRound] = {}
-        for there, way in silent.items():
-            _keep(settled, AgentStates(tuple(map(self._local.settled, there.locals)), there.started), way)
+        for there, ending in silent.items():
+            _keep(settled, AgentStates(tuple(map(self._local.settled, there.locals)), there.started), ending)
         return settled
 
     def _act(self, local: int, action: AgentAction) -> AgentStep:
         if action.what == "timer":
-            return self._local.end_timer(local, action.number, action.way)
+            return self._local.end_timer(local, action.number, action.result)
         if action.what == "complete":
             return self._local.complete(local, action.number)
         if action.what == "reboot":
@@ -254,8 +257,8 @@ class InstantOutcomes:
             if self._bounds.reduced:
                 if answered and self._bounds.settles:
                     settled: dict[AgentStep, tuple[int, ...]] = {}
-                    for step, way in reversed(outcomes):
-                        _keep_fullest(settled, step._replace(local=self._local.settled(step.local)), way)
+                    for step, order in reversed(outcomes):
+                        _keep_fullest(settled, step._replace(local=self._local.settled(step.local)), order)
                     outcomes = list(settled.items())
                 if lossy and not self._counts_losses:  # losing the additional messages may count as several losses
                     outcomes = [outcome for outcome in outcomes if not _is_covered(outcome[0], outcomes)]
@@ -282,16 +285,16 @@ class InstantOutcomes:
                 return None
         if len({heard[position][0] for position in matter}) < len(matter):
             return None
-        ways: dict[int, tuple[int, ...]] = {local: ()}
+        orders: dict[int, tuple[int, ...]] = {local: ()}
         for position in matter:
             sender, message = heard[position]
-            if not all(only_counts(at, sender, message) for at in ways):
+            if not all(only_counts(at, sender, message) for at in orders):
                 return None
-            after = dict(ways) if lossy else {}
-            for at, way in ways.items():
-                _keep_fullest(after, hear(at, sender, message).local, (*way, position))
-            ways = after
-        return [(AgentStep(at, (), ()), (*way, *others)) for at, way in ways.items()]
+            after = dict(orders) if lossy else {}
+            for at, order in orders.items():
+                _keep_fullest(after, hear(at, sender, message).local, (*order, position))
+            orders = after
+        return [(AgentStep(at, (), ()), (*order, *others)) for at, order in orders.items()]
 
     def _in_any_order(self, local: int, heard: ReceivedMessages, lossy: bool, in_order: bool) -> Iterator[_Outcome]:
         matter = self._that_matter(local, heard)
@@ -303,7 +306,7 @@ class InstantOutcomes:
             for position in matter
         }
         begin = (AgentStep(local, (), ()), tuple(copies if position in matter else 0 for position in range(len(heard))))
-        ways: dict[tuple[AgentStep, tuple[int, ...]], tuple[int, ...]] = {begin: ()}
+        orders: dict[tuple[AgentStep, tuple[int, ...]], tuple[int, ...]] = {begin: ()}
         waiting = [begin]
         while waiting:
             node = waiting.pop()
@@ -322,17 +325,17 @@ class InstantOutcomes:
                     AgentStep(step.local, tuple(sorted(sent + step.sent)), self._still(started, step)),
                     tuple(still),
                 )
-                if after not in ways:
-                    ways[after] = (*ways[node], position)
+                if after not in orders:
+                    orders[after] = (*orders[node], position)
                     waiting.append(after)
         outcomes: dict[AgentStep, tuple[int, ...]] = {}
-        for (step, left), way in ways.items():
+        for (step, left), order in orders.items():
             ends_here = lossy or step.local in self._local.flawed or all(left[position] < copies for position in matter)
             if ends_here:
-                _keep_fullest(outcomes, step, way)
+                _keep_fullest(outcomes, step, order)
         others = [position for position in range(len(heard)) if position not in matter]
-        for step, way in outcomes.items():
-            yield step, (*way, *others)
+        for step, order in outcomes.items():
+            yield step, (*order, *others)
 
     def _that_matter(self, local: int, heard: ReceivedMessages) -> list[int]:
         """Return the indices of the messages that may change the agent or cause an answer, at once or after other
@@ -356,18 +359,18 @@ class InstantOutcomes:
         return sorted(matter)
 
 
-def _keep(ways: dict[AgentStates, FinalMessageRound], there: AgentStates, way: FinalMessageRound) -> None:
+def _keep(results: dict[AgentStates, FinalMessageRound], there: AgentStates, ending: FinalMessageRound) -> None:
     """Store this path to a result, unless a path with as few lost messages is already stored."""
-    known = ways.get(there)
-    if known is None or way.lost < known.lost:
-        ways[there] = way
+    known = results.get(there)
+    if known is None or ending.lost < known.lost:
+        results[there] = ending
 
 
-def _keep_fullest(ways: dict[_Key, tuple[int, ...]], there: _Key, way: tuple[int, ...]) -> None:
+def _keep_fullest(orders: dict[_Key, tuple[int, ...]], there: _Key, order: tuple[int, ...]) -> None:
     """Store this path to a result, unless a path with as many different messages is already stored."""
-    known = ways.get(there)
-    if known is None or len(set(way)) > len(set(known)):
-        ways[there] = way
+    known = orders.get(there)
+    if known is None or len(set(order)) > len(set(known)):
+        orders[there] = order
 
 
 def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[_Choice, ...]]:

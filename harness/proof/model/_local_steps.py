@@ -130,9 +130,9 @@ class LocalStates(KnownStates):
             )
         return counts
 
-    def end_timer(self, local: int, timer: int, way: int = 0) -> AgentStep:
-        """Return the step of an agent whose timer expires. If several results are possible, `way` selects one."""
-        return self.ends(local, timer)[way].step
+    def end_timer(self, local: int, timer: int, result: int = 0) -> AgentStep:
+        """Return the step of an agent whose timer expires. If several results are possible, `result` selects one."""
+        return self.ends(local, timer)[result].step
 
     def ends(self, local: int, timer: int) -> list[TimerResult]:
         """Return the possible results when a timer expires.
@@ -152,14 +152,14 @@ class LocalStates(KnownStates):
             ends = self._ends[key] = [TimerResult(step, candidate) for step, candidate in steps.items()]
         return ends
 
-    def older(self, local: int, timer: int, way: int) -> tuple[int, frozenset[int]]:
+    def older(self, local: int, timer: int, result: int) -> tuple[int, frozenset[int]]:
         """Return the block that must be the oldest candidate for this result of a timer expiry, and the candidates that
         must be newer.
 
         Block 0 is the inception block. The set of candidates is empty if the agent does not compare ages.
         """
         ends = self.ends(local, timer)
-        oldest = ends[way].oldest
+        oldest = ends[result].oldest
         if oldest is None or len(ends) == 1:
             return 0, frozenset()
         snapshot = self.known[local].snapshot

@@ -206,7 +206,7 @@ def _copied(value: Any) -> Any:
     """Return a copy that shares no mutable object with the original."""
     copy = _COPIED.get(type(value))
     if copy is None:
-        copy = next((way for kind, way in _COPIED.items() if isinstance(value, kind)), None)
+        copy = next((copier for kind, copier in _COPIED.items() if isinstance(value, kind)), None)
     if copy is None:
         raise TypeError(f"an agent's state has a {type(value).__name__}, and nobody has said how it is copied")
     return copy(value)

@@ -31,15 +31,15 @@ def _shortest_cycle(graph: StateGraph, start: int, part: set[int]) -> list[int]:
         for number in layer:
             for after in _after(graph, number):
                 if after == start:
-                    way = [number]
-                    while way[-1] != start:
-                        way.append(came_from[way[-1]])
-                    return way[::-1]
+                    path = [number]
+                    while path[-1] != start:
+                        path.append(came_from[path[-1]])
+                    return path[::-1]
                 if after in part and after not in came_from:
                     came_from[after] = number
                     following.append(after)
         layer = following
-    raise AssertionError("a part has a way round")
+    raise AssertionError("each part contains a cycle")
 
 
 def _after_a_cycle(graph: StateGraph, check: Check) -> list[int]:
@@ -47,19 +47,19 @@ def _after_a_cycle(graph: StateGraph, check: Check) -> list[int]:
 
     The function removes states without a predecessor among the remaining states, until each remaining state has one.
     """
-    ways_in = array("q", bytes(8 * len(graph.quiet)))
+    incoming = array("q", bytes(8 * len(graph.quiet)))
     for number in range(len(graph.quiet)):
         check()
         for after in _after(graph, number):
-            ways_in[after] += 1
-    waiting = [number for number, ways in enumerate(ways_in) if not ways]
+            incoming[after] += 1
+    waiting = [number for number, count in enumerate(incoming) if not count]
     while waiting:
         check()
         for after in _after(graph, waiting.pop()):
-            ways_in[after] -= 1
-            if not ways_in[after]:
+            incoming[after] -= 1
+            if not incoming[after]:
                 waiting.append(after)
-    return [number for number, ways in enumerate(ways_in) if ways]
+    return [number for number, count in enumerate(incoming) if count]
 
 
 def _parts(graph: StateGraph, check: Check) -> Iterator[list[int]]:

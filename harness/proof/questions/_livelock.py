@@ -90,7 +90,7 @@ def forms(graph: StateGraph, cycles: Sequence[list[int]]) -> list[list[list[int]
 def _form(graph: StateGraph, cycle: Sequence[int]) -> _Form:
     """Return the form of a cycle. It does not depend on the state at which the list of the cycle begins."""
     known = graph.swarm.local.known
-    looks = [
+    agents_at = [
         tuple(
             sorted(
                 (known[local].running, known[local].waits) for local in graph.states[number][AGENTS:] if local != DEAD
@@ -98,7 +98,7 @@ def _form(graph: StateGraph, cycle: Sequence[int]) -> _Form:
         )
         for number in cycle
     ]
-    return min(tuple(looks[first:] + looks[:first]) for first in range(len(looks)))
+    return min(tuple(agents_at[first:] + agents_at[:first]) for first in range(len(agents_at)))
 
 
 def in_timers(graph: StateGraph, cycles: Sequence[list[int]]) -> list[str]:
@@ -109,7 +109,7 @@ def in_timers(graph: StateGraph, cycles: Sequence[list[int]]) -> list[str]:
         return "+".join(names[timer] for timer in running) or ("waiting" if waits else "idle")
 
     def form(cycle: Sequence[int]) -> str:
-        return " > ".join(", ".join(agent(*look) for look in looks) for looks in _form(graph, cycle))
+        return " > ".join(", ".join(agent(*state) for state in agents) for agents in _form(graph, cycle))
 
     return sorted({form(cycle) for cycle in cycles})
 

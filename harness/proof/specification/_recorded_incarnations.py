@@ -351,7 +351,7 @@ def module(records: Sequence[EncodedIncarnation], chains: ChainNumbers) -> str:
             return str(rank_of[int(item)])
         return str(item if -LARGEST <= item <= LARGEST else IMPOSSIBLE)
 
-    told = ",\n".join(
+    incarnations = ",\n".join(
         f"[id |-> {life.agent_id}, whole |-> {str(life.whole).upper()}, steps |-> {text(life.steps)}]"
         for life in records
     )
@@ -360,7 +360,7 @@ def module(records: Sequence[EncodedIncarnation], chains: ChainNumbers) -> str:
         for number in range(1, len(chains.successors) + 1)
     )
     return (
-        f"---- MODULE Lives ----\nEXTENDS Integers\nRecords == <<\n{told}\n>>\n"
+        f"---- MODULE Lives ----\nEXTENDS Integers\nRecords == <<\n{incarnations}\n>>\n"
         f"Successors == <<{','.join(map(text, successors))}>>\n====\n"
     )
 

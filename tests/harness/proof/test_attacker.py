@@ -64,12 +64,12 @@ def explored(agents: int = 3, blocks: int = 1, lies: int = 1) -> StateGraph:
 def lied_to(graph: StateGraph) -> Iterator[tuple[Agent, ForgeryMaterial]]:
     """Yield each agent in each state in which the attacker can send it one more message."""
     bounds, local = graph.swarm.bounds, graph.swarm.local
-    captor = Attacker(replace(bounds, lies=bounds.lies + 1), local)
+    attacker = Attacker(replace(bounds, lies=bounds.lies + 1), local)
     pairs = {
         (state[AGENTS + place], place, material)
         for state in graph.states
         if not state[LEFT] >> ONCE.index("captured") & 1
-        for place, material in captor.material(state[AGENTS:])
+        for place, material in attacker.material(state[AGENTS:])
     }
     for number, place, material in sorted(pairs, key=lambda pair: pair[:2]):
         agent = Agent(place + 1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
@@ -193,11 +193,11 @@ def by_chance(lots: Random) -> Iterator[Any]:
 
 def lie(agents: list[Agent], now: float, lots: Random) -> None:
     """Send a random forged message to some of the agents."""
-    captor = ModelSwarm(Bounds(3, 1, captured=CAPTURED)).captor
-    assert captor is not None
+    attacker = ModelSwarm(Bounds(3, 1, captured=CAPTURED)).attacker
+    assert attacker is not None
     held = [frozenset((*agent.state.chain, *agent.state.reconcile_stack)) for agent in agents]
     named = [block.block_hash for agent in agents for block in agent.state.blocks_to_be_committed]
-    blocks = frozenset(captor.made.values()).union(*held)
+    blocks = frozenset(attacker.made.values()).union(*held)
     material = ForgeryMaterial(
         blocks,
         frozenset({*named, *(block.block_hash for block in blocks)}),
