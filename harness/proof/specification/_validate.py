@@ -90,6 +90,8 @@ class TraceValidation:
         if self.rejected:
             count = len(self.rejected)
             yield f"✘ {looked}: {count:,} {'life' if count == 1 else 'lives'} not as specified"
+        elif not self.steps:
+            yield f"- {looked}: nothing could be checked"
         elif self.exit_status == 0:
             yield f"✔ {looked}: all as specified"
         else:

@@ -99,6 +99,12 @@ def test_agents_that_are_processes_do_what_is_specified(tmp_path: Path) -> None:
     assert validation.steps > 10
 
 
+def test_records_without_steps_do_not_count_as_checked() -> None:
+    nothing = TraceValidation(runs=1, unread=["1.chain.json: no traces found"])
+    *_, last = nothing.in_words()
+    assert last == "- 1 run, 0 lives of agents, 0 handler runs: nothing could be checked"
+
+
 def test_path_without_a_run_gives_one_sentence(tmp_path: Path) -> None:
     done = harness("validate")
     assert done.returncode == 2
