@@ -10,16 +10,20 @@ have lost its clock and its disk.
 
 The receiver collects the echoes for `TRUST_DELAY_S`, or until all vehicles have answered. During this time it receives
 the revocations that it missed, before it trusts any sender.
+
+Challenges and echoes may be recorded as well. A receiver therefore answers each challenge once, and accepts one echo of
+each sender to a challenge. After it has accepted a later boot of a sender, older challenges to this sender no longer
+count. A repeated challenge or echo is dropped before its signature is verified.
 """
 
 CHALLENGE_INTERVAL_S = 5.0
 """Minimum time in mission seconds between two challenges to the same vehicles."""
-ECHO_INTERVAL_S = 1.0
-"""Minimum time in mission seconds between two echoes of challenges that may be recorded."""
 TRUST_DELAY_S = 2.0
 """Maximum number of mission seconds between the first challenge and the first accepted sender. It applies if some
 vehicles do not answer.
 """
+MAX_REMEMBERED_BOOTS = 256
+"""Maximum number of boots of one sender whose newest challenge a receiver remembers."""
 ALL = 0
 """The target of a challenge that is sent to all vehicles."""
 
@@ -34,6 +38,8 @@ class PendingChallenges:
         self._sent_at: dict[int, float] = {}
         self._pending: dict[int, int] = {}
         """Target -> sequence number of the newest challenge to it."""
+        self._closed: dict[int, int] = {}
+        """Sender -> sequence number from which on its echoes count."""
 
     @property
     def is_due(self) -> bool:
@@ -59,4 +65,26 @@ class PendingChallenges:
 
     def is_pending(self, sequence: int, sender: int) -> bool:
         """Return whether this sequence number belongs to the newest challenge to this sender or to all vehicles."""
-        return sequence in (self._pending.get(ALL), self._pending.get(sender))
+        is_newest = sequence in (self._pending.get(ALL), self._pending.get(sender))
+        return is_newest and sequence >= self._closed.get(sender, 0)
+
+    def close(self, sender: int, next_sequence: int) -> None:
+        """Count echoes of this sender only to challenges from this sequence number on."""
+        self._closed[sender] = next_sequence
+
+
+class ReceivedChallenges:
+    """The newest challenge of each boot of one sender. The caller adds only authentic challenges."""
+
+    def __init__(self) -> None:
+        self._newest: dict[bytes, int] = {}
+
+    def is_new(self, boot: bytes, sequence: int) -> bool:
+        """Return whether this challenge is newer than all received challenges of this boot."""
+        return sequence > self._newest.get(boot, -1)
+
+    def add(self, boot: bytes, sequence: int) -> None:
+        """Record a challenge as received. Forget the boot that was added first if there are too many."""
+        self._newest[boot] = sequence
+        if len(self._newest) > MAX_REMEMBERED_BOOTS:
+            del self._newest[next(iter(self._newest))]

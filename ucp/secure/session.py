@@ -15,7 +15,7 @@ from dataclasses import replace
 
 from ucp.messages import TYPE_CODES, MalformedDatagramError, Message
 from ucp.secure._budget import TokenBudget
-from ucp.secure._challenges import ALL, ECHO_INTERVAL_S, TRUST_DELAY_S, PendingChallenges
+from ucp.secure._challenges import ALL, TRUST_DELAY_S, PendingChallenges, ReceivedChallenges
 from ucp.secure._epochs import EpochSecrets
 from ucp.secure._window import ReplayWindow
 from ucp.secure.bundle import LAST_START_US, Bundle
@@ -62,15 +62,13 @@ UNKNOWN_BOOTS_AT_ONCE = 1000
 class _SenderIncarnation:
     """The newest known incarnation of another sender, with its accepted sequence numbers and its newest requests."""
 
-    __slots__ = ("boot", "control", "latest_boot", "requests", "window")
+    __slots__ = ("boot", "latest_boot", "requests", "window")
 
     def __init__(self, boot: bytes, first: int = 0, latest_boot: bytes = b"") -> None:
         self.boot = boot
         self.latest_boot = max(boot, latest_boot)
         """The greatest boot of this sender so far. It is greater than `boot` if the sender lost its clock."""
         self.window = ReplayWindow(first)
-        self.control = -1
-        """Sequence number of the newest challenge that was received from this sender."""
         self.requests: dict[int, int] = {}
         """Type of a request -> sequence of the newest request of this type that was received."""
 
@@ -113,7 +111,7 @@ class Session:
         """
         self._held: dict[int, _SenderIncarnation] = {}
         """Senders that have answered a challenge. This vehicle does not trust them yet."""
-        self._echoed_at: dict[int, float] = {}
+        self._challenged_by = {agent_id: ReceivedChallenges() for agent_id in self.public_keys}
         self._echoes: list[AnsweredRequest] = []
         """The challenges that this vehicle still has to answer."""
         self._next_sequence = 0
@@ -241,7 +239,7 @@ class Session:
             raise MalformedDatagramError("replayed")
         body = self._authenticate(datagram, clear, now)
         if incarnation is None or clear.boot != incarnation.boot:
-            incarnation = self._incarnations[clear.sender] = _SenderIncarnation(clear.boot)
+            incarnation = self._accept_boot(clear)
         incarnation.window.accept(clear.sequence)
         self.epochs.follow(clear.epoch)
         if clear.type in REQUESTS:
@@ -257,31 +255,32 @@ class Session:
             raise MalformedDatagramError("epoch out of range")
         return decrypted(self._keys_of(clear, now), datagram, clear)
 
+    def _accept_boot(self, clear: ClearHeader) -> _SenderIncarnation:
+        """Accept the sender's boot, which is later than all known ones. Echoes of older challenges no longer count."""
+        self.challenges.close(clear.sender, self._control)
+        incarnation = self._incarnations[clear.sender] = _SenderIncarnation(clear.boot)
+        return incarnation
+
     def receive_challenge(self, datagram: bytes, clear: ClearHeader, now: float) -> None:
         """Schedule an echo that answers a challenge. Raises MalformedDatagramError.
 
-        A challenge that is not newer than all known ones may be a replay. The vehicle answers few of these.
+        A challenge that is not newer than all known ones of its boot may be a replay. Its sender does not wait for an
+        answer.
         """
         if not self.epochs.can_open(clear.epoch):
             raise MalformedDatagramError("epoch out of range")
-        incarnation = self._incarnations.get(clear.sender)
-        if incarnation is None:
-            is_new = self._is_complete
-        else:
-            is_newer = clear.boot == incarnation.boot and clear.sequence > incarnation.control
-            is_new = is_newer or incarnation.is_later(clear.boot)
-        if not is_new and now < self._echoed_at.get(clear.sender, -math.inf) + ECHO_INTERVAL_S:
+        received = self._challenged_by[clear.sender]
+        if not received.is_new(clear.boot, clear.sequence):
             raise MalformedDatagramError("replayed")
         body = self._authenticate(datagram, clear, now)
         if len(body) != 4:
             raise MalformedDatagramError("wrong length")
-        if is_new:
-            if incarnation is None or clear.boot != incarnation.boot:
-                incarnation = self._incarnations[clear.sender] = _SenderIncarnation(clear.boot)
-            incarnation.control = clear.sequence
+        received.add(clear.boot, clear.sequence)
+        incarnation = self._incarnations.get(clear.sender)
+        if self._is_complete if incarnation is None else incarnation.is_later(clear.boot):
+            self._accept_boot(clear)
         self.epochs.follow(clear.epoch)
         if int.from_bytes(body, "big") in (ALL, self.agent_id):
-            self._echoed_at[clear.sender] = now
             self._echoes.append(AnsweredRequest(clear.sender, clear.boot, clear.sequence))
 
     def receive_echo(self, datagram: bytes, clear: ClearHeader, now: float) -> None:
@@ -296,6 +295,7 @@ class Session:
         if not is_own or not self.challenges.is_pending(request.sequence, clear.sender):
             raise MalformedDatagramError("answers no request")
         self._authenticate(datagram, clear, now)
+        self.challenges.close(clear.sender, self._control)
         self.epochs.follow(clear.epoch)
         known = self._incarnations.get(clear.sender)
         if known is None or known.boot != clear.boot:

@@ -165,6 +165,32 @@ async def _authentic(bench: CaseBench) -> None:
             await peers.require_single_answer(f"a datagram {what}")
 
 
+@case("with keys, a recorded echo does not restore an earlier boot", SECTION)
+async def _recorded_echo(bench: CaseBench) -> None:
+    from ucp.secure.envelope import CHALLENGE, read_clear_header
+    from ucp.secure.secured_agent import make_boot
+    from ucp.secure.session import Session
+
+    async with _secured(bench) as (peers, keys):
+        await peers.require_single_answer("its start")
+        bundle, socket = keys.bundle(ASKING_PEER), peers.agent.peer_socket
+        earlier = Session(bundle, bytes(16))
+        earlier.set_clock(0.0)
+        socket.send(earlier.seal(0, ChainContainQuery(INCEPTION), None, None, 0))
+        await asyncio.sleep(SILENCE_S)
+        challenges = [data for _, data in socket.take() if data[3] == CHALLENGE]
+        require(len(challenges) == 1, "a challenge to a sender with an earlier boot", f"{len(challenges)} challenges")
+        earlier.receive_challenge(challenges[0], read_clear_header(challenges[0]), 0.0)
+        (echo,) = earlier.control_datagrams(0, 0.0)
+        socket.send(echo)
+        peers.sessions[ASKING_PEER] = earlier
+        await peers.require_single_answer("an echo of the earlier boot")
+        peers.sessions[ASKING_PEER] = Session(bundle, make_boot(round(time.time() * MICROSECONDS), os.urandom(8)))
+        await peers.require_single_answer("a later boot")
+        socket.send(echo)
+        await peers.require_single_answer("the same echo again")
+
+
 @case("with keys, blocks are signed in messages and in the export", SECTION, 1)
 async def _signed(bench: CaseBench) -> None:
     from ucp.secure.block_signature import block_claim

@@ -8,9 +8,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from tests.ucp.secure.swarm import KEYS, ROSTER
 from ucp.messages import RequestForBlock
-from ucp.secure._challenges import CHALLENGE_INTERVAL_S, ECHO_INTERVAL_S, TRUST_DELAY_S
+from ucp.secure._challenges import CHALLENGE_INTERVAL_S, TRUST_DELAY_S
 from ucp.secure._epochs import MAX_EPOCHS_AHEAD, MAX_EPOCHS_FOLLOWED
 from ucp.secure.bundle import Bundle
+from ucp.secure.crypto_suite import UnverifiedSignature, verify
 from ucp.secure.envelope import CHALLENGE, ECHO
 from ucp.secure.revocation import Revocation
 from ucp.secure.secured_agent import SecuredAgent, make_boot
@@ -156,8 +157,75 @@ def test_repeated_challenge_is_echoed_once() -> None:
     assert len(two.datagrams_to_send()) == 1
     stranger = rebooted(3)
     for number in range(100):
-        stranger.receive_datagram(challenge, number * ECHO_INTERVAL_S / 50)
-    assert sum(datagram[3] == ECHO for datagram in stranger.datagrams_to_send()) == 2
+        stranger.receive_datagram(challenge, float(number))
+    assert sum(datagram[3] == ECHO for datagram in stranger.datagrams_to_send()) == 1
+
+
+def test_recorded_challenges_and_echoes_cost_one_signature_each() -> None:
+    verified = list[UnverifiedSignature]()
+
+    def counts(claim: UnverifiedSignature) -> bool:
+        verified.append(claim)
+        return verify(claim)
+
+    one, two = rebooted(1), born(2)
+    one.session.crypto = replace(one.session.crypto, verify=counts)
+    hears(one, query(two), 0.0)
+    (challenge,) = one.datagrams_to_send()
+    two.receive_datagram(challenge, 0.0)
+    two.session.challenges.ask(3, 0.0)
+    to_three, echo = two.datagrams_to_send()
+    for number in range(50):
+        one.receive_datagram(echo, number / 10)
+        one.receive_datagram(to_three, number / 10)
+    assert len(verified) == 2
+    assert one.dropped == {"not confirmed": 1, "answers no request": 49, "replayed": 49}
+
+
+def test_recorded_echo_does_not_replace_a_later_boot() -> None:
+    one, before = rebooted(1), born(2, started_us=3)
+    hears(one, query(before), 0.0)
+    (challenge,) = one.datagrams_to_send()
+    before.receive_datagram(challenge, 0.0)
+    (echo,) = before.datagrams_to_send()
+    one.receive_datagram(echo, 0.0)
+    recorded = [query(before) for _ in range(5)]
+    assert all(hears(one, datagram, TRUST_DELAY_S) for datagram in recorded)
+    later = born(2, started_us=77)
+    assert hears(one, query(later), TRUST_DELAY_S)
+    one.receive_datagram(echo, TRUST_DELAY_S)
+    assert not any(hears(one, datagram, TRUST_DELAY_S) for datagram in recorded)
+    assert hears(one, query(later), TRUST_DELAY_S)
+
+
+def test_delayed_echo_does_not_replace_a_later_boot() -> None:
+    """The attacker has kept the echo from the receiver, until another incarnation was accepted."""
+    one, before = born(1), born(2, started_us=3)
+    assert hears(one, query(born(2, started_us=5)), 0.0)
+    assert not hears(one, query(before), 0.0)
+    (challenge,) = one.datagrams_to_send()
+    before.receive_datagram(challenge, 0.0)
+    (echo,) = before.datagrams_to_send()
+    later = born(2, started_us=77)
+    assert hears(one, query(later), 0.0)
+    one.receive_datagram(echo, 0.0)
+    assert hears(one, query(later), 0.0)
+
+
+def test_recorded_challenges_do_not_keep_restarted_vehicles_apart() -> None:
+    one, two = rebooted(1), rebooted(2)
+    recorded = list[bytes]()
+    for started_us in range(3):
+        before = rebooted(2, started_us)
+        before.begin_reconcile(0.0)
+        recorded.append(before.datagrams_to_send()[0])
+    now = 0.0
+    while not hears(two, query(one), now):
+        now += 0.05
+        assert now < 2 * CHALLENGE_INTERVAL_S, "an answer to each genuine challenge comes at once"
+        for datagram in recorded:
+            one.receive_datagram(datagram, now)
+        settle({one: now, two: now})
 
 
 def test_insider_cannot_echo_for_another_vehicle() -> None:

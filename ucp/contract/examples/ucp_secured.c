@@ -10,7 +10,7 @@ enum {
     KEY = 32, SIGNATURE = 64, TAG = 16, NONCE = 12, MISSION_ID = 16, BOOT = 16, CLEAR = 36, SEAL = TAG + SIGNATURE,
     ASKED_BY = 24, REVOCATION = 10, CHALLENGE, ECHO, AHEAD = 4096, FOLLOWED = AHEAD / 2,
     WINDOW = 1024, WORDS = WINDOW / 64 + 1, MAX_REVOKED = 256, SEALED_EVENTS = KEY + TAG, TELL_AGAIN_S = 5,
-    ALL = 0, CHALLENGE_AGAIN_S = 5, ECHO_AGAIN_S = 1, TRUST_AFTER_S = 2
+    ALL = 0, CHALLENGE_AGAIN_S = 5, TRUST_AFTER_S = 2, MAX_CHALLENGED = 256
 };
 
 typedef struct { uint32_t sender, sequence; uint8_t boot[BOOT]; } Request;
@@ -25,16 +25,17 @@ typedef struct Opened {                                 /* what came, if it is a
 
 typedef struct {                                        /* of another sender: the life that it has */
     uint8_t boot[BOOT], latest[BOOT];                   /* latest: the greatest boot of the sender so far */
-    int64_t control;                                    /* sequence of the newest challenge */
     uint64_t word[WORDS];                               /* a ring: which sequence numbers have come (RFC 6479) */
     int64_t newest;
     uint32_t asked[REVOCATION];                         /* by type of a request: the newest sequence of it */
 } Life;
 
-typedef struct {                                        /* challenges to an agent, or to ALL; and its own, to be echoed */
-    bool due, has_sent, has_echoed;
-    double sent_at, echoed_at;
-    uint32_t sequence;                                  /* of the newest challenge */
+typedef struct {                                        /* challenges to an agent, or to ALL; and those that it sent */
+    bool due, has_sent;
+    double sent_at;
+    uint32_t sequence;                                  /* of the newest challenge to it */
+    uint32_t counts_from;                               /* the sequence of a challenge from which on its echo counts */
+    Buf received;                                       /* boot and sequence of its newest challenge of each boot */
 } Challenge;
 
 typedef struct { Hash block; uint8_t signature[SIGNATURE]; } Signed;
@@ -195,6 +196,8 @@ static void keys_free(Agent *a) {
         free(k->vehicles[i]);
         free(k->lives[i]);
         free(k->waiting[i]);
+        if (k->challenges[i] != NULL)
+            free(k->challenges[i]->received.data);
         free(k->challenges[i]);
     }
     free(k->held);
@@ -590,7 +593,7 @@ static Life *life_new(Life *old, const uint8_t boot[BOOT], uint32_t first, const
     bool later = latest != NULL && memcmp(latest, boot, BOOT) > 0;
     uint8_t greatest[BOOT];
     memcpy(greatest, later ? latest : boot, BOOT);      /* `latest` may be of `old` */
-    *life = (Life){.newest = (int64_t)first - 1, .control = -1};
+    *life = (Life){.newest = (int64_t)first - 1};
     memset(life->word, first > 0 ? 0xff : 0, sizeof life->word);
     memcpy(life->boot, boot, BOOT);
     memcpy(life->latest, greatest, BOOT);
@@ -613,6 +616,33 @@ static void challenge(Keys *k, uint32_t target, double now) {
     Challenge *c = challenge_of(k, target);
     if (!c->has_sent || now >= c->sent_at + CHALLENGE_AGAIN_S)
         c->due = true;
+}
+
+static Life *accept_boot(Keys *k, const Opened *o) {    /* later than all known ones: older challenges do not count */
+    challenge_of(k, o->sender)->counts_from = k->control;
+    return k->lives[o->sender] = life_new(k->lives[o->sender], o->boot, 0, NULL);
+}
+
+static bool is_new_challenge(Challenge *c, const Opened *o) {
+    for (size_t i = 0; i < c->received.len; i += BOOT + 4)
+        if (memcmp(c->received.data + i, o->boot, BOOT) == 0)
+            return o->sequence > read_be(c->received.data + i + BOOT, 4);
+    return true;
+}
+
+static void add_challenge(Challenge *c, const Opened *o) {
+    size_t i = 0;
+    while (i < c->received.len && memcmp(c->received.data + i, o->boot, BOOT) != 0)
+        i += BOOT + 4;
+    if (i == c->received.len) {
+        if (i == (size_t)MAX_CHALLENGED * (BOOT + 4)) { /* forget the first one */
+            c->received.len = i -= BOOT + 4;
+            memmove(c->received.data, c->received.data + BOOT + 4, i);
+        }
+        put(&c->received, o->boot, BOOT);
+        put_be(&c->received, o->sequence, 4);
+    } else
+        write_be(c->received.data + i + BOOT, o->sequence, 4);
 }
 
 static bool is_pending(Keys *k, uint32_t target, uint32_t sequence) {
@@ -650,27 +680,21 @@ static bool is_signed(const Keys *k, const Opened *o, const uint8_t *d, const ui
     return good;
 }
 
-static enum drop take_challenge(Agent *a, double now, const Opened *o, uint64_t epoch, const uint8_t *d, size_t n) {
+static enum drop take_challenge(Agent *a, const Opened *o, uint64_t epoch, const uint8_t *d, size_t n) {
     Keys *k = a->keys;
     uint8_t body[MAX_DATAGRAM];
     Life *life = k->lives[o->sender];
     Challenge *c = challenge_of(k, o->sender);
-    bool is_new = life == NULL ? k->complete
-                : (is_boot(life, o->boot) && (int64_t)o->sequence > life->control) || is_later(life, o->boot);
-    if (!is_new && c->has_echoed && now < c->echoed_at + ECHO_AGAIN_S) return REPLAYED;
+    if (!is_new_challenge(c, o)) return REPLAYED;
     if (!opens(k, o, epoch, d, n, body)) return NOT_AUTHENTIC;
     if (!is_signed(k, o, d, body, n - CLEAR - SEAL)) return NOT_THE_SENDER;
     if (n != CLEAR + SEAL + 4) return WRONG_LENGTH;
-    if (is_new) {
-        if (life == NULL || !is_boot(life, o->boot))
-            life = k->lives[o->sender] = life_new(life, o->boot, 0, NULL);
-        life->control = o->sequence;
-    }
+    add_challenge(c, o);
+    if (life == NULL ? k->complete : is_later(life, o->boot))
+        accept_boot(k, o);
     follow(k, epoch);
     uint64_t target = read_be(body, 4);
     if (target == ALL || target == a->m.agent_id) {
-        c->has_echoed = true;
-        c->echoed_at = now;
         put_be(&k->echoes, o->sender, 4);
         put(&k->echoes, o->boot, BOOT);
         put_be(&k->echoes, o->sequence, 4);
@@ -686,9 +710,11 @@ static enum drop take_echo(Agent *a, double now, const Opened *o, uint64_t epoch
     if (n != CLEAR + SEAL + ASKED_BY + 4) return WRONG_LENGTH;
     uint32_t sequence = (uint32_t)read_be(body + 20, 4);
     if (read_be(body, 4) != a->m.agent_id || memcmp(body + 4, k->boot, BOOT) != 0
-        || !(is_pending(k, ALL, sequence) || is_pending(k, o->sender, sequence)))
+        || !(is_pending(k, ALL, sequence) || is_pending(k, o->sender, sequence))
+        || sequence < challenge_of(k, o->sender)->counts_from)
         return ANSWERS_NO_REQUEST;
     if (!is_signed(k, o, d, body, ASKED_BY + 4)) return NOT_THE_SENDER;
+    challenge_of(k, o->sender)->counts_from = k->control;
     follow(k, epoch);
     Life *known = k->lives[o->sender];
     if (known == NULL || !is_boot(known, o->boot)) {
@@ -733,7 +759,7 @@ static enum drop keys_open(Agent *a, double now, const uint8_t *d, size_t n, Buf
         return keys_revoke(a, now, body, n - CLEAR - TAG);
     }
     if (o->type > REVOCATION) {
-        enum drop drop = (o->type == CHALLENGE ? take_challenge : take_echo)(a, now, o, epoch, d, n);
+        enum drop drop = o->type == CHALLENGE ? take_challenge(a, o, epoch, d, n) : take_echo(a, now, o, epoch, d, n);
         if (drop == GOOD && o->revocations != k->digest)
             tell(k, now);
         return drop;
@@ -756,7 +782,7 @@ static enum drop keys_open(Agent *a, double now, const uint8_t *d, size_t n, Buf
     if (!is_signed(k, o, d, body, size)) return NOT_THE_SENDER;
 
     if (life == NULL || !is_boot(life, o->boot))
-        life = k->lives[o->sender] = life_new(life, o->boot, 0, NULL);
+        life = accept_boot(k, o);
     accept_sequence(life, o->sequence);
     follow(k, epoch);
     if (is_request(o->type) && life->asked[o->type] < o->sequence)
