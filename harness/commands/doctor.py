@@ -60,9 +60,9 @@ def doctor_command(
 
 
 def clean_command() -> None:
-    """Remove the keys and the Docker containers of runs that were killed.
+    """Remove the keys and containers of killed runs.
 
-    Those of active runs and of other programs stay.
+    The keys and containers of active runs, and the containers of other programs, stay.
     """
     from harness.play.containers.docker_engine import DockerEngine
     from harness.play.containers.ownership import clean
