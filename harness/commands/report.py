@@ -30,8 +30,6 @@ from harness.commands.terminal import (
     show_survival,
 )
 from harness.errors import CANNOT_HERE, VIOLATED, WRONG_REQUEST, MachineError, RunDirectoryError
-from harness.field.ingest import ingest_files
-from harness.field.replay.field_evidence import field_evidence
 from harness.report.agent_programs import programs
 from harness.report.live.server_process import require_packages
 from harness.run.provenance import differing_versions, same_judge, versions
@@ -82,6 +80,9 @@ def check_command(
         evidence = checker.gather(archive)
         directories = [path for path in paths if path.is_dir()]
         if not archive.recorded and evidence.traces and directories:
+            from harness.field.ingest import ingest_files  # `run` uses this module too, and needs no field records
+            from harness.field.replay.field_evidence import field_evidence
+
             evidence = field_evidence(evidence, ingest_files(directories).largest())
         result, survived = checker.check(evidence), survival(evidence)
     stored = [*stored_verdict.differences(archive.record, result, survived)]

@@ -6,12 +6,16 @@ The template escapes every text except Markup.
 
 import base64
 import hashlib
+import os
+import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import BytecodeCache, Environment, FileSystemLoader, StrictUndefined
+from jinja2.bccache import Bucket
 from markupsafe import Markup
 
 from harness.present import text as words
@@ -20,6 +24,28 @@ _HERE = Path(__file__).parent
 PALETTE = (_HERE / "palette.css").read_text(encoding="utf-8")
 """The colours that the report and the live page share."""
 PAGE_STYLE = PALETTE + (_HERE / "page.css").read_text(encoding="utf-8")
+
+
+class _TemplateCache(BytecodeCache):
+    """Keeps compiled templates in `__pycache__`, beside the compiled modules of Python. Compiling the template of a
+    report takes longer than rendering it.
+    """
+
+    def _file(self, bucket: Bucket) -> Path:
+        return _HERE / "__pycache__" / f"{bucket.key}.{sys.implementation.cache_tag}.j2c"
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        with suppress(OSError, EOFError, ValueError, TypeError), self._file(bucket).open("rb") as file:
+            bucket.load_bytecode(file)  # a file of another template or of another Python is ignored
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        if sys.dont_write_bytecode:
+            return
+        file = self._file(bucket)
+        with suppress(OSError):  # as for Python's own cache, a directory that is not writable is no error
+            temporary = file.with_suffix(f".{os.getpid()}.tmp")
+            temporary.write_bytes(bucket.bytecode_to_string())
+            temporary.replace(file)
 
 
 def render(template: Path, *, styles: Sequence[str], script: str = "", **content: Any) -> str:
@@ -44,6 +70,7 @@ def _environment(directory: Path) -> Environment:
     """Return the environment of the templates in this directory. It keeps compiled templates."""
     environment = Environment(
         loader=FileSystemLoader([directory, _HERE]),
+        bytecode_cache=_TemplateCache(),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -20,6 +20,7 @@ OWN_FILES = {
     "field/bisection/_live_replay.py": "outputs of programs that it started",
     "field/bisection/_scripted_peers.py": "a script that its parent wrote",
     "pytest_plugin/_yaml_files.py": "small regular files of a project, which may have a package `ucp` of its own",
+    "report/html.py": "templates that it compiled",
     "run/provenance.py": "the modules of the project",
     "scenario/load.py": "the library",
     "sweep/matrix/_results_file.py": "a file that it also writes",
