@@ -12,7 +12,6 @@ from rich.console import Console
 
 from harness.archive.directory import default_path
 from harness.archive.recorded_scenario import load_recorded_scenario
-from harness.archive.run_record import CapturedFrames
 from harness.backend_names import BackendName
 from harness.commands._shared_options import RARE, complete_scenario
 from harness.commands.report import PORT, show_address
@@ -271,8 +270,7 @@ def _show_end(console: Console, finished: Run) -> None:
                 f"agent {agent_id} ended and left processes running ({names}), which the harness ended: an agent must "
                 "end all processes that it starts"
             )
-    captured = finished.played.capture or {}
-    if lacks := gaps({vehicle: CapturedFrames.model_validate(frames) for vehicle, frames in captured.items()}):
+    if lacks := gaps(finished.played.capture or {}):
         complain(f"{lacks}: choose a smaller --speedup")
     for sentence in cut_off(finished.record):
         complain(sentence)

@@ -4,12 +4,24 @@ A mission plays the timeline, stops the events, lets the agents settle, and ends
 asks for it.
 """
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
-from harness.archive.run_record import Cycle, FinalReconcile, RemoteRecord
+from harness.archive.run_record import (
+    AgentRecord,
+    CapturedFrames,
+    ChannelRecord,
+    Counters,
+    Cycle,
+    DatagramsRead,
+    FaultRecord,
+    FinalReconcile,
+    GroundStationRecord,
+    NetworkState,
+    RemoteRecord,
+)
 from harness.errors import HarnessError, UnsupportedError
 from harness.scenario import Scenario
 from harness.scenario.changes import RANGE, Change, final_reconcile, timeline_of
@@ -30,20 +42,20 @@ class RunOutcome:
     outcome_detail: str | None = None
     exit_status: int = 0
     engine: str | None = None
-    network: list[dict[str, Any]] = field(default_factory=list)
-    faults: list[dict[str, Any]] = field(default_factory=list)
+    network: list[NetworkState] = field(default_factory=list)
+    faults: list[FaultRecord] = field(default_factory=list)
     final_reconcile: FinalReconcile | None = None
     mission_s: float = 0.0
     settled: bool = False
     cycle: Cycle | None = None
-    counters: dict[str, Any] | None = None
-    datagrams: dict[str, dict[str, int]] = field(default_factory=dict)
-    channel: dict[str, Any] | None = None
+    counters: Counters | None = None
+    datagrams: dict[str, DatagramsRead] = field(default_factory=dict)
+    channel: ChannelRecord | None = None
     """The counts of frames on a shared channel. None without a channel."""
-    capture: dict[str, dict[str, int]] | None = None
-    agents: dict[str, Any] = field(default_factory=dict)
-    vehicles: dict[str, Any] = field(default_factory=dict)
-    ground_station: dict[str, Any] | None = None
+    capture: dict[str, CapturedFrames] | None = None
+    agents: dict[str, AgentRecord] = field(default_factory=dict)
+    vehicles: dict[str, dict[str, Any]] = field(default_factory=dict)
+    ground_station: GroundStationRecord | None = None
     remote: dict[str, RemoteRecord] = field(default_factory=dict)
     unmatched_fates: list[str] = field(default_factory=list)
 
@@ -53,16 +65,17 @@ class RunOutcome:
         self.outcome_detail = str(error)
         self.exit_status = error.exit_status
 
-    def record(self, change: dict[str, Any]) -> None:
-        """Record a network change, a fault or an injection. A movement of vehicles is recorded only if it changes which
-        of them can receive each other.
+    def record(self, change: Mapping[str, object]) -> None:
+        """Record a network change, a fault or an injection, which has the format of `network.jsonl`. A movement of
+        vehicles is recorded only if it changes which of them can receive each other.
         """
-        if change["what"] == RANGE and self.network and _same_connections(change, self.network[-1]):
-            return
         if "fully_connected" in change:
-            self.network.append(change)
+            state = NetworkState.model_validate(change)
+            if state.what == RANGE and self.network and _same_connections(state, self.network[-1]):
+                return
+            self.network.append(state)
         if change["what"] != "start":
-            self.faults.append(change)
+            self.faults.append(FaultRecord.model_validate(change))
 
 
 @dataclass(frozen=True)
@@ -78,8 +91,8 @@ class SoughtRun:
         return run.handler == self.handler and self.branch in (None, run.branch) and self.agent in (None, agent_id)
 
 
-def _same_connections(now: dict[str, Any], before: dict[str, Any]) -> bool:
-    return all(now[key] == before[key] for key in ("what", "detail", "fully_connected"))
+def _same_connections(now: NetworkState, before: NetworkState) -> bool:
+    return (now.what, now.detail, now.fully_connected) == (before.what, before.detail, before.fully_connected)
 
 
 class Swarm(Protocol):

@@ -203,7 +203,7 @@ class LiveTimeline(GrowingTimeline):
         while await swarm.until_idle(end_s - swarm.now()):
             chains = await swarm.top_chain_hashes()
             played = await swarm.snapshot()
-            busy = any(agent.get("idle") is False for agent in played.agents.values())
+            busy = any(agent.idle is False for agent in played.agents.values())
             if not busy and await swarm.top_chain_hashes() == chains:
                 return played
         return None

@@ -119,17 +119,6 @@ def _network_states(scenario: Scenario) -> list[Change]:
     return [replace(change, detail=f"{change.detail}, {detail}", channel=channel.preset) for change in changes]
 
 
-def disconnected_until(at_s: float, network: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the records of network changes. While scripted deliveries are active, until `at_s`, they are marked as not
-    fully connected.
-    """
-    since = round(at_s + 0.001, 3)  # include messages of the same instant
-    before = [{**state, "fully_connected": False} for state in network if state["at_s"] < since]
-    after = [state for state in network if state["at_s"] >= since]
-    again = {"at_s": since, "what": NO_MORE_FATES, "fully_connected": network[len(before) - 1]["fully_connected"]}
-    return [*before, {**before[-1], **again}, *after]
-
-
 def final_reconcile(at_s: float) -> NetworkChange:
     """Return the network change for the final reconcile. The change removes all network conditions, so that all
     messages arrive.

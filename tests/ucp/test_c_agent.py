@@ -280,8 +280,8 @@ def test_secured_c_agent_sends_the_same_bytes_as_our_agent(secured: Path) -> Non
     assert {agent: export.model_dump() for agent, export in exports[0].items()} == {
         agent: export.model_dump() for agent, export in exports[1].items()
     }
-    assert {agent: told["dropped"] for agent, told in played.played.agents.items()} == {
-        agent: told["dropped"] for agent, told in among_ours.played.agents.items()
+    assert {agent: told.dropped for agent, told in played.played.agents.items()} == {
+        agent: told.dropped for agent, told in among_ours.played.agents.items()
     }
     assert not played.result.bad
 

@@ -22,6 +22,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from harness.archive.directory import RunDirectory
+from harness.archive.run_record import AgentRecord, HandlerRuns
 from harness.archive.trace_files import SUFFIX, open_trace
 from harness.archive.traces import HANDLER_RUN, read_trace
 from harness.errors import AgentFailedError, HarnessError, MachineError, ScenarioError, UnsupportedError
@@ -82,14 +83,14 @@ class _ProcessIncarnation:
     trace_bytes_copied: int = 0
     """Number of bytes of this incarnation's trace that were already appended to the trace of the first incarnation."""
 
-    def handler_runs(self) -> dict[str, int | float] | None:
+    def handler_runs(self) -> HandlerRuns | None:
         """Return the number of handler runs that the agent last reported, and the time of this report. Return None
         without a report.
         """
         if self.status is None:
             return None
         from_s, until_s = self.status_between_s
-        return {"counted": self.status.handled, "from_s": round(from_s, 3), "until_s": round(until_s, 3)}
+        return HandlerRuns(counted=self.status.handled, from_s=round(from_s, 3), until_s=round(until_s, 3))
 
 
 class AgentProcess:
@@ -371,32 +372,32 @@ class AgentProcess:
                 )
                 self._rundir.copy_export(self.agent_id, incarnation.directory)
 
-    def to_json(self) -> dict[str, Any]:
+    def record(self) -> AgentRecord:
+        """Return the outcome of the agent for `run.json`."""
         incarnations = self._incarnations
         statuses = [incarnation.status for incarnation in incarnations if incarnation.status is not None]
-        record = {
-            "outcome": self.outcome,
-            "detail": self.detail,
-            "command": list(self._command),
-            "version": statuses[-1].version if statuses else None,
-            "restarts": sum(not incarnation.reboot for incarnation in incarnations[1:]),
-            "reboots": sum(incarnation.reboot for incarnation in incarnations),
-            "completed_before": list(dict.fromkeys(self._completed_before)),
-            "left_behind": self._left_behind,
-        }
+        record = AgentRecord(
+            outcome=self.outcome,
+            detail=self.detail,
+            command=list(self._command),
+            version=statuses[-1].version if statuses else None,
+            restarts=sum(not incarnation.reboot for incarnation in incarnations[1:]),
+            reboots=sum(incarnation.reboot for incarnation in incarnations),
+            completed_before=list(dict.fromkeys(self._completed_before)),
+            left_behind=self._left_behind,
+        )
         if not statuses:
             return record
         ended_at_once = self.outcome in ("killed", "rebooting") or incarnations[-1].switched_off
         last_status = None if ended_at_once else incarnations[-1].status
         failures = [status.send_failures for status in statuses if status.send_failures is not None]
-        return record | {
-            "idle": last_status.idle if last_status else None,
-            "bytes_sent": sum(status.bytes_sent for status in statuses),
-            "dropped": dict(sum((Counter(status.dropped) for status in statuses), Counter())),
-            "send_failures": sum(failures) if failures else None,
-            "trace_problem": next((status.trace_problem for status in statuses if status.trace_problem), None),
-            "handler_runs": [incarnation.handler_runs() for incarnation in incarnations],
-        }
+        record.idle = last_status.idle if last_status else None
+        record.bytes_sent = sum(status.bytes_sent for status in statuses)
+        record.dropped = dict(sum((Counter(status.dropped) for status in statuses), Counter()))
+        record.send_failures = sum(failures) if failures else None
+        record.trace_problem = next((status.trace_problem for status in statuses if status.trace_problem), None)
+        record.handler_runs = [incarnation.handler_runs() for incarnation in incarnations]
+        return record
 
     @property
     def _control_path(self) -> Path:

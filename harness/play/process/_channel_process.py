@@ -15,6 +15,7 @@ from typing import Any
 
 from harness.archive.channel_journal import CHANNEL_FILE
 from harness.archive.directory import RunDirectory
+from harness.archive.run_record import ChannelRecord
 from harness.errors import MachineError
 from harness.play.agent_control import AgentRefusedError, AgentSilentError
 from harness.play.process._channel_node import CONTROL, VALUE
@@ -101,7 +102,7 @@ class ChannelProcess:
         """End the simulation of the channel, so that the switch delivers all broadcasts from now on."""
         await self._ask("clear")
 
-    async def totals(self) -> dict[str, Any] | None:
+    async def totals(self) -> ChannelRecord | None:
         """Return the channel's data for run.json. Return None if the mission has not begun."""
         if not self._begun:
             return None
@@ -109,7 +110,7 @@ class ChannelProcess:
             await self._ask("totals")
             totals = json.loads(self._value.read_text(encoding="utf-8"))
             self._value.unlink()
-        return {"model": self._model.to_json(), **totals}
+        return ChannelRecord.model_validate({"model": self._model.to_json(), **totals})
 
     async def watch(self) -> None:
         """Wait for the process to end without a request, then raise MachineError."""

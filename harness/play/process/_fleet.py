@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from harness.archive.directory import RunDirectory
+from harness.archive.run_record import GroundStationRecord
 from harness.errors import ScenarioError
 from harness.play._radio_range import track_of
 from harness.play.process._run_lab import MissionLab
@@ -160,18 +161,18 @@ class Fleet:
         flown_s = mission_s - LATE_S - self._flies_since_s.get(vehicle.vehicle_id, mission_s)
         return any(math.hypot(*track.at(second)) > AWAY_M for second in range(max(0, math.ceil(flown_s))))
 
-    def close_station(self) -> dict[str, Any] | None:
+    def close_station(self) -> GroundStationRecord | None:
         """Disconnect the ground station, and return its record for run.json. Return None if the run has no ground
         station.
         """
         if self._station is None:
             return None
-        done = self._station.to_json()
+        done = GroundStationRecord.model_validate(self._station.to_json())
         self._station.close()
         return done
 
     async def stop(self) -> None:
         await asyncio.gather(*(vehicle.stop() for vehicle in self._vehicles.values()))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, dict[str, Any]]:
         return {str(vehicle_id): vehicle.to_json() for vehicle_id, vehicle in self._vehicles.items()}

@@ -17,6 +17,7 @@ from typing import Any, Self
 
 from harness.archive.directory import RunDirectory
 from harness.archive.packed_parts import pack_parts
+from harness.archive.run_record import AgentRecord, CapturedFrames, Counters, DatagramsRead
 from harness.archive.trace_files import packable_traces
 from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError
 from harness.play._radio_range import TRACK_S, RadioRange
@@ -502,8 +503,9 @@ class ProgramRun:
         try:
             if self._rogue is not None:
                 await self._stop_rogue(self._rogue)
-            self.played.counters = self._without_rogue(await lab.read())
-            self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": self.played.counters})
+            counters = self._without_rogue(await lab.read())
+            self.played.counters = Counters.model_validate(counters)
+            self.rundir.append_network({"at_s": self.played.mission_s, "what": "end", "counters": counters})
             await asyncio.gather(*(agent.stop() for agent in self.agents), self._fleet.stop())
             self.played.datagrams = self._datagram_counters(await lab.network.datagrams())
             await self._end_channel()
@@ -520,14 +522,14 @@ class ProgramRun:
             self._end_early(MachineError(str(error)))
         self.played.agents, self.played.remote = self._agent_records(), self._remote.records()
 
-    def _agent_records(self) -> dict[str, Any]:
+    def _agent_records(self) -> dict[str, AgentRecord]:
         """Return the record of each agent. The command of a remote agent is that on its own computer."""
-        records = {str(agent.agent_id): agent.to_json() for agent in self.agents}
+        records = {str(agent.agent_id): agent.record() for agent in self.agents}
         for agent_id, remote in self._remote.records().items():
-            records[agent_id]["command"] = remote.command
+            records[agent_id].command = remote.command
         return records
 
-    def _datagram_counters(self, counted: Mapping[int, UdpCounters]) -> dict[str, dict[str, int]]:
+    def _datagram_counters(self, counted: Mapping[int, UdpCounters]) -> dict[str, DatagramsRead]:
         """Return the datagram counters of the agents for run.json. Omit agents whose vehicle program also uses UDP,
         because their counters contain its datagrams. Omit agents that were cut off from their stand-ins, too.
         """
@@ -537,14 +539,14 @@ class ProgramRun:
             if agent in self.scenario.roster and not self._remote.was_cut_off(agent)
         ]
         return {
-            str(agent): {
-                "read": counted[agent].read,
-                "before_start": self._udp_before_start[agent].read,
-                "overflowed": counted[agent].overflowed,
-                "unreachable": counted[agent].unreachable,
-                "others": counted[agent].others,
-                "broadcasts": counted[agent].broadcasts,
-            }
+            str(agent): DatagramsRead(
+                read=counted[agent].read,
+                before_start=self._udp_before_start[agent].read,
+                overflowed=counted[agent].overflowed,
+                unreachable=counted[agent].unreachable,
+                others=counted[agent].others,
+                broadcasts=counted[agent].broadcasts,
+            )
             for agent in agents
             if agent not in self._kinds or not self._kinds[agent].uses_udp
         }
@@ -569,7 +571,9 @@ class ProgramRun:
             if self.played.outcome == "completed":
                 self._end_early(MachineError(str(error)))
             return
-        self.played.capture = {str(vehicle): frames for vehicle, frames in counted.items()}
+        self.played.capture = {
+            str(vehicle): CapturedFrames.model_validate(frames) for vehicle, frames in counted.items()
+        }
 
     async def _stop_rogue(self, rogue: RogueProcess) -> None:
         try:

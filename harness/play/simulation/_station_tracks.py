@@ -9,8 +9,9 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
+from harness.archive.run_record import GroundStationRecord
 from harness.errors import ScenarioError
 from harness.scenario import Scenario
 from sitl.address import ListenAddress
@@ -93,9 +94,9 @@ class StationTracks:
                 ):  # a station that reads too slowly misses messages
                     connection.sock.send(data)
 
-    def close(self) -> dict[str, Any]:
+    def close(self) -> GroundStationRecord:
         """Close all connections to the ground station. Return the record of these connections for run.json."""
-        passed = self._station.to_json()
+        passed = GroundStationRecord.model_validate(self._station.to_json())
         self._station.close()
         for connection in self._connections.values():
             connection.sock.close()

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from harness.archive.run_record import Cycle
+from harness.archive.run_record import AgentFailure, AgentRecord, ChannelRecord, Cycle, HandlerRuns, NetworkState
 from harness.errors import AgentFailedError, ScenarioError
 from harness.play._radio_range import TRACK_S, RadioRange, tracks_of
 from harness.play.agent_control import AgentStatus
@@ -26,7 +26,7 @@ from harness.play.simulation.fate_script import FateScript, NameOf
 from harness.play.simulation.incarnations import SimulatedIncarnation
 from harness.play.simulation.run_files import Recorder
 from harness.scenario import Scenario
-from harness.scenario.changes import Change, NetworkChange, TimedInjection, disconnected_until, silent_injections
+from harness.scenario.changes import NO_MORE_FATES, Change, NetworkChange, TimedInjection, silent_injections
 from harness.scenario.fates import Fate
 from harness.scenario.faults import VehicleFault
 from netem.radio import Place
@@ -102,7 +102,7 @@ class Simulation(EventLoop):
         self._switched_off: dict[int, SimulatedIncarnation] = {}
         self._failures: dict[int, AgentFailedError | AgentLacksError] = {}
         """Number of an agent -> its last failure."""
-        self._failed_incarnations: list[list[dict[str, Any]]] = [[] for _ in self.roster]
+        self._failed_incarnations: list[list[AgentFailure]] = [[] for _ in self.roster]
         """Records of the failures of each agent."""
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
@@ -370,7 +370,7 @@ class Simulation(EventLoop):
         self._air.remove_agent(number)
         self._failures[number] = error
         which = len(self._incarnations[number]) + (incarnation is None)
-        failure = {"at_s": round(self._now, 3), "incarnation": which, "detail": error.detail}
+        failure = AgentFailure(at_s=round(self._now, 3), incarnation=which, detail=error.detail)
         self._failed_incarnations[number].append(failure)
         if self.played.outcome == "completed":
             self.played.end_early("failed", error)
@@ -395,17 +395,17 @@ class Simulation(EventLoop):
         return dataclasses.replace(
             self.played,
             mission_s=round(self._now, 3),
-            network=network if last_s is None else disconnected_until(last_s, network),
-            channel=self._channel_to_json(),
+            network=network if last_s is None else _disconnected_until(last_s, network),
+            channel=self._channel_record(),
             unmatched_fates=[*self._air.unmatched_fates(), *self._injected_nothing()],
-            agents={str(agent_id): self._agent_to_json(number) for agent_id, number in self._number.items()},
+            agents={str(agent_id): self._agent_record(number) for agent_id, number in self._number.items()},
         )
 
-    def _channel_to_json(self) -> dict[str, Any] | None:
+    def _channel_record(self) -> ChannelRecord | None:
         asked = self.scenario.network.channel
         if self._channel is None or asked is None:
             return None
-        return {"model": asked.to_json(), **self._channel.totals.to_json()}
+        return ChannelRecord.model_validate({"model": asked.to_json(), **self._channel.totals.to_json()})
 
     def _injected_nothing(self) -> list[str]:
         return silent_injections(self._injected, self._rogue.sent) if self._rogue is not None else []
@@ -436,7 +436,7 @@ class Simulation(EventLoop):
         """Return the recorded inputs and answers of the foreign agents, for each of their starts."""
         return [] if self._foreign_swarm is None else self._foreign_swarm.records
 
-    def _agent_to_json(self, number: int) -> dict[str, Any]:
+    def _agent_record(self, number: int) -> AgentRecord:
         incarnations = self._incarnations[number]
         off, failure = self._switched_off.get(number), self._failures.get(number)
         incarnation = off or self._alive[number]
@@ -451,38 +451,29 @@ class Simulation(EventLoop):
         gone = "rebooting" if number in self._disks else "killed" if incarnations else "not started"
         ended = failure.outcome if failure else gone
         detail = failure.detail if failure else f"switched off at {off.ended_at:g} s" if off else None
-        return {
-            "outcome": "exported" if incarnation else ended,
-            **({"detail": detail} if detail else {}),
-            **self._program_to_json(number, known),
-            "restarts": max(0, len(incarnations) - 1 - reboots),
-            "reboots": reboots,
-            **({"failures": failures} if (failures := self._failed_incarnations[number]) else {}),
-            "completed_before": list(completed),
-            "idle": incarnation.idle if incarnation else None,
-            "bytes_sent": sum(incarnation.bytes_sent for incarnation in incarnations),
-            **({"dropped": dict(dropped)} if self._rogue is not None or self._keys is not None else {}),
-            "messages_sent": sum(incarnation.agent.messages_sent for incarnation in incarnations),
-            "reconciles": sum(status.reconciles for status in known if status) if all(known) else None,
-            "chain_changed_at_s": _rounded(incarnation.chain_changed_at) if incarnation else None,
-            **(
-                {"handler_runs": [self._handler_runs(*each) for each in zip(incarnations, known, strict=True)]}
-                if self._tracing
-                else {}
-            ),
-        }
+        agent_id, foreign = self.roster[number], self._foreign_swarm
+        is_foreign = foreign is not None and agent_id in foreign
+        return AgentRecord(
+            outcome="exported" if incarnation else ended,
+            detail=detail,
+            command=foreign.command_of(agent_id) if foreign is not None and is_foreign else None,
+            version=next((status.version for status in reversed(known) if status), None) if is_foreign else None,
+            restarts=max(0, len(incarnations) - 1 - reboots),
+            reboots=reboots,
+            failures=self._failed_incarnations[number],
+            completed_before=list(completed),
+            idle=incarnation.idle if incarnation else None,
+            bytes_sent=sum(incarnation.bytes_sent for incarnation in incarnations),
+            dropped=dict(dropped) if self._rogue is not None or self._keys is not None else None,
+            messages_sent=sum(incarnation.agent.messages_sent for incarnation in incarnations),
+            reconciles=sum(status.reconciles for status in known if status) if all(known) else None,
+            chain_changed_at_s=_rounded(incarnation.chain_changed_at) if incarnation else None,
+            handler_runs=[self._handler_runs(*each) for each in zip(incarnations, known, strict=True)]
+            if self._tracing
+            else [],
+        )
 
-    def _program_to_json(self, number: int, known: Sequence[AgentStatus | None]) -> dict[str, Any]:
-        """Return the command and version of a foreign agent. The result is empty for an agent of the harness."""
-        agent_id = self.roster[number]
-        if self._foreign_swarm is None or agent_id not in self._foreign_swarm:
-            return {}
-        version = next((status.version for status in reversed(known) if status), None)
-        return {"command": self._foreign_swarm.command_of(agent_id), "version": version}
-
-    def _handler_runs(
-        self, incarnation: SimulatedIncarnation, status: AgentStatus | None
-    ) -> dict[str, int | float] | None:
+    def _handler_runs(self, incarnation: SimulatedIncarnation, status: AgentStatus | None) -> HandlerRuns | None:
         """Return the number of handler runs of the agent, with the time of the count. A foreign agent reports this
         number itself.
         """
@@ -490,7 +481,7 @@ class Simulation(EventLoop):
             return None
         at_s = self._now if incarnation.ended_at is None else incarnation.ended_at
         counted = status.handled if incarnation.state is None else incarnation.handler_runs
-        return {"counted": counted, "from_s": round(at_s, 3), "until_s": round(at_s, 3)}
+        return HandlerRuns(counted=counted, from_s=round(at_s, 3), until_s=round(at_s, 3))
 
     # The methods of harness.scenario.faults.AgentOperations
 
@@ -575,3 +566,14 @@ def _initial_data(scenario: Scenario, seed: int) -> bytes:
 
 def _rounded(seconds: float | None) -> float | None:
     return None if seconds is None else round(seconds, 3)
+
+
+def _disconnected_until(at_s: float, network: Sequence[NetworkState]) -> list[NetworkState]:
+    """Return the records of network changes. While scripted deliveries are active, until `at_s`, they are marked as not
+    fully connected.
+    """
+    since = round(at_s + 0.001, 3)  # include messages of the same instant
+    before = [state.model_copy(update={"fully_connected": False}) for state in network if state.at_s < since]
+    after = [state for state in network if state.at_s >= since]
+    again = {"at_s": since, "what": NO_MORE_FATES, "fully_connected": network[len(before) - 1].fully_connected}
+    return [*before, before[-1].model_copy(update=again), *after]

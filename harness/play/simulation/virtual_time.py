@@ -6,6 +6,7 @@ from contextlib import asynccontextmanager, closing, contextmanager
 from typing import TYPE_CHECKING
 
 from harness.archive.directory import RunDirectory
+from harness.archive.run_record import CapturedFrames
 from harness.errors import AgentFailedError, InterruptedRunError, MachineError, ScenarioError
 from harness.play._ground_station_check import refuse_unreachable_ground_station
 from harness.play._pace import VirtualTimePace
@@ -115,15 +116,18 @@ class SimulationBackend(Backend):
             try:
                 _export(simulation, files)
                 if capture:
-                    simulation.played.capture = capture.end(simulation.now())
+                    simulation.played.capture = {
+                        vehicle: CapturedFrames.model_validate(frames)
+                        for vehicle, frames in capture.end(simulation.now()).items()
+                    }
             except OSError as error:
                 simulation.played.end_early("failed", _failure(error, rundir))
             if simulation.records() and simulation.played.outcome == "completed":
                 await _compare_again(simulation, on_progress)
             for agent_id, problem in files.problems().items():
-                simulation.played.agents[str(agent_id)]["trace_problem"] = problem
+                simulation.played.agents[str(agent_id)].trace_problem = problem
             for agent_id, names in programs.close().items() if programs else ():
-                simulation.played.agents[str(agent_id)]["left_behind"] = names
+                simulation.played.agents[str(agent_id)].left_behind = names
 
 
 def _of_real_vehicles(scenario: Scenario) -> list[str]:

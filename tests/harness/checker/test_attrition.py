@@ -44,11 +44,11 @@ def test_attrition_is_the_same_with_processes_and_in_virtual_time(tmp_path: Path
     assert done.returncode == 0, done.stdout + done.stderr
     record = json.loads((out / "run.json").read_text())
     simulated = simulate(Scenario.model_validate({"name": "test", **STORY}), 5)
-    assert summary_of(record["faults"]) == summary_of(simulated.played.faults)
+    assert summary_of(record["faults"]) == summary_of([fault.model_dump() for fault in simulated.played.faults])
     assert {one["verdict"] for one in record["characteristics"].values()} == {"holds"}
     keys = ("outcome", "restarts", "reboots")
     assert {agent: [one[key] for key in keys] for agent, one in record["agents"].items()} == {
-        agent: [one[key] for key in keys] for agent, one in simulated.played.agents.items()
+        agent: [getattr(one, key) for key in keys] for agent, one in simulated.played.agents.items()
     }
     assert [bool(record["agents"][agent]["completed_before"]) for agent in "12345"] == [False, True, False, True, True]
     assert [(loss["what"], loss["vehicles"]) for loss in record["survival"]["losses"]] == [

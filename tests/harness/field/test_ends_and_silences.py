@@ -48,7 +48,7 @@ def test_agent_that_dies_in_a_handler_does_not_end_the_run(monkeypatch: pytest.M
     simulated = simulate(scenario(**FLIGHT | {"capture": False}), 1, tracing=True)
     assert simulated.played.mission_s >= 240
     assert simulated.played.exit_status == 1
-    assert simulated.played.agents["3"]["outcome"] == "crashed"
+    assert simulated.played.agents["3"].outcome == "crashed"
     last_s = {agent_id: trace.runs[-1].t for agent_id, trace in simulated.evidence.traces.items()}
     assert last_s[DEAD] < 100 < 200 < min(last_s[1], last_s[2])
     steps = simulated.result.judgements["steps"]

@@ -140,7 +140,7 @@ def played(monkeypatch: pytest.MonkeyPatch, agent_id: int, spoil: Callable[[Secu
 
 
 def dropped(run: Simulated) -> dict[str, set[str]]:
-    return {agent_id: set(agent["dropped"]) for agent_id, agent in run.played.agents.items()}
+    return {agent_id: set(agent.dropped or ()) for agent_id, agent in run.played.agents.items()}
 
 
 def only_at(agent_id: int, *reasons: str) -> dict[str, set[str]]:

@@ -75,7 +75,7 @@ def test_record_has_changes_of_connected_groups_only() -> None:
         {**change, "at_s": 4.0, "detail": "1 2 3", "fully_connected": True},
     ):
         played.record(record)
-    assert [record["at_s"] for record in played.network] == [1.0, 3.0, 4.0]
+    assert [state.at_s for state in played.network] == [1.0, 3.0, 4.0]
 
 
 def test_virtual_time_has_tracks_only_if_positions_are_needed() -> None:
@@ -91,7 +91,7 @@ def test_virtual_time_has_tracks_only_if_positions_are_needed() -> None:
 def test_subswarms_split_the_network_and_reconcile_after_the_rejoin() -> None:
     split_rejoin = load_scenario(SCENARIOS / "split_rejoin.yaml")
     simulated = simulate(split_rejoin, 1)
-    connected = [(state["at_s"], state["detail"]) for state in simulated.played.network if state["what"] == RANGE]
+    connected = [(state.at_s, state.detail) for state in simulated.played.network if state.what == RANGE]
     assert [detail for _, detail in connected] == ["1 2 3 4 5", "3 4 5 | 1 2", "1 2 3 4 5"]
     (_, _), (apart_s, _), (again_s, _) = connected
     assert apart_s < 300 and again_s > apart_s + 300

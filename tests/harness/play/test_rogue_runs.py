@@ -90,7 +90,7 @@ def test_corrupt_messages_are_refused_or_change_no_chain(tmp_path: Path) -> None
     malformed = sum(injection.refused.values())
     assert min(well_formed, malformed) > 10
     assert injection.sent == well_formed + malformed
-    dropped = [agent["dropped"] for agent in finished.played.agents.values()]
+    dropped = [agent.dropped or {} for agent in finished.played.agents.values()]
     for reason, count in injection.refused.items():
         assert sum(one.get(reason, 0) for one in dropped) == 4 * count
     assert violated(finished) <= {"1"}

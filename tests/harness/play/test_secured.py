@@ -15,7 +15,7 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
 
 def dropped(run: Simulated) -> set[str]:
     """Return the reasons why agents dropped datagrams."""
-    return {reason for agent in run.played.agents.values() for reason in agent.get("dropped", {})}
+    return {reason for agent in run.played.agents.values() for reason in agent.dropped or ()}
 
 
 def secured(plain: Scenario) -> Scenario:

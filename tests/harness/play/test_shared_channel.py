@@ -28,8 +28,9 @@ def scenario(preset: str = "wifi_1", agents: int = 5, **keys: Any) -> Scenario:
 
 def outcome(simulated: Simulated) -> str:
     played = simulated.played
-    agents = {agent_id: {**agent, "handler_runs": None} for agent_id, agent in played.agents.items()}
-    return json.dumps([agents, played.network, played.mission_s, played.channel])
+    agents = {agent_id: agent.model_dump(exclude={"handler_runs"}) for agent_id, agent in played.agents.items()}
+    network = [state.model_dump() for state in played.network]
+    return json.dumps([agents, network, played.mission_s, played.channel and played.channel.model_dump()])
 
 
 @pytest.mark.parametrize(
@@ -63,14 +64,14 @@ def test_answers_that_begin_at_once_collide() -> None:
 def test_partition_separates_the_channels() -> None:
     apart = simulate(scenario(network={"loss": 0.0}, timeline=[{"at_s": 0.1, "partition": [[1, 2]]}]), 1)
     assert apart.played.channel is not None
-    assert apart.played.channel["lost"]["partition"]["1"] > 0
+    assert apart.played.channel.lost["partition"]["1"] > 0
     assert apart.result.figures["distinct_chains"] == 2
 
 
 def test_channel_is_never_fully_connected() -> None:
     states = simulate(scenario(), 1).played.network
-    assert [state["fully_connected"] for state in states] == [False]
-    assert states[0]["detail"] == "loss 0 %, shared channel wifi_1"
+    assert [state.fully_connected for state in states] == [False]
+    assert states[0].detail == "loss 0 %, shared channel wifi_1"
 
 
 def test_final_reconcile_has_no_channel() -> None:
@@ -91,13 +92,13 @@ def test_scripted_fate_drops_a_frame_that_the_channel_delivers() -> None:
 def test_record_has_the_load_and_every_loss() -> None:
     channel = simulate(scenario("wifi_1", 20, channel={"processing_s": 0.0}, duration_s=100), 1).played.channel
     assert channel is not None
-    assert channel["model"]["preset"] == "wifi_1"
-    assert channel["model"]["rate_bps"] == 1e6
-    assert channel["frames"] > 0
-    assert channel["airtime_s"] >= sum(channel["load"]) * channel["load_interval_s"] - 1e-3
-    assert max(channel["load"]) <= 1
-    assert sum(channel["lost"]["collision"].values()) > 0
-    assert sum(channel["lost"]["half_duplex"].values()) > 0
+    assert channel.model["preset"] == "wifi_1"
+    assert channel.model["rate_bps"] == 1e6
+    assert channel.frames > 0
+    assert channel.airtime_s >= sum(channel.load) * channel.load_interval_s - 1e-3
+    assert max(channel.load) <= 1
+    assert sum(channel.lost["collision"].values()) > 0
+    assert sum(channel.lost["half_duplex"].values()) > 0
 
 
 def test_run_without_a_channel_has_no_record_of_it() -> None:

@@ -49,8 +49,7 @@ def results_of(simulated: Simulated) -> dict[str, Any]:
     """Return the results of a run except its traces and their numbers of handler runs."""
     exports = {agent_id: export.model_dump() for agent_id, export in simulated.evidence.exports.items()}
     agents = {
-        agent_id: {name: value for name, value in agent.items() if name != "handler_runs"}
-        for agent_id, agent in simulated.played.agents.items()
+        agent_id: agent.model_copy(update={"handler_runs": []}) for agent_id, agent in simulated.played.agents.items()
     }
     played = replace(simulated.played, agents=agents)
     return {"exports": exports, "figures": simulated.result.figures, "played": played}

@@ -39,7 +39,7 @@ def verdicts(simulated: Simulated) -> set[str]:
 def test_killed_agent_leaves_no_export() -> None:
     simulated = played([{"at_s": 300, "kill": [2, 5]}], final_reconcile=True)
     assert sorted(simulated.evidence.exports) == [1, 3, 4]
-    assert simulated.played.agents["2"]["outcome"] == "killed"
+    assert simulated.played.agents["2"].outcome == "killed"
     assert max(run.t for run in simulated.evidence.traces[2].runs) <= 300
     assert verdicts(simulated) == {"holds"}
     blocks, left = simulated.result.figures["blocks"], len(simulated.evidence.exports[1].chain)
@@ -97,7 +97,7 @@ def test_reboot_with_kept_disk_loses_no_block(seed: int) -> None:
     assert verdicts(simulated) == {"holds"}
     assert simulated.result.characteristics["5"].reason.endswith("blocks are in every chain")
     agent = simulated.played.agents["2"]
-    assert (agent["outcome"], agent["restarts"], agent["reboots"], agent["completed_before"]) == ("exported", 0, 2, [])
+    assert (agent.outcome, agent.restarts, agent.reboots, agent.completed_before) == ("exported", 0, 2, [])
     trace = simulated.evidence.traces[2]
     first, second, third = ([run for _, run in life] for life in trace.incarnations())
     assert max(run.t for run in first) <= 203 < 223 <= min(run.t for run in second)
@@ -105,7 +105,7 @@ def test_reboot_with_kept_disk_loses_no_block(seed: int) -> None:
     assert (third[0].t, third[0].handler) == (412, "reconcile_finalize")
     completed = simulated.evidence.exports[2].completed
     assert completed == list(dict.fromkeys(trace.completed()))
-    assert [fault["what"] for fault in simulated.played.faults[:4]] == ["reboot", "boot", "reboot", "boot"]
+    assert [fault.what for fault in simulated.played.faults[:4]] == ["reboot", "boot", "reboot", "boot"]
 
 
 def test_reboot_with_lost_disk_equals_kill_and_restart() -> None:
@@ -288,8 +288,8 @@ def test_switched_off_agent_exports_its_chain_and_loses_nothing() -> None:
     simulated = played([{"at_s": 300, "switch_off": [2, 5]}], final_reconcile=True)
     assert sorted(simulated.evidence.exports) == [1, 2, 3, 4, 5]
     assert simulated.evidence.exports[2].exported_at_us == 300_000_000
-    assert simulated.played.agents["2"]["outcome"] == "exported"
-    assert simulated.played.agents["2"]["detail"] == "switched off at 300 s"
+    assert simulated.played.agents["2"].outcome == "exported"
+    assert simulated.played.agents["2"].detail == "switched off at 300 s"
     assert max(run.t for run in simulated.evidence.traces[2].runs) <= 300
     assert not simulated.result.bad
     uniform = simulated.result.characteristics["6"]

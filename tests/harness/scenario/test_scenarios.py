@@ -147,7 +147,7 @@ def rolling_partitions(run: Simulated, seed: int) -> None:
 
 
 def late_joiner(run: Simulated, seed: int) -> None:
-    assert run.played.agents["5"]["restarts"] == 1
+    assert run.played.agents["5"].restarts == 1
     before = state(run, 1, 600).chain
     assert before > 0
     assert reconciles(run, 5) > 0
@@ -158,8 +158,8 @@ def late_joiner(run: Simulated, seed: int) -> None:
 def shared_channel(run: Simulated, seed: int) -> None:
     channel = run.played.channel
     assert channel is not None
-    assert all(count > 100 for count in channel["lost"]["collision"].values())
-    assert len(channel["lost"]["collision"]) == 20
+    assert all(count > 100 for count in channel.lost["collision"].values())
+    assert len(channel.lost["collision"]) == 20
     assert distinct_chains(run) == 1
 
 
@@ -182,7 +182,7 @@ def attrition(run: Simulated, seed: int) -> None:
         (500, "crash", [4]),
         (750, "reboot", [6]),
     ]
-    lives = {agent: (one["outcome"], one["restarts"], one["reboots"]) for agent, one in run.played.agents.items()}
+    lives = {agent: (one.outcome, one.restarts, one.reboots) for agent, one in run.played.agents.items()}
     assert (lives["2"], lives["3"], lives["4"]) == (("exported", 1, 0), ("exported", 0, 1), ("killed", 0, 0))
     assert survival(run.evidence).gone < MAX_UNDECIDED_BLOCKS
 
@@ -197,7 +197,7 @@ def large_divergence(run: Simulated, seed: int) -> None:
 
 
 def split_rejoin(run: Simulated, seed: int) -> None:
-    assert any(change["what"] == RANGE for change in run.played.network)
+    assert any(change.what == RANGE for change in run.played.network)
     assert longest_stack(run) > 1
     assert blocks_beyond_mutual(run) <= MAX_UNDECIDED_BLOCKS
 
@@ -281,7 +281,7 @@ def field_test_2020(run: Simulated, seed: int) -> None:
     exports = run.evidence.exports
     left = {agent: (len(it.blocks_to_be_committed), len(it.reconcile_stack)) for agent, it in exports.items()}
     assert left == {10: (0, 0), 28: (0, 0), 32: (1, 1), 118: (0, 0), 120: (1, 0), 122: (1, 0)}
-    assert not any("partition" in change["what"] for change in run.played.network), "the flight had no partition"
+    assert not any("partition" in change.what for change in run.played.network), "the flight had no partition"
     assert run.evidence.switched_off == {118: 1740, 120: 1740, 122: 1740, 28: 1770, 32: 1770, 10: 1785}
     last_event_s = {
         agent: max(step.t for step in trace.runs if step.trigger.kind == "event")
@@ -308,13 +308,13 @@ def captured(run: Simulated, seed: int) -> None:
     )
     assert all(finding.detail.startswith(never_made) for finding in violated["4"].evidence)
     unsigned = {"not signed by its sender": 1}
-    dropped = {agent_id for agent_id, agent in run.played.agents.items() if agent["dropped"] == unsigned}
+    dropped = {agent_id for agent_id, agent in run.played.agents.items() if agent.dropped == unsigned}
     assert dropped == {"1", "4", "5"}, "agents that receive a block in the name of vehicle 2 drop it"
 
 
 def secure(run: Simulated, seed: int) -> None:
     """Check that agents accept no message of a rogue node without keys."""
-    dropped = sum((Counter(agent["dropped"]) for agent in run.played.agents.values()), Counter[str]())
+    dropped = sum((Counter(agent.dropped) for agent in run.played.agents.values()), Counter[str]())
     assert dropped["replayed"]
     assert dropped["not secured"]
     final = run.evidence.exports.values()

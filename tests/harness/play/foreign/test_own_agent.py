@@ -34,10 +34,7 @@ EVENTFUL: dict[str, Any] = {
 
 
 def results_of(simulated: Simulated) -> dict[str, Any]:
-    agents = [
-        {key: value for key, value in agent.items() if key not in ("command", "version")}
-        for agent in simulated.played.agents.values()
-    ]
+    agents = [agent.model_dump(exclude={"command", "version"}) for agent in simulated.played.agents.values()]
     return {
         "exports": [export.model_dump() for export in simulated.evidence.exports.values()],
         "traces": [[run.to_line() for run in trace.runs] for trace in simulated.evidence.traces.values()],
