@@ -10,7 +10,6 @@ wheel and the site contain the schemas as files. To write them into a folder:
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel
 
@@ -38,7 +37,7 @@ MODELS: dict[str, type[BaseModel]] = {
 }
 
 
-def generate(name: str) -> dict[str, Any]:
+def generate(name: str) -> dict[str, object]:
     """Return the JSON schema with this name, which is a key of `MODELS`."""
     schema = MODELS[name].model_json_schema(by_alias=True)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

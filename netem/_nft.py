@@ -204,19 +204,19 @@ def _grouped(parts: list[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]
     yield together
 
 
-def _add(kind: str, **what: Any) -> dict[str, Any]:
+def _add(kind: str, **what: Any) -> dict[str, object]:
     return {"add": {kind: what}}
 
 
-def _flush(kind: str, name: str) -> dict[str, Any]:
+def _flush(kind: str, name: str) -> dict[str, object]:
     return {"flush": {kind: {**_TABLE, "name": name}}}
 
 
-def _rule(chain: str, *expressions: dict[str, Any]) -> dict[str, Any]:
+def _rule(chain: str, *expressions: dict[str, Any]) -> dict[str, object]:
     return _add("rule", **_TABLE, chain=chain, expr=list(expressions))
 
 
-def _match(operator: str, left: dict[str, Any], right: int) -> dict[str, Any]:
+def _match(operator: str, left: dict[str, Any], right: int) -> dict[str, object]:
     return {"match": {"op": operator, "left": left, "right": right}}
 
 

@@ -84,7 +84,7 @@ def _command(message: Any) -> str | None:
     return known.name if known else str(number)
 
 
-def _values(message: Any) -> dict[str, Any]:
+def _values(message: Any) -> dict[str, object]:
     """Return the fields of the message as JSON values, without its address. The result is empty for joystick
     messages.
     """

@@ -11,7 +11,7 @@ import asyncio
 import socket
 import time
 from collections.abc import Callable
-from typing import Any, Self, cast
+from typing import Self, cast
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -95,7 +95,7 @@ class GroundStation(asyncio.DatagramProtocol):
         if self._transport is not None:
             self._transport.abort()
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {
             "address": str(self._address),
             "sent": self._sent,

@@ -187,7 +187,7 @@ class ClientChannel:
             vehicle.simulate(name, value)
         self.send(self._parameters()[name])
 
-    def _parameters(self) -> dict[str, Any]:
+    def _parameters(self) -> dict[str, object]:
         """Return the message PARAM_VALUE for each parameter. A ground station requests all parameters before it shows a
         vehicle.
         """

@@ -1,11 +1,9 @@
 """The status of an agent, as its driver reports it (see contract/CONTRACT.md)."""
 
-from typing import Any
-
 from ucp.agent import Agent
 
 
-def status_of(agent: Agent) -> dict[str, Any]:
+def status_of(agent: Agent) -> dict[str, object]:
     """Return those values of the status that the agent core knows. The caller adds the other values."""
     state = agent.state
     return {

@@ -67,7 +67,7 @@ class ControlServer:
         with contextlib.suppress(OSError):  # the client may have disconnected already
             _ControlClient(self._listener.accept()[0], self.answer, self._loop)
 
-    def answer(self, line: bytes) -> dict[str, Any]:
+    def answer(self, line: bytes) -> dict[str, object]:
         """Return the answer to one line with a request."""
         try:
             request = json.loads(line.decode())  # given bytes, json would also accept UTF-16

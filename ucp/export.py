@@ -2,7 +2,6 @@
 
 import base64
 from collections.abc import Mapping
-from typing import Any
 
 from ucp.block import Block
 from ucp.state import AgentState
@@ -12,7 +11,7 @@ SCHEMA = "ucp-chain-export/1"
 
 def export_chain(
     state: AgentState, exported_at_us: int, signatures: Mapping[bytes, bytes] | None = None
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the chain export of an agent as a JSON object.
 
     The chain is listed from its oldest block, the deque from its front, and the reconcile stack to its top. In a
@@ -20,7 +19,7 @@ def export_chain(
     """
     inception = state.chain.inception
 
-    def exported(block: Block, chain_hash: bytes | None) -> dict[str, Any]:
+    def exported(block: Block, chain_hash: bytes | None) -> dict[str, object]:
         signature = signatures.get(block.block_hash) if signatures else None
         return _block(block, chain_hash) | ({"signature": _base64(signature)} if signature else {})
 
@@ -43,7 +42,7 @@ def export_chain(
     }
 
 
-def _block(block: Block, chain_hash: bytes | None) -> dict[str, Any]:
+def _block(block: Block, chain_hash: bytes | None) -> dict[str, object]:
     return {
         "agent_id": block.agent_id,
         "timestamp_us": block.timestamp_us,

@@ -57,7 +57,7 @@ class SecuredState:
             self.revocations = (base64.b64decode(revocation),)
         self.revocations = (*self.revocations, *map(base64.b64decode, entry.get("revocations", ())))
 
-    def entry(self, before: "SecuredState | None" = None) -> dict[str, Any]:
+    def entry(self, before: "SecuredState | None" = None) -> dict[str, object]:
         """Return the data that changed since `before`, as one entry for the store file."""
         new: dict[str, Any] = {}
         if before is None:

@@ -175,7 +175,7 @@ def _read(path: Path) -> RecordFile:
     return RecordFile(record, None if needed else record, sentences)
 
 
-def _document(path: Path) -> dict[str, Any]:
+def _document(path: Path) -> dict[str, object]:
     try:
         document = read_json(path, MAX_BYTES, MAX_WEIGHT)
     except OSError as error:

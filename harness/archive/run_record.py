@@ -655,6 +655,6 @@ class RunRecord(JudgedRecord):
         further = {key: judgement for key in FURTHER_CHECKS if (judgement := getattr(self, key)) is not None}
         return {**self.characteristics, **further}
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the record as a JSON object with all keys."""
         return self.model_dump(mode="json", by_alias=True)

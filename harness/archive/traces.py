@@ -103,7 +103,7 @@ HANDLER_RUN = TypeAdapter(HandlerRun)
 ASIDE = TypeAdapter(DroppedDatagram | CommandEntry)
 
 
-def read_clock(path: Path) -> dict[str, Any]:
+def read_clock(path: Path) -> dict[str, object]:
     """Return the clock in the header of a trace. Return an empty clock if the header cannot be read."""
     try:
         with open_trace(path) as file:

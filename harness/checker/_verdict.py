@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 from harness.archive.archive import RunArchive
 from harness.checker import (
@@ -88,7 +87,7 @@ class Result:
         """
         return VIOLATED if self.wrong else INCOMPLETE if self.bad else 0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the verdict as JSON, in the form of the schema `ucp-run/1`: one key for each part of the verdict."""
         return {
             "characteristics": {

@@ -4,7 +4,6 @@ A check without evidence is `not applicable`, never `holds`.
 """
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 from harness.scenario.verdict_names import Kind, Verdict, kind_of
 
@@ -40,7 +39,7 @@ class Judgement:
         """The class of the verdict: `good`, `bad` or `unknown`. A bad verdict leads to a nonzero exit status."""
         return kind_of(self.verdict)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the judgement as an object of type `JudgementRecord` in the JSON schema `ucp-run/1`."""
         return {
             "name": self.name,

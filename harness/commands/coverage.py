@@ -67,7 +67,7 @@ def coverage_command(
         raise typer.Exit(WRONG_REQUEST)
 
 
-def _relevant_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _relevant_settings(settings: Mapping[str, Any]) -> dict[str, object]:
     """Return the settings that differ from their defaults and affect the local states of an agent."""
     default = dataclasses.asdict(Settings())
     return {

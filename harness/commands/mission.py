@@ -194,7 +194,7 @@ def _texts(option: str, pairs: list[str] | None) -> dict[str, str]:
     return texts
 
 
-def _pairs(option: str, pairs: list[str] | None) -> dict[str, Any]:
+def _pairs(option: str, pairs: list[str] | None) -> dict[str, object]:
     """Return the values of options in the form KEY=VALUE, by key. A value that is not valid JSON is a text."""
     values: dict[str, Any] = {}
     for key, text in _texts(option, pairs).items():
@@ -205,7 +205,7 @@ def _pairs(option: str, pairs: list[str] | None) -> dict[str, Any]:
     return values
 
 
-def _events(values: dict[str, Any]) -> dict[str, Any]:
+def _events(values: dict[str, Any]) -> dict[str, object]:
     """Split the value of `log` at its commas, so that the user can write `--event log=mode,position` without
     brackets.
     """

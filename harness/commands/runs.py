@@ -3,7 +3,7 @@
 import webbrowser
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.table import Table
@@ -83,7 +83,7 @@ def _local(started_at: str | None) -> str:
         return ""
 
 
-def _document(run: PastRun) -> dict[str, Any]:
+def _document(run: PastRun) -> dict[str, object]:
     record = run.record
     return {
         "directory": str(run.path),

@@ -68,7 +68,7 @@ def scenario_of(name: str, command: Sequence[str], variant: SettingsVariant, pat
     return to_yaml({key: value for key, value in document.items() if value not in ({}, [])}, COMMENT)
 
 
-def _non_default(settings: dict[str, Any]) -> dict[str, Any]:
+def _non_default(settings: dict[str, Any]) -> dict[str, object]:
     default = Settings().to_json()
     return {name: value for name, value in settings.items() if name not in default or default[name] != value}
 

@@ -115,7 +115,7 @@ def to_lines(generated: Sequence[VectorSet]) -> Iterator[str]:
                 numbers[path[:length]] = number
 
 
-def _step(number: int, after: int, line: VirtualLine, state: str | None) -> dict[str, Any]:
+def _step(number: int, after: int, line: VirtualLine, state: str | None) -> dict[str, object]:
     """Return the JSON object for one line. `state` describes the tested state. `state` is None for a step that only
     leads to a test.
     """

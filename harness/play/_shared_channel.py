@@ -9,12 +9,12 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from heapq import heappop, heappush
 from random import Random
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from netem.channel import Channel, EndedTransmission, FrameFate, Radio, numbers
 from netem.radio import Place
 
-Journal = Callable[[dict[str, Any]], None]
+Journal = Callable[[dict[str, object]], None]
 """A function that records a message on the channel: the time at which its radio received it, the time at which it was
 sent, and the vehicles that lost it.
 """
@@ -89,11 +89,11 @@ class ChannelTraffic(Generic[Message]):
             self.next_s = processed[0][0]
         return ended
 
-    def _line(self, at: float, sender: int, message: Message, data_bytes: int) -> dict[str, Any]:
+    def _line(self, at: float, sender: int, message: Message, data_bytes: int) -> dict[str, object]:
         identity = {"sender": self._roster[sender], "sequence": message.sequence, "bytes": data_bytes}
         return {"at_s": round(at, 6), **identity}
 
-    def _line_of(self, frame: EndedTransmission, message: Message) -> dict[str, Any]:
+    def _line_of(self, frame: EndedTransmission, message: Message) -> dict[str, object]:
         lost = {fate.value: [self._roster[number] for number in numbers(bits)] for fate, bits in frame.lost().items()}
         times = {"began_s": round(frame.began_at, 6), "ended_s": round(frame.ended_at, 6)}
         return {**self._line(frame.queued_at, frame.sender, message, frame.data_bytes), **times, "lost": lost}
@@ -147,7 +147,7 @@ class ChannelTotals:
             self._load[index] += until - began_at
             began_at = until
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the counts as a JSON object for run.json."""
         lost = {fate.value: self._by_id(counter.counts()) for fate, counter in sorted(self._receivers.items())}
         return {

@@ -16,7 +16,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED, HarnessError
 from harness.play.core_version import CORE, edited_files
@@ -73,7 +72,7 @@ class ProofComparison:
             return INTERRUPTED
         return 0 if self.proof.decided else INCOMPLETE
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         original = {"name": self.original.name, "complete": self.original.complete, "findings": self.original.findings}
         return {**self.proof.to_json(), "original": original, "new_findings": self.new, "shared_findings": self.shared}
 

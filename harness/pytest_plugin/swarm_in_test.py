@@ -346,7 +346,7 @@ class Swarm:
         return self._recording.end(played)
 
 
-def _of_message(message: str | None, keys: dict[str, Any]) -> dict[str, Any]:
+def _of_message(message: str | None, keys: dict[str, Any]) -> dict[str, object]:
     return keys if message is None else {"message": message, **keys}
 
 

@@ -119,7 +119,9 @@ def _pictures(
     ]
 
 
-def _picture(heading: str, exports: Mapping[int, Export], ink: Mapping[int, AgentColours], key: str) -> dict[str, Any]:
+def _picture(
+    heading: str, exports: Mapping[int, Export], ink: Mapping[int, AgentColours], key: str
+) -> dict[str, object]:
     tree = ChainTreePicture(exports, ink, key)
     return {
         "heading": heading,

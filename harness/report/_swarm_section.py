@@ -58,7 +58,7 @@ VEHICLE_FAULTS_KEY = "befallen"
 """Key of the list of faults in a vehicle's record."""
 
 
-def agents_table(archive: RunArchive, ink: Mapping[int, AgentColours]) -> dict[str, Any]:
+def agents_table(archive: RunArchive, ink: Mapping[int, AgentColours]) -> dict[str, object]:
     """Return the column titles and a row for each agent with its vehicle. A row consists of agent ID, colour, and the
     cells by column.
     """
@@ -107,7 +107,7 @@ def _vehicle_faults(recorded: Any) -> str:
         return text.value(recorded)
 
 
-def _agent_cells(agent: AgentRecord) -> dict[str, Any]:
+def _agent_cells(agent: AgentRecord) -> dict[str, object]:
     kept = agent.model_dump(mode="json", exclude={"detail", "dropped", "command", "version", "failures"})
     cells: dict[str, Any] = {text.label(key): value for key, value in kept.items()}
     cells["completed before"] = len(agent.completed_before) or None

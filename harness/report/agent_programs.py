@@ -4,7 +4,6 @@ import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
 from harness.archive.run_record import AgentRecord, RunRecord
 from harness.report.chain_tree import ranges
@@ -29,7 +28,7 @@ class AgentProgram:
         of_version = "" if self.version is None else f" ({self.version})"
         return f"agent{'s' * (len(self.agents) > 1)} {', '.join(ranges([*self.agents]))} ran {program}{of_version}"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {"agents": self.agents, "command": self.command, "version": self.version}
 
 

@@ -113,6 +113,6 @@ def headline(verdicts: list[VerdictEntry], *, completed: bool) -> tuple[str, str
     return words_for_it, bad if beside else "holds" if completed and holding else "unknown"
 
 
-def _evidence(finding: FindingRecord) -> dict[str, Any]:
+def _evidence(finding: FindingRecord) -> dict[str, object]:
     labels = {"agent_id": "agent", "block_hash": "hash"}
     return {labels.get(key, key): value for key, value in finding.model_dump(exclude_none=True).items()}

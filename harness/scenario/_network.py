@@ -173,7 +173,7 @@ class ConditionOverrides(StrictModel):
     messages are lost. With `none`, there is no limit. A `limit` requires a `delay` or a `rate`.
     """
 
-    def given(self) -> dict[str, Any]:
+    def given(self) -> dict[str, object]:
         """Return the conditions that were given a value, by key."""
         return {key: value for key in KEYS if (value := getattr(self, key)) is not None}
 

@@ -3,7 +3,6 @@
 import re
 import shlex
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from harness.errors import ScenarioError
 from harness.scenario.scenario import Scenario
@@ -26,7 +25,7 @@ def programs_of(options: Iterable[str]) -> Programs:
     return programs
 
 
-def command_keys(scenario: Scenario, programs: Programs) -> dict[str, Any]:
+def command_keys(scenario: Scenario, programs: Programs) -> dict[str, object]:
     """Return the scenario keys that select these programs. The result is empty if there are no programs."""
     if not programs:
         return {}

@@ -7,7 +7,6 @@ checker does not use this timeline.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any
 
 from harness.scenario import Scenario
 from harness.scenario.faults import Fault
@@ -42,7 +41,7 @@ class NetworkChange:
     channel: str | None = None
     """Preset of the radio channel that vehicles share. On a shared channel, any message may be lost."""
 
-    def to_json(self, at_s: float) -> dict[str, Any]:
+    def to_json(self, at_s: float) -> dict[str, object]:
         """Return the record of this change. It was made at mission second `at_s`."""
         return {
             "at_s": at_s,
@@ -71,13 +70,13 @@ class TimedInjection:
     def detail(self) -> str:
         return self.injection.in_words()
 
-    def to_json(self, at_s: float) -> dict[str, Any]:
+    def to_json(self, at_s: float) -> dict[str, object]:
         """Return the record of this injection. It started at mission second `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail}
         return {**record, **planned_key(self.at_s, at_s), **_hand(self.by_hand)}
 
 
-def _hand(by_hand: bool) -> dict[str, Any]:
+def _hand(by_hand: bool) -> dict[str, object]:
     return {"by_hand": True} if by_hand else {}
 
 

@@ -100,7 +100,7 @@ def parse_yaml(text: str) -> Any:
     raise ScenarioError(f"not YAML{where}: {problem[:MAX_PROBLEM]}")
 
 
-def read_yaml(path: Path, what: str) -> dict[str, Any]:
+def read_yaml(path: Path, what: str) -> dict[str, object]:
     """Return the mapping in a YAML file, or in the included file of this name. Error messages call it `what`.
 
     Raises ScenarioError.

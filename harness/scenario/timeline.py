@@ -131,7 +131,7 @@ class _TimelineEntryBase(NetworkDisturbance):
         return self
 
 
-def _keys_of_faults() -> dict[str, Any]:
+def _keys_of_faults() -> dict[str, object]:
     """Return the model fields for faults in a timeline entry: the names of all faults, and their further keys."""
     annotations: dict[str, Any] = {}
     descriptions: dict[str, str] = {}

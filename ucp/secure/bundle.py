@@ -55,7 +55,7 @@ class PublicKeys:
         text = json.dumps(self.to_json(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(b"UCP public keys\0" + text.encode("ascii")).hexdigest()
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the content of `public.json`."""
         return {
             "schema": PUBLIC_SCHEMA,
@@ -107,7 +107,7 @@ class Bundle:
         """Return a copy of the bundle that is marked as used: the vehicle may have flown with it before."""
         return replace(self, started_us=self.started_us or 0)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the content of the bundle file, including the secrets."""
         return {
             **self.public.to_json(),

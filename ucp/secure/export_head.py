@@ -12,7 +12,6 @@ import hashlib
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from ucp.secure.crypto_suite import UnverifiedSignature
 from ucp.secure.sealed_datagrams import Signer
@@ -38,7 +37,7 @@ class ExportHead:
     held: bytes
     revoked: Sequence[int]
 
-    def sign(self, signer: Signer, mission: bytes) -> dict[str, Any]:
+    def sign(self, signer: Signer, mission: bytes) -> dict[str, object]:
         """Sign the head, and return it as the JSON object that the export contains."""
         return {
             "mission": mission.hex(),

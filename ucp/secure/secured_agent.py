@@ -80,11 +80,11 @@ class SecuredAgent(Agent):
         """
         return self._signatures.held()
 
-    def signed_export(self, exported_at_us: int) -> dict[str, Any]:
+    def signed_export(self, exported_at_us: int) -> dict[str, object]:
         """Return the chain export with the signatures of the blocks and a signed head."""
         return {**export_chain(self.state, exported_at_us, self.signatures), "head": self.sign_head(exported_at_us)}
 
-    def sign_head(self, exported_at_us: int) -> dict[str, Any]:
+    def sign_head(self, exported_at_us: int) -> dict[str, object]:
         """Return the signed head of a chain export. Each head has the next higher number."""
         self._exports += 1
         head = head_of(self.state, self.session.boot, self._exports, exported_at_us, self.revoked)

@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from harness.errors import RunDirectoryError
 from harness.field.bisection._playing import SubjectPlayer, UntestableError
@@ -42,7 +42,7 @@ class BisectionResult:
     first_difference: RunDifference | None = None
     """The first difference between the runs before and after the change. Only for a scenario in virtual time."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {
             "first": [{"hash": commit.hash, "subject": commit.subject, "files": commit.files} for commit in self.first],
             "changes": self.changes,

@@ -8,7 +8,6 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from harness.errors import FieldError
 from harness.field.calibrate._attempts import observe, pairs_of
@@ -138,7 +137,7 @@ class CalibrationResult:
         if self.validation:
             yield self.validation.sentence
 
-    def network(self, preset: str | None = None) -> dict[str, Any]:
+    def network(self, preset: str | None = None) -> dict[str, object]:
         """Return the section `network` of a scenario. It contains a radio, or the shared channel of a preset.
 
         A shared channel simulates the losses caused by other messages, so only `floor` remains as its constant loss.
@@ -172,7 +171,7 @@ class CalibrationResult:
             },
         }
 
-    def scenario(self, name: str, preset: str | None = None) -> dict[str, Any]:
+    def scenario(self, name: str, preset: str | None = None) -> dict[str, object]:
         """Return a scenario with the fitted network. The scenario has no flight plans, because only the network is
         fitted.
         """
@@ -185,7 +184,7 @@ class CalibrationResult:
         Scenario.model_validate(document)
         return document
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         """Return the result of the calibration as a JSON object."""
         return {
             "messages": len(self.attempts),
@@ -215,7 +214,7 @@ class CalibrationResult:
         }
 
 
-def _share_json(share: DeliveryShare) -> dict[str, Any]:
+def _share_json(share: DeliveryShare) -> dict[str, object]:
     return {
         "messages": share.attempts,
         "delivered": share.delivered,

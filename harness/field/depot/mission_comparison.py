@@ -103,7 +103,7 @@ class MissionComparison:
             sentence += "; without a mission file, settings, network and seeds were not compared"
         return sentence
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {
             "verdict": self.verdict,
             "files": [{"file": str(file.path), "kind": file.kind, "agent_id": file.agent_id} for file in self.files],
@@ -180,7 +180,7 @@ def read(path: Path) -> ComparedFile:
     raise UnreadableFileError("not a mission file, manifest, chain export or trace")
 
 
-def _beginning(path: Path) -> dict[str, Any]:
+def _beginning(path: Path) -> dict[str, object]:
     """Return the JSON object in the first line of the file. If the first line is not an object, return the object that
     the whole file contains.
     """

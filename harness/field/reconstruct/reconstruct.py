@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from harness.archive.archive import ReportProgress
 from harness.archive.exports import Export
@@ -88,7 +88,7 @@ class Reconstruction:
             return f"reproduces {chains}, {self.blocks} blocks"
         return f"reproduces {reproduced} of {all_of_them} chains: {self.problems[0]}"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         exports = self.simulated.evidence.exports
         return {
             "reproduced": not self.problems,

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import islice
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 from rich.text import Text
@@ -63,7 +63,7 @@ class ReplayDocument(BaseModel):
     records: list[ReplayedRecord]
 
 
-def document(records: Iterable[ReplayedRecord]) -> dict[str, Any]:
+def document(records: Iterable[ReplayedRecord]) -> dict[str, object]:
     return ReplayDocument(records=list(records)).model_dump(by_alias=True)
 
 

@@ -96,7 +96,7 @@ def _keys(scenario: Scenario) -> MissionKeys | None:
     return mission_keys(scenario, bytes(FRESH_BYTES))
 
 
-def _secrets(scenario: Scenario, keys: MissionKeys | None) -> dict[str, Any]:
+def _secrets(scenario: Scenario, keys: MissionKeys | None) -> dict[str, object]:
     """Return the keys of all vehicles as Compose secrets. Each agent can read only its own keys."""
     if keys is None or scenario.security is None:
         return {}
@@ -108,7 +108,7 @@ def _bundle(vehicle: int) -> str:
     return f"{vehicle}.bundle.json"
 
 
-def _network() -> dict[str, Any]:
+def _network() -> dict[str, object]:
     subnet = f"{addresses.NETWORK}/{addresses.PREFIX_LENGTH}"
     return {"driver": "bridge", "internal": True, "ipam": {"config": [{"subnet": subnet}]}}
 
@@ -120,7 +120,7 @@ def _services(
     system_ids: dict[int, int],
     folder: Path,
     keys: MissionKeys | None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     ours, build = _our_image(scenario, folder)
     docker = scenario.docker.image
     in_named = set(_images.agents_in_named(scenario))
@@ -183,7 +183,7 @@ def _our_image(scenario: Scenario, folder: Path) -> tuple[ContainerImage, dict[s
 
 def _service(
     scenario: Scenario, image: ContainerImage, argv: list[str], directory: str, folder: Path
-) -> dict[str, Any]:
+) -> dict[str, object]:
     command = image.command(argv)
     docker = scenario.docker
     service: dict[str, Any] = {

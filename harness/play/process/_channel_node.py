@@ -141,12 +141,12 @@ class ChannelNode:
         for vehicle in self._roster:
             relay.deliver(vehicle, heard.frame)
 
-    def _write(self, line: dict[str, Any]) -> None:
+    def _write(self, line: dict[str, object]) -> None:
         self._journal.write(json.dumps(line, separators=(",", ":")) + "\n")
 
     # Commands of the control socket. Only the harness sends them.
 
-    def _start(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _start(self, request: dict[str, Any]) -> dict[str, object]:
         self._roster = roster = tuple(request["roster"])
         radio = dataclasses.replace(PRESETS[request["preset"]], **request["figures"])
         self._channel = LiveChannel(roster, radio, request["processing_s"], request["seed"], self._write)
@@ -160,7 +160,7 @@ class ChannelNode:
         self._loop.watch(self._relay.input, readable=self._turn)
         return {}
 
-    def _move(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _move(self, request: dict[str, Any]) -> dict[str, object]:
         coordinates = iter(request["places"])
         places = [Place(*triple) for triple in zip(coordinates, coordinates, coordinates, strict=True)]
         if self._relay is not None:
@@ -168,14 +168,14 @@ class ChannelNode:
             self._turn()
         return {}
 
-    def _apply(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _apply(self, request: dict[str, Any]) -> dict[str, object]:
         conditions = NetworkConditions.from_json(json.loads((self._directory / VALUE).read_text(encoding="utf-8")))
         if self._relay is not None:
             self._started().apply(conditions, self._clock.now())
             self._turn()
         return {}
 
-    def _clear(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _clear(self, request: dict[str, Any]) -> dict[str, object]:
         """End the simulation of the channel. Messages on it are lost, and the switch delivers all broadcasts from now
         on.
         """
@@ -186,7 +186,7 @@ class ChannelNode:
             self._relay = None
         return {}
 
-    def _totals(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _totals(self, request: dict[str, Any]) -> dict[str, object]:
         """Write the counts of the channel to a file. The harness copies them to `run.json`."""
         if self._relay is not None:
             self._lateness.missed = self._relay.count_missed()
@@ -222,7 +222,7 @@ class DeliveryLateness:
             self._most.extend([0.0] * (index + 1 - len(self._most)))
         self._most[index] = max(self._most[index], late_s)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         used = resource.getrusage(resource.RUSAGE_SELF)
         ordered = sorted(self._all)
         return {
@@ -271,7 +271,7 @@ class AnswerTimeMeter:
         if answer is not None:
             self._asked_s[vehicle, answer] = now
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {"answers": {"count": len(self._all), **_quantiles(sorted(self._all))}}
 
 

@@ -221,7 +221,7 @@ class VehicleProcess:
         if self._process is not None and self._process.returncode is None:
             await self._process.terminate(STOP_GRACE_S)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         record: dict[str, Any] = {"kind": self.kind.name, "type": self.kind.vehicle_type, "sysid": self.sysid}
         record |= self._firmware()
         if self.pilot is not None:
@@ -241,7 +241,7 @@ class VehicleProcess:
                 record["last_text"] = state.texts[-1]
         return record
 
-    def _firmware(self) -> dict[str, Any]:
+    def _firmware(self) -> dict[str, object]:
         """Return the version, type and parameters that the vehicle reported. File names are relative to the run
         directory.
         """

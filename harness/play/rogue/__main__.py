@@ -97,12 +97,12 @@ class RogueNode:
             delay_s = self._clock.wall_s(soonest - self._clock.now())
             self._timer = self._loop.call_later(delay_s, self._due)
 
-    def _write(self, record: dict[str, Any]) -> None:
+    def _write(self, record: dict[str, object]) -> None:
         self._file.write(json.dumps(record, separators=(",", ":")) + "\n")
 
     # Commands of the control socket. Only the harness sends them.
 
-    def _start(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _start(self, request: dict[str, Any]) -> dict[str, object]:
         epoch_us = request["epoch_us"]
         self._clock = MissionClock(request["speedup"])
         self._clock.start(epoch_us)
@@ -112,7 +112,7 @@ class RogueNode:
         )
         return {}
 
-    def _inject(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _inject(self, request: dict[str, Any]) -> dict[str, object]:
         if self._rogue is None:
             raise CommandError("the mission has not started")
         try:
@@ -125,7 +125,7 @@ class RogueNode:
         self._send()
         return {}
 
-    def _status(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _status(self, request: dict[str, Any]) -> dict[str, object]:
         return {"sent": dict(self._rogue.sent) if self._rogue is not None else {}}
 
 

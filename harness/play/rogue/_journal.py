@@ -14,7 +14,7 @@ LINES = 2000
 
 
 class RogueJournal:
-    def __init__(self, write: Callable[[dict[str, Any]], None]) -> None:
+    def __init__(self, write: Callable[[dict[str, object]], None]) -> None:
         self._write = write
         self._lines: Counter[int] = Counter()
         self._counted: dict[int, dict[str, Any]] = {}

@@ -68,7 +68,7 @@ class RogueDatagram:
     receivers: Sequence[int] | None = None
     """The receivers of the datagram. None for a broadcast."""
 
-    def to_json(self, at_s: float) -> dict[str, Any]:
+    def to_json(self, at_s: float) -> dict[str, object]:
         said = self.plain or self.datagram
         return line_of(at_s, self.injection, self.what, self.source, said) | {"bytes": len(self.datagram)}
 

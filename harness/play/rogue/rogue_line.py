@@ -1,7 +1,5 @@
 """Define the lines of the log `rogue.jsonl`, and the sequence numbers that mark forged messages."""
 
-from typing import Any
-
 from ucp.messages import MalformedDatagramError, block_named, decode
 from ucp.secure.envelope import CONTROL_NAMES, NAMES, read_clear_header
 from ucp.secure.envelope import VERSION as SECURED
@@ -12,7 +10,7 @@ OF_NO_INJECTION = -1
 """
 
 
-def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, Any]:
+def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes) -> dict[str, object]:
     """Return the log entry of a datagram that was sent at `at_s`. The field `refused` of the entry is the reason why
     agents drop the datagram.
     """
@@ -28,7 +26,7 @@ def line_of(at_s: float, injection: int, what: str, source: int, datagram: bytes
     return {**record, **decoded, "block": block.hex() if block else None, "bytes": len(datagram)}
 
 
-def _secured(datagram: bytes) -> dict[str, Any]:
+def _secured(datagram: bytes) -> dict[str, object]:
     """Return the unencrypted fields of an encrypted datagram."""
     try:
         clear = read_clear_header(datagram)

@@ -5,7 +5,7 @@ living agent, except the imitated agent, which would drop a datagram in its own 
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from harness.play.rogue._journal import RogueJournal
 from harness.play.rogue._rogue import RogueLogic
@@ -29,7 +29,7 @@ class VirtualRogue:
         seed: int,
         air: VirtualAir,
         number: int,
-        write: Callable[[dict[str, Any]], None],
+        write: Callable[[dict[str, object]], None],
         captured: "CapturedKeys | None" = None,
         initial_data: bytes = b"",
     ) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from harness.play.simulation._simulated_agent import VirtualAgent
 from harness.play.simulation.air import ScheduledInput
@@ -71,7 +71,7 @@ class SimulatedIncarnation:
         """
         return max(0, round(self._last_local_s(mission_s) * MICROSECONDS))
 
-    def export(self, mission_s: float) -> dict[str, Any]:
+    def export(self, mission_s: float) -> dict[str, object]:
         """Return the agent's chain export as JSON."""
         return self.agent.export(self._last_local_s(mission_s), self.timestamp_us(mission_s))
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 from harness.proof._progress_bar import Ended
 from harness.proof.bounds import Bounds
@@ -99,7 +98,7 @@ def not_taken(reached: ReachedStates) -> list[Branch]:
     return [branch for branch in BRANCHES if not reached.branches[branch]]
 
 
-def to_json(reached: ReachedStates, there: ExistingStates | None) -> dict[str, Any]:
+def to_json(reached: ReachedStates, there: ExistingStates | None) -> dict[str, object]:
     """Return the coverage as a JSON document. If `there` is given, the document also contains the shares of the
     existing states and pairs.
     """

@@ -37,7 +37,7 @@ class ViolationExample:
         option = "" if variant is None else f" --variant {variant.file}"
         return f"ucp-harness run {self.path} --backend sim --seed {SEED}{option}"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         judged = {key: judgement.verdict for key, judgement in self.judged.items()}
         return {
             "path": str(self.path),

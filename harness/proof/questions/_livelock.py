@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from harness.archive.run_record import Cycle
 from harness.proof.examples._example import PlayedExample, ViolationExample, keep, play
@@ -49,7 +49,7 @@ class Livelock:
     cycle: Cycle | None
     contradictory: bool = False
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {
             "ways": self.ways,
             "coincidences": self.coincidences,

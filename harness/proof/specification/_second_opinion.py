@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from math import gcd
-from typing import Any
 
 from harness.errors import INCOMPLETE, INTERRUPTED, VIOLATED
 from harness.proof._progress_bar import Ended, ExplorationProgress
@@ -65,7 +64,7 @@ class SecondOpinion:
             return INTERRUPTED if self.ended == "interrupted" else INCOMPLETE
         return 0 if self.agrees and self.flaw is None and not self.livelock else VIOLATED
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         bounds = asdict(self.bounds)
         return {
             "schema": "ucp-second-opinion/1",

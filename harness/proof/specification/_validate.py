@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 from harness.archive.archive import RunArchive
 from harness.archive.traces import Trace, read_trace, why_not_a_trace
@@ -77,7 +76,7 @@ class TraceValidation:
             return INTERRUPTED
         return VIOLATED if self.rejected else WRONG_REQUEST if self.unread or not self.steps else 0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {"schema": "ucp-validation/1", **asdict(self)}
 
     def in_words(self) -> Iterator[str]:

@@ -166,7 +166,7 @@ class RunDifference:
             return "differ"
         return "identical" if self.exact else "same but for times"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {
             "verdict": self.verdict,
             "keys": [asdict(key) for key in self.keys],
@@ -225,7 +225,7 @@ class _ComparedRun:
         yield from self.archive.record_problems
         yield from self.exports.errors
 
-    def requested(self) -> dict[str, Any]:
+    def requested(self) -> dict[str, object]:
         """Return the seed and the scenario of the run as a JSON object."""
         scenario = self.record.scenario
         return {"seed": self.record.seed, **(scenario.model_dump(mode="json", by_alias=True) if scenario else {})}

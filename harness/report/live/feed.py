@@ -32,7 +32,6 @@ from itertools import chain, islice
 from math import isinf
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
 from harness.archive.archive import RunArchive
 from harness.archive.connectivity import QUALITY_LIMITS
@@ -313,7 +312,7 @@ class ChangeFeed:
                 self._reported_problems.add(sentence)
                 yield ["note", sentence]
 
-    def _ending(self) -> dict[str, Any]:
+    def _ending(self) -> dict[str, object]:
         record = self._record if self.over else RunRecord()
         return {
             "outcome": record.outcome,

@@ -32,7 +32,7 @@ def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
             yield f"  beside the chain: {outside}"
 
 
-def document(logbook: Logbook, decode: bool) -> dict[str, Any]:
+def document(logbook: Logbook, decode: bool) -> dict[str, object]:
     """Return the logbook as a JSON object. Data and hashes are hexadecimal, and times are in microseconds.
 
     `events` is null for a block whose events are unreadable or encrypted.
@@ -113,7 +113,9 @@ def _outside_chain(export: Export) -> str:
     return ", ".join(part for part in parts if part)
 
 
-def _block_document(logbook: Logbook, block: ExportedBlock, decode: bool, types: Mapping[int, int]) -> dict[str, Any]:
+def _block_document(
+    logbook: Logbook, block: ExportedBlock, decode: bool, types: Mapping[int, int]
+) -> dict[str, object]:
     sealed = False
     try:
         events = logbook.event_data.events(block)
@@ -133,7 +135,7 @@ def _block_document(logbook: Logbook, block: ExportedBlock, decode: bool, types:
     }
 
 
-def _event_document(event: LoggableEvent, logbook: Logbook, decode: bool, of_type: int | None) -> dict[str, Any]:
+def _event_document(event: LoggableEvent, logbook: Logbook, decode: bool, of_type: int | None) -> dict[str, object]:
     known: dict[str, Any] = {"timestamp_us": event.timestamp_us, "mission_s": logbook.mission_s(event.timestamp_us)}
     known |= {"event_id": event.event_id, "data": event.data.hex()}
     return {**known, "words": words(event, logbook.telemetry, of_type)} if decode else known

@@ -8,7 +8,7 @@ from harness.report.logbook.positions import EventTrack, GlobalPosition, LogEntr
 from ucp.telemetry import describe
 
 
-def geojson(tracks: Iterable[EventTrack]) -> dict[str, Any]:
+def geojson(tracks: Iterable[EventTrack]) -> dict[str, object]:
     """Return a GeoJSON FeatureCollection. Altitudes are metres above mean sea level.
 
     The property `times` of a LineString holds the time of each position. A vehicle with a single position has no
@@ -28,11 +28,11 @@ def _features(track: EventTrack) -> Iterator[dict[str, Any]]:
         yield {"type": "Feature", "geometry": _point(entry), "properties": _properties(track, entry)}
 
 
-def _point(entry: LogEntry) -> dict[str, Any] | None:
+def _point(entry: LogEntry) -> dict[str, object] | None:
     return {"type": "Point", "coordinates": coordinates(entry.position)} if entry.position else None
 
 
-def _properties(track: EventTrack, entry: LogEntry) -> dict[str, Any]:
+def _properties(track: EventTrack, entry: LogEntry) -> dict[str, object]:
     return {
         "agent": track.agent_id,
         "block": entry.block,

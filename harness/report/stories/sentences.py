@@ -92,7 +92,7 @@ def _ids(text: str) -> list[int]:
     return [int(word) for word in text.split()]
 
 
-def _entry(sentence: str) -> dict[str, Any]:
+def _entry(sentence: str) -> dict[str, object]:
     try:
         entry = parse_yaml(sentence)
     except ScenarioError:

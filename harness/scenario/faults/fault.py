@@ -149,7 +149,7 @@ class Fault:
         return [field.name for field in fields(cls) if field.name not in Fault.__dataclass_fields__]
 
     @classmethod
-    def entry_keys(cls, *agents: int, **further: Any) -> dict[str, Any]:
+    def entry_keys(cls, *agents: int, **further: Any) -> dict[str, object]:
         """Return the keys of a timeline entry, from the arguments of a call in a pytest test."""
         return {cls.what: list(agents), **cls.default_values, **further}
 
@@ -158,7 +158,7 @@ class Fault:
         agents = f"agent{'s' if len(self.agents) > 1 else ''} {' '.join(map(str, self.agents))}"
         return agents if self.disk_after is None else f"{agents}, disk {self.disk_after}"
 
-    def to_json(self, at_s: float) -> dict[str, Any]:
+    def to_json(self, at_s: float) -> dict[str, object]:
         """Return the record of this fault. It happened at mission second `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
         hand = {"by_hand": True} if self.by_hand else {}

@@ -219,8 +219,8 @@ def load_matrix(path: Path | str, backend: BackendName | None = None) -> Matrix:
         )
     if backend is not None:
         document["backend"] = backend
-    if isinstance(document.get("scenario"), str):
-        document["scenario"] = load_scenario(path.parent / document["scenario"])
+    if isinstance(named := document.get("scenario"), str):
+        document["scenario"] = load_scenario(path.parent / named)
     try:
         return Matrix.model_validate(document, context={"beside": path.parent})
     except ValidationError as error:

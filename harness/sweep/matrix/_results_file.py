@@ -74,7 +74,7 @@ def opened(directory: Path, matrix: Matrix) -> Iterator[MatrixResults]:
         yield MatrixResults(directory, started_at, _read(lines, matrix, path), file)
 
 
-def _header(matrix: Matrix) -> dict[str, Any]:
+def _header(matrix: Matrix) -> dict[str, object]:
     now = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     return {"schema": SCHEMA, "started_at": now, "matrix": matrix.model_dump(mode="json")}
 

@@ -82,7 +82,7 @@ def write(finished: Finished, directory: Path, nights: StoredNights | None = Non
         raise MachineError(f"{error.filename or directory} cannot be written: {error.strerror}") from None
 
 
-def _cell_row(cell: Cell) -> dict[str, Any]:
+def _cell_row(cell: Cell) -> dict[str, object]:
     row: dict[str, Any] = {
         **_place(cell.point),
         "runs": cell.runs,
@@ -95,7 +95,7 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
     return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in ALL_CHECKS}
 
 
-def _place(point: MatrixPoint) -> dict[str, Any]:
+def _place(point: MatrixPoint) -> dict[str, object]:
     """Return the table columns that name a combination of values. If all runs have the same mission length, it has no
     column.
     """

@@ -3,7 +3,7 @@
 Later versions may add keys, but never remove or rename one.
 """
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -82,5 +82,5 @@ class MatrixRecord(BaseModel):
             return INCOMPLETE
         return CANNOT_HERE if self.unsupported else 0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return self.model_dump(mode="json", by_alias=True)

@@ -8,7 +8,7 @@ independent means.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from harness.play.variant import Variant
 from harness.present import text as words
@@ -80,7 +80,7 @@ class ComparisonRow:
     differing: list[int]
     """Seeds whose two runs differ."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {
             "label": self.compared.label,
             "original": self.original,
@@ -98,7 +98,7 @@ class VariantComparison:
     matrix: Matrix
     rows: dict[MatrixPoint, list[ComparisonRow]]
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         cells = [{**point._asdict(), "rows": [row.to_json() for row in rows]} for point, rows in self.rows.items()]
         return {"schema": "ucp-variant-comparison/1", "variant": self.variant.version, "cells": cells}
 

@@ -27,6 +27,6 @@ DOCUMENTS: dict[str, Callable[[], dict[str, Any]]] = {
 """Name of a document -> function that returns its schema."""
 
 
-def generate(name: str) -> dict[str, Any]:
+def generate(name: str) -> dict[str, object]:
     """Return the JSON schema of the document with this name."""
     return {"$schema": DIALECT, "title": name, **DOCUMENTS[name]()}

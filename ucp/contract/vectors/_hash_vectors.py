@@ -1,7 +1,5 @@
 """Test vectors for the hashes of inception blocks, events, blocks and chains (eq. 3.1 to 3.5)."""
 
-from typing import Any
-
 from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES, Block, InceptionBlock
 from ucp.chain import Chain
 from ucp.events import LoggableEvent
@@ -24,7 +22,7 @@ BLOCKS = (
 )
 
 
-def vectors() -> dict[str, Any]:
+def vectors() -> dict[str, object]:
     """Return the test vectors. `block_data` is the input of the block hash, and also the encoding of the block in
     messages.
     """
@@ -36,7 +34,7 @@ def vectors() -> dict[str, Any]:
     }
 
 
-def _inception(initial_data: bytes) -> dict[str, Any]:
+def _inception(initial_data: bytes) -> dict[str, object]:
     block = InceptionBlock(initial_data)
     return {
         "initial_data": initial_data,
@@ -45,7 +43,7 @@ def _inception(initial_data: bytes) -> dict[str, Any]:
     }
 
 
-def _event(event: LoggableEvent) -> dict[str, Any]:
+def _event(event: LoggableEvent) -> dict[str, object]:
     return {
         "timestamp_us": event.timestamp_us,
         "event_id": event.event_id,
@@ -54,7 +52,7 @@ def _event(event: LoggableEvent) -> dict[str, Any]:
     }
 
 
-def _block(block: Block) -> dict[str, Any]:
+def _block(block: Block) -> dict[str, object]:
     return {
         "agent_id": block.agent_id,
         "timestamp_us": block.timestamp_us,
@@ -64,7 +62,7 @@ def _block(block: Block) -> dict[str, Any]:
     }
 
 
-def _chain(initial_data: bytes, blocks: tuple[Block, ...]) -> dict[str, Any]:
+def _chain(initial_data: bytes, blocks: tuple[Block, ...]) -> dict[str, object]:
     chain = Chain(InceptionBlock(initial_data))
     for block in blocks:
         chain.append(block)

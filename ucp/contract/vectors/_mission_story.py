@@ -75,11 +75,11 @@ class RecordedMission:
         mission["features"] = needed_features(mission)
         self._exchange({"mission": mission, "trace": True, **self._of_life(), **store})
 
-    def _of_mission(self) -> dict[str, Any]:
+    def _of_mission(self) -> dict[str, object]:
         """Return additional keys for the mission file. The base class has none."""
         return {}
 
-    def _of_life(self) -> dict[str, Any]:
+    def _of_life(self) -> dict[str, object]:
         """Return additional keys for the input line that starts the agent. The base class has none."""
         return {}
 

@@ -1,7 +1,6 @@
 """Record an example of a secured mission, in which the other agents encrypt and sign their messages."""
 
 import base64
-from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -75,10 +74,10 @@ class SecuredStory(RecordedMission):
     def _signature(self, block: Block) -> bytes:
         return sign_block(self._peers[block.agent_id].private_key, KEYS.public.mission, block.block_data())
 
-    def _of_mission(self) -> dict[str, Any]:
+    def _of_mission(self) -> dict[str, object]:
         return {"security": {"bundle": bundle_name(AGENT_ID)}}
 
-    def _of_life(self) -> dict[str, Any]:
+    def _of_life(self) -> dict[str, object]:
         self._incarnations += 1
         boot = make_boot(1_795_258_278_064_591 + self._incarnations, b"a chance")
         bundle = KEYS.bundle(AGENT_ID)

@@ -1,7 +1,6 @@
 """Test vectors for secured missions: the datagram of each message, and datagrams that an agent must drop."""
 
 from collections.abc import Iterator
-from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -77,7 +76,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
     yield "of a revoked sender", other.seal(4, RequestForBlock(BLOCK_HASH), None, None, 0)
 
 
-def vectors() -> dict[str, Any]:
+def vectors() -> dict[str, object]:
     """Return the test vectors. Keys are in hexadecimal, and datagrams are in base64."""
     receiver = SecuredAgent(session(AGENT_ID), AGENT_ID, ROSTER, b"test", tracing=True)
     dropped = []
@@ -103,7 +102,7 @@ def _secret(epoch: int) -> bytes:
     return secret
 
 
-def _sealed(sender: int, sequence: int, message: Message) -> dict[str, Any]:
+def _sealed(sender: int, sequence: int, message: Message) -> dict[str, object]:
     request = AnsweredRequest(AGENT_ID, BOOT, 4) if TYPE_CODES[type(message)] in REQUEST_OF else None
     signature = signature_of(message.block) if type(message) in CARRY_A_BLOCK else None  # type: ignore[union-attr]
     sealed = session(sender).seal(sequence, message, request, signature, 0)

@@ -1,7 +1,6 @@
 """Test vectors for dropped datagrams: datagrams that an agent must drop, and similar ones that it must handle."""
 
 from collections.abc import Iterator
-from typing import Any
 
 from ucp.agent import Agent
 from ucp.block import Block
@@ -77,7 +76,7 @@ def cases() -> Iterator[tuple[str, bytes]]:
     yield "of a stranger, with a block of a stranger", datagram(9, block(STRANGER), sender=STRANGER)
 
 
-def vectors() -> dict[str, Any]:
+def vectors() -> dict[str, object]:
     """Return the test vectors. `dropped` is the reason for a drop, or null if the agent must handle the datagram."""
     return {
         "agent_id": AGENT_ID,

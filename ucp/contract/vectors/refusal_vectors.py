@@ -15,7 +15,7 @@ UNKNOWN = "a feature of a later version"
 """The name of a feature that no agent supports."""
 
 
-def vectors() -> dict[str, Any]:
+def vectors() -> dict[str, object]:
     """Return the test vectors. `plays` is true if an agent that has the features in `needs` must play the mission."""
     ordinary = RecordedMission().exchanges[0]["input"]["mission"]
     return {

@@ -201,7 +201,7 @@ def _marks(matches: Sequence[MatchedLog]) -> dict[int, list[_time_chart.Mark]]:
     return marks
 
 
-def _row(block: Block, ink: Mapping[int, AgentColours]) -> dict[str, Any]:
+def _row(block: Block, ink: Mapping[int, AgentColours]) -> dict[str, object]:
     places = []
     for held in block.held:
         position = "" if held.position is None else f" {held.position}"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from random import Random
-from typing import Any, Literal
+from typing import Literal
 
 from harness.errors import INTERRUPTED, VIOLATED, HarnessError
 from harness.proof import Bounds
@@ -72,7 +72,7 @@ class NightFinding:
         """The command that plays the finding again. None if no command can."""
         return None if self.path is None else f"ucp-harness run {self.path} --backend sim --seed {self.finding.seed}"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         return {
             "status": self.status,
             **self.finding.model_dump(),
@@ -115,7 +115,7 @@ class NightResult:
             return INTERRUPTED
         return VIOLATED if self.hunt.failed or any(finding.status != "resolved" for finding in self.findings) else 0
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, object]:
         reached = self.hunt.reached
         return {
             "schema": SCHEMA,

@@ -127,7 +127,7 @@ class RosAgent(Node):
     def _publish_status(self) -> None:
         self._status_out.publish(String(data=json.dumps(self._status({}))))
 
-    def _status(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _status(self, request: dict[str, Any]) -> dict[str, object]:
         return {**super()._status(request), "version": f"rclpy on {rclpy.get_rmw_implementation_identifier()}"}
 
 
