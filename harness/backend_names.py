@@ -6,6 +6,6 @@ The module is in no room, because the pytest plugin always imports it, and the i
 from typing import Literal, get_args
 
 BackendName = Literal["process", "docker", "sim"]
-"""Real processes in a private network, the same in containers, or virtual time."""
+"""The backends: real processes in a private network, the same processes in containers, or virtual time."""
 
 BACKEND_NAMES: tuple[BackendName, ...] = get_args(BackendName)

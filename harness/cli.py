@@ -27,8 +27,8 @@ def _quit(signal_number: int, frame: object) -> None:
 
 
 def _interrupts_are_quiet(quiet: bool) -> None:
-    """Let Ctrl-C end the process at once while it only imports modules, because Python would otherwise print a
-    traceback of the import.
+    """Let Ctrl-C end the process immediately while the process only imports modules, because Python would otherwise
+    print a traceback of the import.
 
     A program that merely imports this module keeps its own handler.
     """

@@ -1,7 +1,8 @@
 """Pause Python's garbage collection of cycles, for code that creates a million objects without cycles.
 
-The collector would scan these objects repeatedly. This takes a third of the time to make or read handler runs, and an
-eighth of the time to import a command. A simulated run leaves no cycles, so reference counting frees all of it.
+The collector would scan these objects repeatedly. The scans take a third of the time to make or read handler runs, and
+an eighth of the time to import a command. A simulated run leaves no cycles, so reference counting frees all objects of
+the run.
 """
 
 import contextlib

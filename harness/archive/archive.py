@@ -87,12 +87,13 @@ class HeldBlock(NamedTuple):
 class RunArchive:
     """The files of a run: those in a run directory, in a directory of exports, or single export files.
 
-    Each file is read once, at its first use. `directory` is the first directory with a run.json. If none has one, it is
-    the first given directory, or None. `exports` and `traces` contain the readable files by agent. `problems` contains
-    a sentence for each damaged file, and `gaps` one for each missing file. If `skim` is true, large traces are read
-    without the handler runs that only received a message. `keys` are public keys that the user trusts. They are used
-    instead of those in the directory. `report_progress` receives a text before each long step of reading and judging.
-    Raises RunDirectoryError if a path does not exist, or is a directory with other content.
+    Each file is read once, at its first use. `directory` is the first of the given directories with a run.json. If no
+    directory has a run.json, it is the first given directory, or None if there is no directory. `exports` and `traces`
+    contain the readable files by agent. `problems` contains a sentence for each damaged file, and `gaps` one for each
+    missing file. If `skim` is true, large traces are read without the handler runs that only received a message. `keys`
+    are public keys that the user trusts. They are used instead of the keys in the directory. `report_progress` receives
+    a text before each long step of reading and judging. Raises RunDirectoryError if a path does not exist, or is a
+    directory with other content.
     """
 
     def __init__(

@@ -141,8 +141,8 @@ class NetworkReplay:
         self._out_of_range: set[Pair] = set()
         self._cut_off: set[Pair] = set()
         self._scripted: dict[Pair, tuple[float, float]] = {}
-        """The losses that the scenario requests for each pair: from the lower to the higher ID, and back. Radio losses
-        are added to them.
+        """The losses that the scenario requests for each pair: from the lower to the higher ID, and back. The losses by
+        the radio model are added to these losses.
         """
         self._radio_losses: dict[Pair, float] = {}
 
@@ -297,8 +297,8 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
 
 
 def _append_state(states: list[Topology], state: Topology) -> None:
-    """Append the state of the network if it differs from the last one in the list. If the last state has the same
-    mission second, replace it.
+    """Append a state of the network to the list `states` if it differs from the last state in the list. If the last
+    state has the same mission second, replace the last state.
     """
     if states and states[-1].at_s == state.at_s:
         states.pop()

@@ -61,7 +61,7 @@ class AgentVote:
 
 @dataclass(frozen=True, slots=True)
 class ReconcilePhase:
-    """A phase of a reconcile, with the number of rounds in it."""
+    """A phase of a reconcile, and the number of message rounds in this phase."""
 
     name: PhaseName
     start_s: float
@@ -212,7 +212,9 @@ class HistoryReader:
         self._phases: list[ReconcilePhase] = []
 
     def feed(self, run: HandlerRun) -> Iterator[HistoryEvent]:
-        """Process the next handler run. Yield the parts of the history that begin or end with it."""
+        """Process the next handler run. Yield the parts of the history, such as votes and reconciles, that begin or end
+        with this handler run.
+        """
         self._now_s = run.t
         if run.handler == "process_next_deque_block" and run.branch == "proposed":
             self._vote = next((sent.block or "" for sent in run.sent), ""), run.t
@@ -241,7 +243,9 @@ class HistoryReader:
             yield AgentVote(self._agent, block, since_s, max(at_s, since_s), outcome)
 
     def _continue_reconcile(self, run: HandlerRun) -> Iterator[HistoryEvent]:
-        """Process a handler run during a reconcile. Yield the parts of the history that begin or end with it."""
+        """Process a handler run during a reconcile. Yield the parts of the history, such as a phase, that begin or end
+        with this handler run.
+        """
         if run.branch.startswith("tie:"):
             yield Phase2Tie(self._agent, run.t, run.branch)
         if run.handler == "reconcile_finalize" and run.branch == "done":

@@ -122,7 +122,9 @@ def _opened(path: Path, flags: int) -> BinaryIO:
 
 
 def _packed_file(path: Path, file: BinaryIO) -> BinaryIO:
-    """Open the gzip file for appending. Without packed parts in it, it begins anew."""
+    """Open the gzip file of the packed parts for appending. If the file `file` has no packed parts, the gzip file is
+    new.
+    """
     packed = packed_name(path).open("ab", buffering=0)
     if not hole_at_begin(file.fileno()):
         packed.truncate(0)

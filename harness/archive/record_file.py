@@ -40,7 +40,7 @@ NOT_AN_OBJECT = "input should be an object"
 class InvalidPart:
     """The invalid parts of run.json below one top-level key.
 
-    `where` and `what` describe the first of them. `more` is the number of the others.
+    `where` and `what` describe the first invalid part. `more` is the number of further invalid parts.
     """
 
     key: str
@@ -92,7 +92,8 @@ def _by_key(document: dict[str, Any], errors: Sequence[ErrorDetails]) -> Iterato
 def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, list[int | str]]:
     """Return the innermost part of the document that contains an error, and the path to this part.
 
-    `loc` may contain additional elements, which name the types that pydantic tried. The path omits them.
+    `loc` is the error location from pydantic. It may contain additional elements, which name the types that pydantic
+    tried. The path omits these elements.
     """
     place: Place = document, loc[0]
     value: Any = document
@@ -106,7 +107,9 @@ def _place(document: dict[str, Any], loc: Sequence[int | str]) -> tuple[Place, l
 
 
 def _repair(place: Place, problem: ErrorDetails) -> bool:
-    """Replace lone surrogates in a text by question marks. Return true if the part of the document was such a text."""
+    """Replace lone surrogates in a text of run.json by question marks. Return true if the invalid part of the document
+    was a text with lone surrogates.
+    """
     holder, key = place
     if problem["type"] == LONE_SURROGATE and isinstance(text := holder[key], str):
         holder[key] = text.encode(errors="replace").decode()

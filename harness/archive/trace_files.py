@@ -14,7 +14,7 @@ from harness.archive.packed_parts import can_free_parts, has_finished_part, pack
 SUFFIX = ".trace.jsonl"
 PACKED_SUFFIX = f"{SUFFIX}.gz"
 MAX_TRACE_BYTES = 256 * 1024 * 1024
-"""Maximum size of a trace in bytes. In a swarm of 50 agents without loss, a trace reaches a tenth of it in 20
+"""Maximum size of a trace in bytes. In a swarm of 50 agents without loss, a trace reaches a tenth of this size in 20
 minutes.
 """
 PACKED_FROM_BYTES = 64 * 1024 * 1024

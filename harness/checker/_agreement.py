@@ -57,8 +57,8 @@ def _idle(ids: list[int]) -> str:
 
 
 def explain_no_chance(evidence: Evidence, differing: set[int]) -> str | None:
-    """Return the reason why none of the `differing` agents had a chance to agree. Return None if one of them had a
-    chance.
+    """Return the reason why none of the `differing` agents had a chance to agree with the other agents. Return None if
+    at least one of these agents had a chance.
     """
     if evidence.record is None:
         return "exports do not show whether the system was fully connected"

@@ -43,8 +43,8 @@ def _holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def _least_held(evidence: Evidence, exports: Mapping[int, Export]) -> LeastHeld | None:
-    """Return the block that the fewest vehicles hold. Of several such blocks, return the oldest. Return None if no
-    vehicle holds a block.
+    """Return the block that the fewest vehicles hold. If there are several such blocks, return the oldest one. Return
+    None if no vehicle holds a block.
     """
     holders = _holders(exports)
     if not holders:

@@ -111,11 +111,12 @@ def bisect_command(
 ) -> None:
     """Find the commit that changes how a scenario or record plays.
 
-    Exit status 0: the commit is found. 1: both ends have the same outcome, or only commits that cannot be tried are
-    left. 2: the request is wrong, or the repository cannot be read. 3: this machine cannot play the subject.
+    Exit status 0: the commit is found. 1: the good and the bad commit have the same outcome, or the remaining commits
+    cannot be tested. 2: an argument is wrong, or the repository cannot be read. 3: this machine cannot play the
+    subject.
 
-    With --once, the command tries the code in --repository. Exit status 0: the outcome is as expected (of records: as
-    recorded). 1: it changed. 125: this code cannot be tried. 128: the request is wrong.
+    With --once, the command tries the code in --repository. Exit status 0: the outcome is as expected (for records: as
+    recorded). 1: the outcome changed. 125: this code cannot be tested. 128: an argument is wrong.
     """
     request = _PlayRequest(subject, seed, agent, agent_command or [None], speedup, limit_s)
     console = output(stderr=as_json, highlight=False)

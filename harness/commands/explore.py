@@ -67,8 +67,9 @@ def explore_command(
     and keeps runs that reach new local states. Each run ends in a liveness phase. Findings are new, ongoing, rare or
     resolved compared with the previous hunt in the same --corpus.
 
-    Exit status 0: no run is bad. 1: a run is bad or failed; of a hunt: a run failed, or a finding is not resolved.
-    4: without a hunt, the only bad verdict of a run is `not finished`. A hunt counts such runs, and ends with 0.
+    Exit status 0: no run has a bad verdict. 1: a run has a bad verdict or failed; for a hunt: a run failed, or a
+    finding is not resolved. 4: without a hunt, the only bad verdict of a run is `not finished`. A hunt counts runs that
+    did not finish, and ends with 0.
     """
     if for_time is not None or runs is not None:
         if seeds is not None or out is not None:

@@ -39,8 +39,8 @@ def new_command(
 ) -> None:
     """Make the keys of a mission in a new directory.
 
-    The keys are those of the authority, the depot and each vehicle. Other users cannot read the directory. All files
-    in it are secret except public.json.
+    The command makes keys of the authority, the depot and each vehicle. Other users cannot read the directory. All
+    files in it are secret except public.json.
     """
     agent_ids = parse({"name": "keys", "agents": roster_of(agents)}).roster
     made = KeyDirectory.new(home, agent_ids, seals=sealed, epoch_s=epoch_s)

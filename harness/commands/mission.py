@@ -115,7 +115,7 @@ def verify_command(
 ) -> None:
     """Check that all files belong to the same mission.
 
-    Exit status 0: they do. 1: they differ. 2: no file is usable.
+    Exit status 0: all files belong to the same mission. 1: files belong to different missions. 2: no file is usable.
     """
     comparison = compare(paths)
     if as_json:

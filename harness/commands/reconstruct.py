@@ -25,8 +25,8 @@ def reconstruct_command(
 ) -> None:
     """Make a scenario that reproduces a recorded flight.
 
-    The scenario plays in virtual time. Exit status 0: it reproduces all chains. 1: it does not, and the first place
-    where it fails is printed, or a signature is wrong. 2: nothing is usable.
+    The scenario plays in virtual time. Exit status 0: the scenario reproduces all chains. 1: it does not, and the
+    command prints the first difference, or a signature is wrong. 2: no record is usable.
     """
     if out.exists():
         raise RunDirectoryError(f"{out} exists: choose another --out; existing files are not overwritten")

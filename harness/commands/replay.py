@@ -43,7 +43,7 @@ def replay_command(
 ) -> None:
     """Feed an agent's trace to the reference, and compare.
 
-    Exit status 0: the agent did the same as the reference. 1: it did not. 2: no step could be replayed.
+    Exit status 0: all steps of the agent equal those of the reference. 1: a step differs. 2: no step could be replayed.
     """
     if until is not None and not until >= 0:
         raise typer.BadParameter(f"--until {until:g} is not a mission second: use a number from 0 on")

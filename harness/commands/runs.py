@@ -101,7 +101,7 @@ def _document(run: PastRun) -> dict[str, object]:
 def scenarios_command() -> None:
     """List the scenarios that come with the harness.
 
-    For example, `ucp-harness run loss_15` plays one of them.
+    For example, `ucp-harness run loss_15` plays the scenario loss_15.
     """
     table = Table.grid(padding=(0, 2))
     for name in load.scenario_names():

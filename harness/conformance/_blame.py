@@ -196,8 +196,8 @@ def _messages_after(event: LocalEvent) -> set[str]:
 
 
 def _sends_other_content(observation: TestedStep) -> ExpectedRun | None:
-    """If the agent sent messages of the right types with wrong content, return the handler run that sent them. Return
-    None if a block or a message type is wrong.
+    """If the agent sent messages of the right types with wrong content, return the handler run that sent these
+    messages. Return None if a block or a message type is wrong.
     """
     if BLOCK_KEYS & set(observation.wrong_status_keys) or set(observation.missing) != set(observation.unexpected):
         return None

@@ -97,7 +97,9 @@ class ReferenceModel:
     def __init__(self, settings: Settings) -> None:
         self.agent = ReferenceAgent(AGENT, ROSTER, INITIAL_DATA, ReferenceSettings.of(settings))
         self.blocks: dict[bytes, Block] = {}
-        """Block hash -> block, for the blocks of peers. Some of them are also in the agent's chain, deque or stack."""
+        """Block hash -> block, for the blocks of the simulated peers. Some of these blocks are also in the chain, deque
+        or stack of the agent.
+        """
         self.datagrams: list[bytes] = []
         """Datagrams that the reference sent after the last input."""
         self.handled = self.reconciles = 0

@@ -43,7 +43,9 @@ test.
 RETRY_WORKERS = 3
 """Number of agents that replay suspected failures in parallel. It is small, so that they do not delay each other."""
 MAX_FAILURES_OF_A_KIND = 3
-"""Number of suspected failures with the same branches. After it, further vectors with these branches are not played."""
+"""Number of suspected failures with the same branches. After this number, further vectors with these branches are not
+tested.
+"""
 MAX_RETRIES_OF_A_KIND = 2
 MAX_SUSPICIONS = 24
 """Maximum number of suspected failures that are replayed. When this number is reached, the suite stops its tours."""
@@ -298,8 +300,8 @@ class VectorSuite:
         """Test a suspected failure with several sequences of inputs, until the agent fails in one. Yield the result of
         each sequence.
 
-        The first sequence is the shortest one that leads to the state. The next ones contain an additional answer that
-        the agent must ignore. The last ones are the ends of the original sequence.
+        The first sequence is the shortest sequence that leads to the state. The next sequences contain an additional
+        answer that the agent must ignore. The last sequences are the ends of the original sequence.
         """
         variant = variant_result.vectors.variant
         name = suspicion.path[-1]

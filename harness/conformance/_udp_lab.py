@@ -35,7 +35,8 @@ FIRST_PORT = 14600
 MAX_READ_BYTES = 65536
 MAX_REPEATED_REQUESTS, REPEATED_REQUEST_LIMIT_S = 10, 1.0
 """Number and time limit of additional requests to an agent that did not answer a request within ANSWER_LIMIT_S. An
-agent that answers none of them counts as hung. If the harness itself pauses, only one of these requests is wasted.
+agent that answers none of the additional requests counts as hung. If the harness itself pauses, only one of these
+requests is wasted.
 """
 _SO_TIMESTAMPNS = 35
 """A socket option of Linux that has no name in Python."""

@@ -67,8 +67,8 @@ class VirtualTimePace:
 
     @contextmanager
     def unlimited(self) -> Iterator[None]:
-        """Lift all speed limits inside the context. Such a context applies an event that the user causes by hand,
-        because the event takes no mission time.
+        """Lift all speed limits inside the context. The run uses this context to apply an event that the user causes by
+        hand, because the event takes no mission time.
         """
         self._limited = False
         try:

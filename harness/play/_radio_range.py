@@ -58,7 +58,9 @@ class RadioRange:
         )
 
     def cut_off(self, at_s: float, vehicles: frozenset[int]) -> NetworkChange:
-        """Cut these vehicles off, and connect those that were cut off before. Return the network change."""
+        """Cut off these vehicles from the network, and connect the vehicles that were cut off before. Return the
+        network change.
+        """
         radio_losses = {pair: loss for pair, loss in self._losses.items() if not pair & self._cut_off}
         self._cut_off = vehicles
         changed = self._set_losses(radio_losses)

@@ -167,8 +167,8 @@ class BitCounter:
     """A counter for sets of small numbers. For each number, it counts the sets that contain the number. A set is given
     as an integer with a bit for each member.
 
-    The counts are stored as binary digits. One integer holds the same digit of all counts. Adding a set is a
-    ripple-carry addition of all counts at once. It takes two steps on average, regardless of the number of counts.
+    The counts are stored as binary digits. One integer holds the same digit of all counts. A set is added to all counts
+    at once by a ripple-carry addition, which takes two steps on average, regardless of the number of counts.
     """
 
     def __init__(self) -> None:

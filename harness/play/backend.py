@@ -23,7 +23,9 @@ class Backend(ABC):
 
     name: ClassVar[BackendName]
     virtual_time: ClassVar[bool] = False
-    """True if mission time is computed. Such a run has no lag, no speedup and no telemetry."""
+    """True if the backend computes mission time. A run with computed mission time has no lag, no speedup and no
+    telemetry.
+    """
     plays_in_memory: ClassVar[bool] = False
     """True if `harness.run.simulate` can play the same run in memory, for sweeps over thousands of runs."""
 
@@ -36,7 +38,7 @@ class Backend(ABC):
 
     def remark(self, scenario: Scenario) -> str | None:
         """Return a sentence about a part of the scenario that this backend plays differently from other backends.
-        Return None if it plays everything in the same way.
+        Return None if it plays the whole scenario like other backends.
         """
         return None
 

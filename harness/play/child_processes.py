@@ -21,8 +21,8 @@ GRACE_S = 0.5
 """Seconds of wall time that a child process has to end after its agent."""
 RETRY_S = 0.02
 MAX_ROUNDS = 20
-"""Maximum number of times that the harness ends child processes. It repeats this because children may start others
-meanwhile.
+"""Maximum number of times that the harness ends child processes. The harness repeats this, because a child process may
+start further processes in the meantime.
 """
 _PASSED_ON = {
     *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "TERM", "TMPDIR", "TZ", "LANG", "LANGUAGE", "VIRTUAL_ENV"),
@@ -35,8 +35,8 @@ def passed_on(environ: Mapping[str, str]) -> dict[str, str]:
     """Return those environment variables that the harness passes to the programs of a run, because the programs need
     them to start.
 
-    The harness passes no others. The user's environment may contain secrets, such as tokens, and an agent may be a
-    program of another author.
+    The harness passes no other variables, because the user's environment may contain secrets, such as tokens, and an
+    agent may be a program of another author.
     """
     return {
         name: value for name, value in environ.items() if name in _PASSED_ON or name.startswith(_PASSED_ON_PREFIXES)

@@ -1,8 +1,9 @@
-"""Find out whether the agent core in use is the released one or was edited.
+"""Find out whether the agent core in use is the released core or was edited.
 
-The core is the code of `ucp` that determines how an agent behaves. An engineer who develops the protocol edits it in
-place. Two things depend on an edit. A run records which core its agents had. And virtual time omits messages that the
-released core would ignore (`ucp.interest`) only if the released core is in use. An edited core might not ignore them.
+The core is the code of `ucp` that determines how an agent behaves. An engineer who develops the protocol edits this
+code in place. Two things depend on an edit. A run records which core its agents had. And virtual time omits messages
+that the released core would ignore (`ucp.interest`) only if the released core is in use. An edited core might not
+ignore them.
 
 `released_core.sha256` has the digests of the released files, in the format of sha256sum(1). After a reviewed change:
 

@@ -1,4 +1,5 @@
-"""Handle interventions: events that a user causes by hand while a mission runs. They are added to the timeline.
+"""Handle interventions: events that a user causes by hand while a mission runs. Interventions are added to the timeline
+of the run.
 
 `harness.run.run.run` takes an `Interventions` object. Any thread may then use it:
 
@@ -119,7 +120,7 @@ class Interventions(GrowingTimeline):
         """The event loop of the run. None before its start and after its end."""
         self._swarm: Swarm | None = None
         self._closed: str | None = "the mission has not started"
-        """Reason why the run does not accept requests. None while it accepts them."""
+        """Reason why the run does not accept requests of the user. None while the run accepts them."""
         self._requests: deque[tuple[Entry, Future[float]]] = deque()
         self._request_arrived = asyncio.Event()
         self._by_hand: dict[float, TimelineEntry] = {}
@@ -133,7 +134,7 @@ class Interventions(GrowingTimeline):
 
     @property
     def closed(self) -> str | None:
-        """The reason why the run does not accept requests now. None if it accepts them."""
+        """The reason why the run does not accept requests of the user now. None if the run accepts requests."""
         return self._closed
 
     @property

@@ -1,4 +1,5 @@
-"""The disk space that the traces of a run need: an estimate before the start, and a quota that protects the disk.
+"""The disk space that the traces of a run need: an estimate before the start, and a quota, which ensures that the disk
+does not become full.
 
 Each agent that receives a message writes a line to its trace, so traces grow with the third power of the number of
 agents, or faster. A trace ends at its quota in the same way as on a full disk: after a complete line, and with a reason

@@ -99,7 +99,7 @@ class Proof:
     that shows it. `exit_status` is 0 if every property holds, 1 if a property does not hold, and 4 if a limit was
     reached first. `liveness` is None if it was not examined, because some states are unknown or the network is `any`.
     `whole_ended` states how the examination of the whole graph ended. With the network `any`, `way` lists the steps of
-    a single agent that lead to the violation. No run of the whole swarm may be known to show it.
+    a single agent that lead to the violation. In this case, no run of the whole swarm with the violation may be known.
     """
 
     bounds: Bounds

@@ -122,7 +122,7 @@ def code_of(original: str) -> Iterator[Path]:
 
 def prove_original(name: str, code: Path, bounds: Bounds, limits: Limits) -> OriginalProof:
     """Run the proof for the agent core in the directory `code`, with the same bounds and limits. Raises OriginalError
-    if that fails.
+    if the process fails.
     """
     with TemporaryDirectory(prefix="ucp-original-") as temporary:
         place = Path(temporary)

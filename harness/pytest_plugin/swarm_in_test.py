@@ -51,10 +51,10 @@ class _ActionContext(AbstractContextManager[None]):
 class Swarm:
     """The value of the fixture `swarm`: agents on any backend, controlled by a test.
 
-    Times are mission seconds, and agents are named by their IDs. Between two calls, virtual time stands still. Real
-    processes continue, and faults that are due in the meantime happen at the next call. Between two actions, all
-    queries of the test describe the same moment. An impossible action raises ScenarioError and changes nothing. Raises
-    HarnessError if the run cannot start.
+    Times are mission seconds, and agents are named by their IDs. Between two calls, virtual time does not advance. Real
+    processes continue to run, and faults that become due between two calls happen at the next call. Between two
+    actions, all queries of the test describe the same moment. An impossible action raises ScenarioError and changes
+    nothing. Raises HarnessError if the run cannot start.
     """
 
     def __init__(self, scenario: Scenario, seed: int, backend: BackendName, out: Path) -> None:
@@ -215,7 +215,7 @@ class Swarm:
         the agent's ID.
 
         A handler run that the last action caused also counts. The names are those in traces (ucp/contract/HANDLERS.md).
-        Raises AssertionError if no agent runs it within `limit_s` mission seconds.
+        Raises AssertionError if no agent runs the handler within `limit_s` mission seconds.
         """
         __tracebackhide__ = True
         if not 0 <= limit_s < math.inf:
@@ -331,7 +331,7 @@ class Swarm:
         return self._judge()
 
     def close(self) -> None:
-        """End the run at once if it is still active, and judge it."""
+        """End the run immediately if it is still active, and judge it."""
         self._in_loop(self._interrupted.set)
         self._in_loop(self._timeline.stop)
         self._thread.shutdown()

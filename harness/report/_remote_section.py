@@ -6,7 +6,7 @@ from harness.report import facts
 
 
 def sentences(record: RunRecord) -> list[str]:
-    """Return sentences about each agent on another computer. Empty without such agents."""
+    """Return sentences about each agent on another computer. Return no sentences if all agents ran on this computer."""
     lines = []
     for agent_id, found in record.remote.items():
         where = f"Agent {agent_id} ran on the computer {found.host}"

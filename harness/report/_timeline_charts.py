@@ -56,9 +56,9 @@ def draw(
 
 
 def thin_states(spreads: Sequence[ReplicationFigures], end_s: float) -> Sequence[ReplicationFigures]:
-    """Shorten a long list of states to those that are visible when the picture shows the whole run.
+    """Shorten a long list of states to the states that are visible when the picture shows the whole run.
 
-    For each column of the picture, it keeps the last state and the state with the shortest mutual chain.
+    For each column of the picture, the result keeps the last state and the state with the shortest mutual chain.
     """
     if len(spreads) <= MAX_MOMENTS:
         return spreads
@@ -133,8 +133,8 @@ def _tip(moment: ReplicationFigures, figures: Sequence[tuple[str, Figure]], name
 
 CYCLE_HEIGHT = 34
 MAX_ROUNDS = 400
-"""Maximum number of brackets that mark repetitions. A larger number could not be distinguished, so only the last ones
-are drawn.
+"""Maximum number of brackets that mark repetitions. A larger number could not be distinguished, so only the last
+brackets are drawn.
 """
 MOST_ROUNDS = 1_000_000
 MAX_TEXT = 1000

@@ -120,7 +120,7 @@ RESPONSES: dict[str, str] = {
     ChainHashSuccessorQuery.NAME: NextInSequenceResponse.NAME,
     RequestForBlock.NAME: BlockResponse.NAME,
 }
-"""Name of a request -> name of its response. A Commit Block is neither of them."""
+"""Name of a request -> name of its response. A Commit Block is neither a request nor a response."""
 
 CARRY_A_BLOCK = frozenset((CommitBlock.NAME, BlockResponse.NAME))
 TOP_OF_CHAIN = "top of chain"

@@ -61,8 +61,8 @@ class MessageFilter:
 
 
 class AnsweredMessage(NamedTuple):
-    """A message that is no answer, with the answers to it. If a block is selected, only answers about this block are
-    included.
+    """A message that is not an answer, together with the answers to it. If a block is selected, only answers about this
+    block are included.
     """
 
     first: Transmission

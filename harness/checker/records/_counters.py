@@ -20,7 +20,7 @@ ROUNDED_S = 5e-4
 
 
 def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each counter of an agent that differs from the number of such lines in its trace."""
+    """Yield each counter of an agent that differs from the number of trace lines that the agent should have counted."""
     for agent_id, trace in evidence.traces.items():
         recorded = evidence.recorded(agent_id)
         if recorded is None or trace.problem:
@@ -229,7 +229,7 @@ def _over_brown_outs(
 
 
 def _out_of_order(exported: list[str], traced: list[str]) -> bool:
-    """Return true if the blocks that occur in both lists have different orders, or if one list contains such a block
+    """Return true if the two lists have their common blocks in different orders, or if one list contains a common block
     more often.
     """
     both = {*exported} & {*traced}

@@ -57,7 +57,9 @@ class _ExpectedDeliveries:
     most: float = 0.0
     handled: int = 0
     dropped: int = 0
-    """Recorded datagrams that arrived and that the agent did not handle. Some of them may be among `messages`."""
+    """Recorded datagrams that arrived at the receiver but that it did not handle. Some of these datagrams may be among
+    `messages`.
+    """
 
     def loss_range(self) -> tuple[float, float]:
         """Return the minimum and maximum of the mean loss rate of these messages."""
@@ -178,7 +180,7 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
 
 
 class _ReadyTimes:
-    """The times at which an agent in virtual time handles a message of certain types, if such a message arrives."""
+    """The times at which an agent in virtual time can handle a message of certain types."""
 
     def __init__(self, evidence: Evidence, agent_id: int) -> None:
         self._latest_s = LATENCY.mean_s + LATENCY.jitter_s

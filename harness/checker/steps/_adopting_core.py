@@ -238,8 +238,8 @@ class AdoptingCore(_Core):
                 timer.start(self.now, self._duration(timer))
 
     def _asked(self, message: Message) -> Timer | None:
-        """Prepare to count the answers to `message`. Return the timer that limits the wait for them, or None if the
-        message needs no answer.
+        """Prepare to count the answers to `message`. Return the timer that limits the wait for these answers, or None
+        if the message needs no answer.
         """
         match message:
             case BlockAddRequest():

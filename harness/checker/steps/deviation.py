@@ -14,7 +14,9 @@ NameOf = Callable[[str], str]
 CHOOSES = 15
 """The number of the Algorithm that records its choice instead of counters."""
 SHOWN = 3
-"""Maximum number of changes or messages that the description of a step lists. It only counts further ones."""
+"""Maximum number of changes or messages that the description of a step lists. If there are more, the description only
+gives their number.
+"""
 
 
 @dataclass(frozen=True, slots=True)

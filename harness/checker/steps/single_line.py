@@ -44,7 +44,9 @@ class OtherRecords(Protocol):
         """Return the recorded datagrams with this sender and this sequence number."""
 
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
-        """Return false if the records prove that the agent received no such message before this time."""
+        """Return false if the records of other agents prove that the agent received no message of this kind from
+        `sender` before this time.
+        """
 
 
 LINES_AFTER = 8
@@ -184,8 +186,8 @@ def _is_malformed(run: HandlerRun) -> bool:
 
 
 def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
-    """Return the damage to a trace line that explains why a completed block has different events than the logged ones.
-    Return None if no damage explains it.
+    """Return the damage to a trace line that explains why the events of a completed block differ from the events that
+    the agent logged. Return None if no damage explains the difference.
     """
     completed = next((block_hash for operation, block_hash in run.changes if operation == "complete"), None)
     if run.handler != LOGS or completed is None:

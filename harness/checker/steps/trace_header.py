@@ -84,7 +84,7 @@ def checked(header: TraceHeader) -> CheckedHeader:
 
 
 def _unknown_to_reference(settings: Settings) -> list[str]:
-    """Return those settings that the reference does not implement and that do not have their default value."""
+    """Return the settings that the reference does not implement and that differ from their default values."""
     lacking = _SETTINGS - {setting.name for setting in fields(ReferenceSettings)}
     usual = Settings()
     return sorted(name for name in lacking if getattr(settings, name) != getattr(usual, name))

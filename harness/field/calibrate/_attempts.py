@@ -25,7 +25,9 @@ from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 from ucp.trigger import MessageTrigger
 
 ON_AIR_S = 0.005
-"""Maximum number of seconds between the sending times of two messages that count as on the air at the same time."""
+"""Maximum difference of the sending times of two messages, in seconds, at which both messages count as on the air at
+the same time.
+"""
 _NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitBlock, ChainContainQuery))
 
 

@@ -117,7 +117,9 @@ class FittedModel:
 
 
 class _TransmissionCluster(NamedTuple):
-    """Transmissions that belong to one cluster and have about the same distance."""
+    """Transmissions that belong to one cluster (a link, or a link in a period of time) and have about the same
+    distance.
+    """
 
     log_m: float
     others: int
@@ -164,8 +166,8 @@ def _rows(attempts: Iterable[TransmissionAttempt]) -> list[_TransmissionCluster]
 
 
 def _cells(rows: Iterable[_TransmissionCluster]) -> list[_TransmissionCluster]:
-    """Combine transmissions with similar distances across clusters. The likelihood stays the same and is faster to
-    compute.
+    """Combine transmissions with similar distances, across all clusters. The result has the same likelihood and is
+    faster to compute.
     """
     counts: dict[tuple[float, int], list[int]] = defaultdict(lambda: [0, 0])
     for row in rows:

@@ -387,8 +387,8 @@ def _edited(path: Path, which: str, claimed: str) -> str:
 
 
 def _content(path: Path, named_by_user: bool) -> bytes:
-    """Return the content of a file. Return None if the user did not name the file and it does not look like an
-    export.
+    """Return the content of a file. Return None if the file does not look like an export and the user did not name
+    it.
     """
     try:
         with BoundedFile(path, MAX_EXPORT_BYTES) as file:

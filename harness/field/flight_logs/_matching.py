@@ -215,7 +215,7 @@ def _cell(lat_deg: float, lon_deg: float) -> tuple[int, int]:
 
 def _contradiction(vehicle: VehicleLog, fixes: Fixes) -> str | None:
     """Return the reason why a flight log cannot belong to the agent with these positions. Return None if the log may
-    belong to it.
+    belong to the agent.
     """
     if not vehicle.positions or not fixes:
         return None

@@ -77,7 +77,8 @@ def _is_copy(incarnation: TraceIncarnation, other: TraceIncarnation) -> bool:
 
 
 def _overlap(incarnation: TraceIncarnation, other: TraceIncarnation, *, anywhere: bool = False) -> bool:
-    """Return true if the times of two traces overlap. Two such traces of one agent cannot belong to the same flight.
+    """Return true if the times of two traces overlap. Two overlapping traces of one agent cannot belong to the same
+    flight.
 
     Incarnations in the same file count as successive, regardless of their times. If `anywhere` is true, the times count
     even then.

@@ -371,8 +371,8 @@ def _add_capture(groups: list[_FlightRecords], capture: CaptureSummary) -> None:
 
 
 def _add_logged(groups: list[_FlightRecords], path: Path, agent_id: int, event: LoggableEvent) -> None:
-    """Add an event to the flight that was in progress at the time of the event. If no flight was in progress then, add
-    it to the flight with files in the same directory.
+    """Add an event to the flight that was in progress at the time of the event. If no flight was in progress at that
+    time, add the event to the flight with files in the same directory.
     """
 
     def under_way(records: _FlightRecords) -> bool:

@@ -29,11 +29,13 @@ MAX_DAMAGED = 1_000_000
 MAX_PLACES = 1000
 """Maximum number of damaged places that are listed one by one."""
 MAX_RUNS = 1_000_000
-"""Maximum number of handler runs in a file. In a swarm of 20 agents without loss, an agent reaches about a tenth of it
-in 2 hours.
+"""Maximum number of handler runs in a file. In a swarm of 20 agents without loss, a trace reaches about a tenth of this
+number in 2 hours.
 """
 MAX_BYTES_BEFORE_TRACE, MAX_LINES_BEFORE_TRACE = 8 * 1024 * 1024, 100_000
-"""Limits within which a trace must have its first valid line. A file without such a line is not a trace."""
+"""Limits within which a trace must have its first valid line. A file without a valid line within these limits is not a
+trace.
+"""
 ROUNDING_S = 2e-3
 """Maximum number of seconds by which a line may be earlier than the line before it. Times may be rounded to
 milliseconds.

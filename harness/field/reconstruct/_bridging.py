@@ -110,8 +110,8 @@ class InferredInputPath:
         return self._datagram(owner, CommitBlock(block, self._chain_hashes[held + 1]))
 
     def _log(self, event_data: bytes) -> Cause | None:
-        """Return the next event that the block under construction lacks. Return None if it lacks none, or if its events
-        differ from the known ones.
+        """Return the next event that the block under construction lacks. Return None if the block lacks no event, or if
+        its events differ from the known events.
         """
         logged = bytes(self._agent.state.current_block)
         if not event_data.startswith(logged):

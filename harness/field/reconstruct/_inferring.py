@@ -293,7 +293,7 @@ class _InputSequence:
 
     def _begin_requested_reconcile(self, next_s: float) -> bool:
         """Begin a reconcile if the capture shows that one began before the next input without another cause. The
-        operator must have requested it. Return true in this case.
+        operator must have requested this reconcile. Return true if a requested reconcile begins.
         """
         if self._explained == len(self._sent) or self._agent.state.reconcile_in_progress:
             return False

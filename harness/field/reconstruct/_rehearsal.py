@@ -185,7 +185,7 @@ class _IncarnationSimulation:
 
     def bridge(self, known: KnownState) -> bool:
         """Guess inputs that lead the agent to the state `known`, and simulate them. Return true if the agent reaches
-        the state.
+        the state `known`.
         """
         bridge = InferredInputPath(self.agent, known)
         sent: list[Message] = []

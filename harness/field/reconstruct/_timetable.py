@@ -112,8 +112,8 @@ def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, fl
 def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSimulation]) -> dict[int, ClockLine]:
     """Choose mission second 0. Return the clocks of all agents relative to it.
 
-    It is the time at which the first clock shows 0. If the first input is earlier or much later, it is directly before
-    this input.
+    Mission second 0 is the time at which the first clock shows 0. If the first input is earlier or much later, mission
+    second 0 is directly before this input.
     """
     played = {agent: rehearsal.played[0] for agent, rehearsal in rehearsals.items() if rehearsal.played}
     first = min((clocks[agent].at(of_agent.input.at_s) for agent, of_agent in played.items()), default=0.0)

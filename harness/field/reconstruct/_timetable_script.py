@@ -125,7 +125,7 @@ def _events(table: InputTimetable, sealed: Sealed) -> list[Document]:
 
 
 class _StrayDatagrams:
-    """Datagrams that no agent in the scenario sends. The scenario must send them itself."""
+    """Datagrams that no agent in the scenario sends. The scenario contains entries that send these datagrams."""
 
     def __init__(self) -> None:
         self._reached: dict[bytes, list[dict[int, float]]] = defaultdict(list)

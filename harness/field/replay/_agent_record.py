@@ -183,7 +183,7 @@ class RecordedTrace:
     def present_until_s(self) -> float | None:
         """A mission second after the last line until which the agent certainly ran. None if no such time is known.
 
-        Steps that were due before this time, but have no line, are missing.
+        If a step was due before this time but has no line, its line was lost.
         """
         if self.trace.cut_off or self.trace.problem or self.agent_id not in self.flight.exports:
             return None

@@ -178,7 +178,7 @@ def _directory_of(file: Path) -> Path:
 
 
 def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
-    """Return the traces of all agents or of one agent, if the file names identify them without doubt.
+    """Return the traces of all agents or of one agent, if the file names identify these traces without doubt.
 
     Otherwise return an empty result. All files must then be read, which takes longer.
     """

@@ -91,8 +91,8 @@ class ResumptionSearch:
 
     @cached_property
     def _all_steps(self) -> _ChainSteps:
-        """The pairs of successive chain hashes in all records. Computing them takes some time, because it reads every
-        trace.
+        """The pairs of successive chain hashes in all records. The computation of the pairs takes some time, because it
+        reads every trace.
         """
         steps = self._own_steps.copy()
         for trace in self._record.flight.traces.values():

@@ -81,8 +81,8 @@ def blocks_of(entry: RecordEntry) -> set[str]:
 
 @cache
 def source_of(handler: str) -> str:
-    """Return the place of a handler's first statement, such as "ucp/reconcile.py:187". A debugger always stops at a
-    breakpoint on this line.
+    """Return the place of a handler's first statement, such as "ucp/reconcile.py:187". If a breakpoint is on this line,
+    a debugger stops there.
 
     If the code is in the working directory, the path is relative to it.
     """

@@ -110,7 +110,7 @@ class ReplayPrompt(cmd.Cmd):
         self._go(arg, backward=False)
 
     def do_back(self, arg: str) -> None:
-        """back [N | HANDLER | BLOCK | difference] (b): go back in the same way"""
+        """back [N | HANDLER | BLOCK | difference] (b): go back one step, N steps, or to the previous such step"""
         self._go(arg, backward=True)
 
     def do_continue(self, arg: str) -> None:

@@ -19,7 +19,7 @@ from ucp.agent import HANDLERS
 
 SCHEMA: Literal["ucp-replay/1"] = "ucp-replay/1"
 MAX_DIFFERENCES = 1000
-"""Maximum number of differences that are listed for each record. Further ones are only counted."""
+"""Maximum number of differences that are listed for each record. Further differences are only counted."""
 
 Verdict = Literal["as specified", "deviates", "not judged"]
 

@@ -20,7 +20,9 @@ PROC = Path("/proc")
 
 
 def first_process(engine: DockerEngine, identity: str) -> int | None:
-    """Return the process ID of the container's first process. Return None if it does not run on this machine."""
+    """Return the process ID of the container's first process. Return None if the process does not run on this
+    machine.
+    """
     pid: int = engine.do("look at a container", engine.api.inspect_container, identity)["State"]["Pid"]
     with suppress(OSError):
         if identity in (PROC / str(pid) / "cgroup").read_text():  # the process ID may belong to another process

@@ -207,7 +207,7 @@ def _package(name: str) -> Path:
 
 
 def outermost(paths: Iterable[Path]) -> list[Path]:
-    """Return those directories of the list that do not lie inside another one."""
+    """Return the directories of the list that do not lie inside another directory of the list."""
     roots: list[Path] = []
     for path in sorted(set(paths)):
         if not any(path.is_relative_to(outer) for outer in roots):

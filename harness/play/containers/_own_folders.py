@@ -15,7 +15,9 @@ _NAMES = ("mission.json", "control", "log", "trace.jsonl", "chain.json", "store"
 
 
 class OwnFolders:
-    """The folders of the agents of a run in containers. `agents` is the directory that contains all of them."""
+    """The folders that hold the files of the agents in a run with containers. `agents` is the directory that contains
+    all of these folders.
+    """
 
     def __init__(self, agents: Path) -> None:
         self._agents = agents

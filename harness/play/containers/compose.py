@@ -49,7 +49,7 @@ def write_compose(
 ) -> Path:
     """Write the Compose file `file`, and a directory beside it. Return the directory.
 
-    Raises RunDirectoryError if one of them exists.
+    Raises RunDirectoryError if the file or the directory exists already.
     """
     keys = _keys(scenario)
     if scenario.gcs:

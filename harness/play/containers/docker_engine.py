@@ -1,6 +1,7 @@
 """Call Docker with the docker SDK. Calls run in threads with a time limit, and each error is one sentence.
 
-If the engine fails to answer once, all later calls fail at once. Otherwise each of them would wait for the time limit.
+If the engine fails to answer once, all later calls fail immediately, because otherwise each call would wait for the
+time limit.
 """
 
 import asyncio

@@ -91,7 +91,7 @@ class KeyDirectory:
         return self.bundles([agent_id])[agent_id]
 
     def bundles(self, agents: Sequence[int] | None = None, *, also_revoked: bool = False) -> dict[int, Bundle]:
-        """Return the secret keys of these vehicles. Without `agents`, return those of all vehicles that are not
+        """Return the secret keys of these vehicles. Without `agents`, return the keys of all vehicles that are not
         revoked.
         """
         public, path = self.public(), self.directory / VEHICLES_NAME

@@ -56,6 +56,8 @@ def _command(arguments: list[str]) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment variables with which the command inside imports the same Python packages."""
+    """Return the environment variables with which the command inside User Mode Linux imports the same Python packages
+    as the command outside.
+    """
     path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path}

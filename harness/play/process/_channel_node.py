@@ -1,9 +1,9 @@
 """Simulate a shared radio channel in a process of its own: `python -m harness.play.process._channel_node`.
 
-It takes over the broadcasts of all vehicles from the switch (`netem.relay`), and delivers them when `LiveChannel`
-decides. Its working directory is the run directory. The process creates the socket `channel.control` there, which
-accepts the commands below, and the journal `channel.jsonl`. Large values of commands are passed in files, because the
-length of a line on a control socket is limited. SIGTERM ends the process.
+The process takes over the broadcasts of all vehicles from the switch (`netem.relay`), and delivers them when
+`LiveChannel` decides. The process runs in the run directory. In this directory it creates the socket `channel.control`,
+which accepts the commands below, and the journal `channel.jsonl`. Large values of commands are passed in files, because
+the length of a line on a control socket is limited. SIGTERM ends the process.
 
 The process waits with `select`, whose timeouts are exact to microseconds. It measures how late each delivery is.
 """
@@ -135,8 +135,8 @@ class ChannelNode:
             channel.send(at_s, heard.vehicle, heard.frame, len(data), _sequence(data, heard.vehicle))
 
     def _deliver_to_all(self, relay: Relay, heard: ReceivedBroadcast) -> None:
-        """Deliver a broadcast of the rogue node (a sender outside the swarm) at once. It does not occupy the
-        channel.
+        """Deliver a broadcast of the rogue node (a sender outside the swarm) immediately. This broadcast does not
+        occupy the channel.
         """
         for vehicle in self._roster:
             relay.deliver(vehicle, heard.frame)

@@ -1,7 +1,7 @@
 """Start the process that simulates a shared radio channel, forward each change to it, and stop it.
 
-It belongs to the harness and not to the system under test. If it fails, the machine or the harness has failed, and the
-run ends.
+This process belongs to the harness and not to the system under test. If the process fails, the machine or the harness
+has failed, and the run ends.
 """
 
 import asyncio

@@ -22,8 +22,8 @@ from sitl.vehicle import Home, VehicleError, VehicleKind
 from ucp.clock import MissionClock
 
 LATE_S = 10.0
-"""Mission seconds by which a vehicle may take off later than computed. ArduPilot, or a busy machine, can cause such a
-delay.
+"""Maximum lateness of the take-off of a vehicle against its computed take-off, in mission seconds. ArduPilot, or a busy
+machine, can cause this lateness.
 """
 AWAY_M = 5.0
 

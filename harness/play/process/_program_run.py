@@ -266,8 +266,8 @@ class ProgramRun:
     async def _strike_all(self, fault: Fault) -> None:
         """Apply the fault to all its agents at the same time.
 
-        Raises ScenarioError if the fault is impossible for all of them. If it is impossible for some, record the
-        reasons.
+        Raises ScenarioError if the fault is impossible for all of them. If the fault is impossible for some agents,
+        record the reasons.
         """
         strikes = [self._strike(fault, agent_id) for agent_id in fault.agents]
         problems = [problem for problem in await asyncio.gather(*strikes, return_exceptions=True) if problem]

@@ -24,7 +24,7 @@ class MissionTasks:
 
     @asynccontextmanager
     async def guard(self, *watched: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-        """Run the mission in this context, together with the tasks in `watched`. If one of them fails, raise its
+        """Run the mission in this context, together with the tasks in `watched`. If one of these tasks fails, raise its
         error.
         """
         try:

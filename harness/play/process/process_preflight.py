@@ -61,8 +61,8 @@ def _network_states(scenario: Scenario) -> list[NetworkConditions]:
     """Return the different network conditions that occur in the scenario, at the scenario's speed and without
     partitions.
 
-    With a radio model, one link in each of them loses more messages than the others. The different links of a flight
-    are tested in this way.
+    With a radio model, one link in each of these conditions loses more messages than the other links, so the conditions
+    represent links that differ during a flight.
     """
     states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
     out_of_reach = {frozenset(scenario.roster[:2]): 0.5} if scenario.network.radio else {}

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MAX_REMEMBERED = 10_000
 """Maximum number of received datagrams that the rogue node keeps for replays."""
 MAX_WAITING = 100_000
-"""Maximum number of datagrams that wait to be sent. The rogue node makes no further ones."""
+"""Maximum number of datagrams that wait to be sent. At this number, the rogue node makes no further datagrams."""
 FLOOD_BATCH = 64
 """Maximum number of messages of a flood in a row, before the rogue node handles other work."""
 

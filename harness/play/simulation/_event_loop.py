@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 
 ANY_INCARNATION = 0
 KEPT_MESSAGES = 10_000
-"""Number of past messages that a rogue node knows if it starts during a run. A rogue node that runs from the start
-keeps the same number.
+"""Number of past messages that a rogue node knows if it starts during a run. A rogue node that runs from the start also
+knows at most this number of messages.
 """
 
 
@@ -297,10 +297,10 @@ class EventLoop:
         self._finish_input(number, incarnation)
 
     def _tally_answers(self, number: int, incarnation: SimulatedIncarnation) -> None:
-        """Give the agent those arrived answers that it only counts.
+        """Give an agent the answers that have arrived and that it only counts.
 
-        The loop calls this before a handler reads the count. If a trace is written, the loop also calls it before other
-        inputs, so that the lines of the trace are in order.
+        The loop calls this method before a handler reads the count. If a trace is written, the loop also calls it
+        before other inputs, so that the lines of the trace are in order.
         """
         agent, state = incarnation.agent, incarnation.state
         if state is None or incarnation.waiting is not None or not self._air.open_queries[number]:

@@ -13,7 +13,7 @@ these conditions is met:
 Otherwise the recurrence proves nothing. The traces show such cycles too (`harness.checker.recurring_cycles`).
 
 The search uses Brent's algorithm. It keeps one state and compares it with the following ones, then keeps a later state
-and compares it with twice as many states states. Its memory therefore does not grow with the length of the run.
+and compares it with twice as many states. Its memory therefore does not grow with the length of the run.
 """
 
 from collections import defaultdict

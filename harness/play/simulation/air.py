@@ -42,7 +42,7 @@ DISCARD_EVERY = 1000
 
 @dataclass(slots=True, eq=False)
 class MessageInFlight:
-    """A broadcast message that is on its way to its receivers."""
+    """A message that was broadcast and has not yet reached all of its receivers."""
 
     sender: int
     sequence: int
@@ -390,7 +390,9 @@ class VirtualAir:
         self.busy_until[number] = 0.0
 
     def _open_query(self, number: int, question: Question) -> None:
-        """Open a query of the agent. Later answers count even if they answer the same query of another agent."""
+        """Mark a query of an agent as open. Answers that arrive later count for it, even if they answer the same query
+        of another agent.
+        """
         open_queries = self.open_queries[number]
         about: QueryKind = "vote" if question[0] is BlockAddResponse else "reconcile"
         before = open_queries.get(about)

@@ -35,8 +35,8 @@ class _KnowledgeFromAgent(NamedTuple):
 
 
 class ForgedTimestamps:
-    """Timestamps before, between and after the timestamps of `blocks` honest blocks. With them, up to `lies` forged
-    blocks can have any age relative to honest blocks.
+    """Timestamps before, between and after the timestamps of `blocks` honest blocks. With these timestamps, up to
+    `lies` forged blocks can have any age relative to honest blocks.
     """
 
     def __init__(self, blocks: int, lies: int) -> None:

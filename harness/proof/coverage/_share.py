@@ -28,7 +28,7 @@ class ExistingStates:
 
 def existing(bounds: Bounds, *, most_bytes: float = 4e9, most_s: float = float("inf")) -> ExistingStates:
     """Return all agent states and (state, input) pairs within the bounds. If a limit of memory or time is reached,
-    return those found so far.
+    return the states and pairs that were found before.
     """
     there = ExistingStates(bounds, set(), set())
     if bounds.network == "any":

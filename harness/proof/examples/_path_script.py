@@ -1,10 +1,9 @@
 """Write a path through the state graph as a scenario.
 
 Scripted events, message fates and timer delays make the simulation take the same path. A message takes LATENCY_S. An
-*instant* is a moment at which one or more agents act. An *instant* is a moment at which one or more agents act. If the
-path requires a different order of arrivals, or if the next instant follows soon, a fate gives the message a different
-delay. A message that is lost on the path has the fate `drop`. A timer expires on time, unless messages of the previous
-instant arrive later.
+*instant* is a moment at which one or more agents act. If the path requires a different order of arrivals, or if the
+next instant follows soon, a fate gives the message a different delay. A message that is lost on the path has the fate
+`drop`. A timer expires on time, unless messages of the previous instant arrive later.
 """
 
 from collections import Counter, defaultdict

@@ -23,7 +23,7 @@ class StateExpansion(NamedTuple):
     The other fields contain only successors without a lost message and without a new block. For each timer that may
     expire next, `by_timer` contains the possible successors: the timer expires alone, or timers that must expire at the
     same moment expire before it or together with it. `crossing` contains the successors in which several timers expire
-    at once.
+    at the same moment.
     """
 
     transitions: int
@@ -48,7 +48,7 @@ def expanded(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpan
 
 
 def quiet(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
-    """Return those successors of a state that are reached without a lost message and without a new block.
+    """Return the successors of a state that are reached without a lost message and without a new block.
 
     The field `transitions` of the result is 0.
     """
@@ -58,8 +58,8 @@ def quiet(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansio
 def _quiet(
     swarm: ModelSwarm, state: State, number_of: NumberOf, ending: Sequence[Actions], known: _Following
 ) -> StateExpansion:
-    """Return those successors that are reached without a lost message and without a new block. `known` may already
-    contain some of them.
+    """Return the successors that are reached without a lost message and without a new block. `known` may already
+    contain some of these successors.
     """
     after = {
         actions: known[actions]

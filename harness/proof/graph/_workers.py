@@ -37,7 +37,7 @@ CHUNK = 100
 MAX_REPORTED = 500_000
 """Maximum number of states that a worker remembers as reported.
 
-Above it, the worker forgets them and reports them again.
+Above this number, the worker forgets these states and reports them again.
 """
 
 Definitions = list[tuple[int, Any]]

@@ -7,8 +7,8 @@ mention a block before it is completed.
 
 The local states of each agent and the sent messages are collected together until no new ones appear. The result
 contains every local state and message of every possible run. It may contain more, because some of these messages may
-never occur in the same run. If a property holds for all of these states, it holds in every run. If it does not hold for
-one of them, this does not prove that a run violates it.
+never occur in the same run. If a property holds for all of these states, it holds in every run. If a property does not
+hold for one of these states, this does not prove that a run violates the property.
 """
 
 import time
@@ -132,11 +132,13 @@ class _BlockDistribution:
         The attacker has the blocks of the captured vehicle from the beginning.
         """
         self._lied: dict[int, tuple[ForgeryMaterial, int]] = {}
-        """Agent -> the data of the last forged messages to it, and the number of its states that have received these
-        messages.
+        """Agent -> the data of the last forged messages to it, and the number of its states in which the exploration
+        has delivered these messages.
         """
         self._looked_at = 0
-        """Number of states whose own actions (those without a message) have been explored."""
+        """Number of states in which the exploration has tried the agent's own actions (the actions without a received
+        message).
+        """
 
     def collect(self, began: float) -> Iterator[ExplorationProgress]:
         """Explore until no new states or messages appear. Yield the progress."""

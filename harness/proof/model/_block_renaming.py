@@ -76,8 +76,8 @@ class NumberedBlocks:
         return frozenset().union(*(self.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     def of(self, snapshot: Snapshot) -> Ordinals:
-        """Return the numbers of the blocks in a state, each once. States that differ only in their blocks list them in
-        the same order.
+        """Return the numbers of the blocks in a state, each once. States that differ only in the identity of their
+        blocks list the blocks in the same order.
         """
         return tuple(dict.fromkeys(self._all(snapshot)))
 

@@ -168,8 +168,8 @@ class CanonicalOrder:
     ) -> bool:
         """Return true if these agents with equal descriptions differ only in their blocks.
 
-        In this case they have no timers and have counted no agent, and each vote count of the other agents contains all
-        of them or none.
+        In this case these agents have no timers and have counted no agent, and each vote count of the other agents
+        contains all of these agents or none.
         """
         if timers[group[0]]:
             return False
@@ -205,7 +205,7 @@ class CanonicalOrder:
         return named, about, [[matrix[i][j] for j in order] for i in order]
 
     def _renamed(self, local: int, new: int, places: Places) -> int:
-        """Return the state of an agent at its new position. The IDs of the other agents in it are the new ones."""
+        """Return the state of an agent at its new position. The state contains the new IDs of the other agents."""
         if local == DEAD:
             return local
         if not self._local.known[local].names_others:

@@ -286,8 +286,8 @@ class ModelSwarm:
         return ANY_NUMBER if self.bounds.losses is None else state[LEFT] // LOSSES
 
     def _can_be(self, state: State, instant: _InstantResults) -> bool:
-        """Return true if these timers can expire together and before all other timers. Each of them alone must be able
-        to expire first.
+        """Return true if these timers can expire together and before all other timers. Each of these timers alone must
+        be able to expire first.
         """
         if len(instant.ended) < 2 or self.bounds.timers_any:
             return True

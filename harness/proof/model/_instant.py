@@ -96,7 +96,9 @@ number of lost messages.
 
 _Key = TypeVar("_Key")
 _Outcome = tuple[AgentStep, tuple[int, ...]]
-"""A step of an agent, and an order of received messages that leads to it, as indices of the messages that reach it."""
+"""A step of an agent, and an order of the received messages with this result. The order lists the indices of the
+messages that the agent receives.
+"""
 
 
 class InstantOutcomes:
@@ -134,7 +136,7 @@ class InstantOutcomes:
     def outcomes(
         self, locals_: tuple[int, ...], actions: Sequence[AgentAction], most_lost: int, *, with_rounds: bool
     ) -> dict[AgentStates, FinalMessageRound]:
-        """Return the possible results of these actions. If the same result can be reached in several ways, keep the one
+        """Return the possible results of these actions. If the same result can be reached in several ways, keep the way
         with the fewest lost messages.
 
         If `with_rounds` is true, the result includes the rounds of messages.
@@ -338,8 +340,8 @@ class InstantOutcomes:
             yield step, (*order, *others)
 
     def _that_matter(self, local: int, heard: ReceivedMessages) -> list[int]:
-        """Return the indices of the messages that may change the agent or cause an answer, at once or after other
-        messages of this round.
+        """Return the indices of the messages that may change the agent or cause an answer, either directly or after
+        other messages of this round.
 
         Return all indices if a wrong agent reaches new states again and again by the same messages.
         """
@@ -387,8 +389,8 @@ def _within(choices: Sequence[Sequence[_Choice]], most_lost: int) -> list[tuple[
 
 
 def _is_covered(step: AgentStep, outcomes: Sequence[_Outcome]) -> bool:
-    """Return true if another possible step differs from this one only by additional sent messages. The network may lose
-    these messages, so the other step covers this one.
+    """Return true if another possible step differs from this step only by additional sent messages. The network may
+    lose these additional messages, so the other step covers this one.
     """
     return any(
         other.local == step.local

@@ -352,8 +352,8 @@ class LocalStates(KnownStates):
         return pattern
 
     def about(self, local: int) -> Ordinals:
-        """Return the numbers of the blocks in a state, each once. States that differ only in their blocks list them in
-        the same order.
+        """Return the numbers of the blocks in a state, each once. States that differ only in the identity of their
+        blocks list the blocks in the same order.
         """
         about = self._about.get(local)
         if about is None:

@@ -40,7 +40,7 @@ class RealAgents:
         self.revoked = {
             agent_id: self.new(agent_id, revoked=True) for agent_id in self._roster if self._gate is not None
         }
-        """The same agents, but with knowledge of the revocation of the captured vehicle."""
+        """Agent ID -> an agent that knows that the captured vehicle is revoked."""
 
     @property
     def gate(self) -> SecurityGate:

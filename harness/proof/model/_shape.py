@@ -87,8 +87,8 @@ class HeldBlockOrder:
     def input_shape(self, message: Message) -> Shape:
         """Return the shape of a message that this agent receives.
 
-        The shape identifies blocks by their positions among the blocks that the agent holds. It does not contain the
-        sender.
+        The shape identifies blocks by their positions among the blocks that the agent holds. The shape does not contain
+        the sender.
         """
         values = [getattr(message, name) for name in type(message).__slots__]
         about = next((value for value in values if isinstance(value, bytes | Block)), b"")

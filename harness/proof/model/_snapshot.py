@@ -27,7 +27,7 @@ unreduced proof repeats each step with other counters and at other times, and re
 them.
 """
 COUNTS = ("reconciles", "_sequence", "chain_changed_at")
-"""Those counters in `REPORTED` that are numbers and that no input sets."""
+"""The counters in `REPORTED` that are numbers and that no input sets."""
 FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing", "_seal", "sealed"))
 """Attributes that never change, or that are other names of included parts. Explored agents do not encrypt events."""
 HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
@@ -109,7 +109,9 @@ def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) ->
 
 
 def set_counts(agent: Agent, count: int, now_s: float) -> None:
-    """Set all counters of the agent to `count`, and its time to `now_s`. Steps of covered agents ignore them."""
+    """Set all counters of the agent to `count`, and its time to `now_s`. The steps of agents that a proof covers do not
+    depend on these values.
+    """
     state = vars(agent.state)
     state["now"] = now_s
     state.update(dict.fromkeys(COUNTS, count))

@@ -26,7 +26,7 @@ It raises LimitReachedError when the limit of memory or time is reached.
 class ConvergenceResult:
     """The result of the search: endless cycles, and states from which the swarm does not reach one common chain.
 
-    - `forks`: number of idle states with several different chains. `fork` is the nearest of them.
+    - `forks`: number of idle states with several different chains. `fork` is the nearest of these states.
     - `cycles`: cycles as lists of their states, the nearest first.
     - `astray`: for 0, 1, 2, ... further votes, the number of states from which the swarm still cannot become idle with
       one chain. The list ends at 0 states, or at one vote for each agent.

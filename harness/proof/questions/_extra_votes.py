@@ -22,8 +22,8 @@ With wrong agents, the number of states can be infinite. Above the limit, the qu
 MAX_CACHED = 200_000
 """Maximum number of states for which the number of votes is cached."""
 MAX_PATH_INSTANTS = 150
-"""Maximum number of instants on a single path, including those of all votes. Beyond it, all successors are explored
-instead.
+"""Maximum number of instants on a single path, including those of all votes. If a path is longer, all successors are
+explored instead.
 """
 
 

@@ -18,7 +18,9 @@ from ucp.clock import MICROSECONDS
 
 MEGABYTE = 1e6
 AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
-"""Deliberate mistakes (quirks) that the specification also supports. The thesis prints them, presumably by mistake."""
+"""Deliberate mistakes (quirks) that the specification also supports. In these two places the printed algorithms of the
+thesis contradict its text.
+"""
 INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
 """Name of an invariant in the specification -> key of the violation that `prove` reports."""
 

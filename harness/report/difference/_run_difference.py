@@ -71,7 +71,7 @@ def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str
 class KeyDifference:
     """A scenario key with different values in the two runs, such as `network.loss` or `timeline.0.at_s`.
 
-    If a run lacks the key, its value is None.
+    If a run lacks the key, the value for this run is None.
     """
 
     key: str
@@ -149,8 +149,8 @@ class RunDifference:
 
     @property
     def first(self) -> int | None:
-        """The agent with the earliest first difference in mission time. Of several such agents, it is the one with the
-        lowest ID. None without differences.
+        """The agent with the earliest first difference in mission time. If several agents have the earliest difference,
+        it is the agent with the lowest ID. None without differences.
         """
         at_s = {
             agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None

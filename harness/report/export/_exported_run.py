@@ -167,8 +167,8 @@ class ExportedRun:
         return merge(*streams, key=attrgetter("at_ns"))
 
     def positions(self) -> Iterator[FieldPosition]:
-        """Yield the recorded positions of the vehicles. Without recorded positions, yield those that agents logged as
-        events.
+        """Yield the recorded positions of the vehicles. If no positions were recorded, yield the positions that agents
+        logged as events.
         """
         positions = self._by_tracks() if self.tracks.by_vehicle else self._by_events()
         return iter(sorted(positions, key=attrgetter("at_ns")))

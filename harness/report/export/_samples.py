@@ -1,7 +1,7 @@
 """Define the types of the recorded values of a run. Each value has a time in nanoseconds since the Unix epoch.
 
 Mission second 0 is the epoch that the agents received: wall time, or 0 in virtual time. With a speedup, mission time
-runs faster than wall time. The timestamps of blocks do the same.
+runs faster than wall time. The timestamps of blocks run faster in the same way.
 """
 
 from collections import Counter

@@ -22,7 +22,7 @@ _TEXT = Color(r=1.0, g=1.0, b=1.0, a=1.0)
 
 
 def colours_of(vehicles: Iterable[int]) -> dict[int, Any]:
-    """Return the colour of each vehicle. They are the same as in reports."""
+    """Return the colour of each vehicle. The colours are the same as in reports."""
     return {vehicle: _colour(ink.fill) for vehicle, ink in inks(vehicles).items()}
 
 

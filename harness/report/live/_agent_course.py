@@ -58,8 +58,8 @@ class SentMessage(NamedTuple):
 
 
 class AgentActions:
-    """The actions of one agent that were read so far. Callers read the lists `changes`, `sent` and `receipts`, and
-    empty them.
+    """The actions of one agent that were read so far. Callers read and empty the lists `changes`, `sent` and
+    `receipts`.
     """
 
     def __init__(self, agents: Path, agent_id: int) -> None:

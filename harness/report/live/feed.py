@@ -55,8 +55,8 @@ left out do not count.
 """
 LINES_AT_ONCE_LATE = 50
 POLLS_UNTIL_REPORTED = 2
-"""Number of polls between the first sight of a message and its change on the page. By then most receivers have recorded
-the message. If a receiver on a busy machine records it later, this causes a change `h`.
+"""Number of polls between the first sight of a message and its change on the page. After this time most receivers have
+recorded the message. If a receiver on a busy machine records it later, this causes a change `h`.
 """
 MAX_BEHIND_S = 2.0
 """Wall time. If the stream is further behind an active run, it leaves out messages until it has caught up."""

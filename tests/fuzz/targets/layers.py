@@ -1,4 +1,4 @@
-"""Fuzz target: scapy's layers of a datagram. They give the same bytes back, and accept what the codec accepts."""
+"""Fuzz target: scapy's layers of a datagram. They reproduce its bytes, and accept the same datagrams as the codec."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -157,8 +157,8 @@ def _group(
 def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Iterator[_BlockRange]:
     """Yield ranges of consecutive blocks that the agent holds at the same place.
 
-    Columns that are narrower than a pixel are combined. A combined cell shows the place at which the agent holds most
-    of its blocks, and whether it holds all of them.
+    Columns that are narrower than a pixel are combined into one cell. A combined cell shows the place at which the
+    agent holds most of the blocks in the cell, and whether the agent holds all of these blocks.
     """
     columns_per_cell = max(1, math.ceil(MIN_CELL_PX / column_px))
     cells = [members[at : at + columns_per_cell] for at in range(0, len(members), columns_per_cell)]
@@ -178,7 +178,9 @@ def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Itera
 
 
 def _cell_state(cell: Sequence[Column], agent_id: int) -> tuple[str | None, str]:
-    """Return the place at which the agent holds most of these blocks, and "part" if it does not hold all of them."""
+    """Return the place at which the agent holds most of the blocks in this cell, and "part" if the agent does not hold
+    all of them.
+    """
     places = Counter(place for _, _, held in cell if (place := held.get(agent_id)) is not None)
     if not places:
         return None, ""

@@ -34,7 +34,7 @@ from ucp.settings import Settings
 from ucp.trace import Entry, HandlerRun, RecordedBytes, in_base64
 
 MAX_TIMERS_PER_S = 10_000
-"""Maximum number of timer expiries in a mission second. An agent with more of them counts as hung."""
+"""Maximum number of timer expiries in a mission second. An agent with more expiries counts as hung."""
 MAX_SENT_PER_S = 5000
 """Maximum number of datagrams that an agent may send in a mission second. Without a limit, the datagrams and their
 answers could grow without end.

@@ -86,7 +86,7 @@ class ProgramPool:
 
 
 SHARED = ProgramPool()
-"""The pool for missions in memory. A sweep plays thousands of them."""
+"""The pool of programs for missions in memory, because a sweep plays thousands of these missions."""
 
 atexit.register(SHARED.close)
 os.register_at_fork(after_in_child=SHARED.release_all)
