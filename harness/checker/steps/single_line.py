@@ -1,23 +1,27 @@
-"""Decide whether damage to one line of a trace explains a difference from the reference.
+"""Decide whether damage to a few lines of a trace explains a difference from the reference.
 
 A file from the field may lack a line, or contain a damaged line that is still readable. The difference then does not
-prove a mistake of the agent. The module tries three kinds of damage:
+prove a mistake of the agent. The module tries four kinds of damage:
 
 - One character of the line is wrong.
 - The line and the next line are in the wrong order.
 - The line before it is missing. The missing handler run changed no block, so no recorded state reveals it.
+- Several lines before it are missing. They contained answers to one question, which often arrive together, and perhaps
+  the expiry of the timer of this question.
 
 An explanation counts only if the reference, after this correction, agrees with the lines that follow.
 """
 
 import base64
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from copy import copy
+from itertools import combinations_with_replacement
 from typing import Protocol
 
 from harness.checker.recorded_inputs import NotOnRecordError, decoded, event_of
+from harness.checker.reference.algorithms import ON_MESSAGE
 from harness.checker.reference.state import ReferenceState
 from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import LOGS, StepComparer
@@ -31,7 +35,7 @@ from ucp.messages import (
     encode,
 )
 from ucp.trace import HandlerRun, RecordedBytes
-from ucp.trigger import MessageTrigger
+from ucp.trigger import LocalTrigger, MessageTrigger
 
 Line = tuple[int, HandlerRun]
 """A handler run with its line number."""
@@ -43,6 +47,9 @@ class OtherRecords(Protocol):
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
         """Return the recorded datagrams with this sender and this sequence number."""
 
+    def sent_by_others(self, kind: str) -> Iterable[tuple[int, Message]]:
+        """Return the recorded messages of this type from other agents, with their senders. Equal ones occur once."""
+
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
         """Return false if the records of other agents prove that the agent received no message of this kind from
         `sender` before this time.
@@ -51,6 +58,12 @@ class OtherRecords(Protocol):
 
 LINES_AFTER = 8
 """Number of lines after the difference that must agree with an explanation."""
+MAX_ANSWERS = 4
+"""Maximum number of lost answers to one question."""
+COUNTS = frozenset(ON_MESSAGE[kind].name for kind in (BlockAddResponse, ChainContainResponse, NextInSequenceResponse))
+"""Names of the handlers that count answers."""
+_MESSAGES = {handler.name: kind.NAME for kind, handler in ON_MESSAGE.items()}
+"""Name of a handler of messages -> the type of its messages."""
 MAX_LOCAL = 4
 """Maximum number of handlers that the handler of one lost line may trigger in turn."""
 
@@ -77,11 +90,17 @@ def damage_that_explains(
     for trial in _with_a_line_more(before, line[1], others):
         if _agrees(trial, [line, *following]):
             return "a line is missing"
+    for trial in _with_lines_more(before, [line[1], *(run for _, run in following)], others):
+        if _agrees(trial, [line, *following]):
+            return "lines are missing"
     return None
 
 
 def _agrees(follower: StepComparer, lines: Sequence[Line]) -> bool:
+    """Return true if the reference agrees with the lines, up to the first block that has events without a line."""
     for number, run in lines:
+        if number > lines[0][0] and _damage_to_events(follower, run) is not None:
+            return True
         follower.follow(number, run)
         if follower.deviations or follower.lost:
             return False
@@ -121,7 +140,7 @@ def _as_it_may_have_been(
         texts = [base64.b64encode(data).decode() for data in others.datagrams(run.trigger.sender, run.trigger.sequence)]
         texts += [
             base64.b64encode(encode(run.trigger.sender, run.trigger.sequence, message)).decode()
-            for message in _answers(before.state, run)
+            for message in _answers(before.state, run, others)
         ]
         for text in texts:
             other = copy(run)
@@ -193,44 +212,116 @@ def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
     if run.handler != LOGS or completed is None:
         return None
     try:
-        logged = Counter([*decode_events(bytes(before.state.current_block)), event_of(run.input)])
+        earlier, last = decode_events(bytes(before.state.current_block)), event_of(run.input)
         events = Counter(decode_events(before.block(completed).event_data))
-    except (NotOnRecordError, MalformedEventsError):
+    except NotOnRecordError:
+        return "a line is missing (its block may have an event that no line logs, and no record has the block)"
+    except MalformedEventsError:
         return None
-    if logged < events:
-        return "a line is missing (its block has an event that no line logs)"
-    pairs = [*zip((logged - events).elements(), (events - logged).elements(), strict=False)]
-    if pairs and all(
-        _differ_in_one_character(*(base64.b64encode(event.encode()).decode() for event in pair)) for pair in pairs
-    ):
-        return "one character of a line is damaged (its block has another event than the line logs)"
+    for logged in (Counter([*earlier, last]), Counter(earlier)):  # a full block may lack the last event
+        if logged < events:
+            return "a line is missing (its block has an event that no line logs)"
+        pairs = [*zip((logged - events).elements(), (events - logged).elements(), strict=False)]
+        if pairs and all(
+            _differ_in_one_character(*(base64.b64encode(event.encode()).decode() for event in pair)) for pair in pairs
+        ):
+            return "one character of a line is damaged (its block has another event than the line logs)"
     return None
 
 
 def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
     """Yield copies of the reference. Each one is in a state to which one lost trace line could have led."""
-    trial = before.copy()
-    for _ in range(MAX_LOCAL):
-        if not trial.play_lost_local_event(run.t):
-            break
-        yield trial.copy()
-    for timer in before.state.timers:
-        trial = before.copy()
-        if trial.play_lost_expiry(timer.name, run.t):
-            yield trial.copy()
-            for _ in range(MAX_LOCAL):
-                if not trial.play_lost_local_event(run.t):
-                    break
-                yield trial.copy()
-    for message in _answers(before.state, run):
+    yield from _with_local_events_more(before, run)
+    yield from _with_an_expiry_more(before, run)
+    for message in _answers(before.state, run, others):
         for sender in sorted(before.roster - {before.state.agent_id}):
             if others.may_have_arrived(sender, message, run.t):
                 trial = before.copy()
                 if trial.play_lost_message(sender, message, run.t):
                     yield trial
+    if isinstance(run.trigger, LocalTrigger) and run.trigger.handler in _MESSAGES:
+        for sender, message in others.sent_by_others(_MESSAGES[run.trigger.handler]):
+            trial = before.copy()
+            if trial.play_lost_message(sender, message, run.t):
+                yield trial
 
 
-def _answers(state: ReferenceState, run: HandlerRun) -> Iterator[Message]:
+def _with_local_events_more(before: StepComparer, run: HandlerRun) -> Iterator[StepComparer]:
+    """Yield copies of the reference after its next local events."""
+    trial = before.copy()
+    for _ in range(MAX_LOCAL):
+        if not trial.play_lost_local_event(run.t):
+            break
+        yield trial.copy()
+
+
+def _with_an_expiry_more(before: StepComparer, run: HandlerRun) -> Iterator[StepComparer]:
+    """Yield copies of the reference after the expiry of a timer, and after the local events that follow."""
+    for timer in before.state.timers:
+        trial = before.copy()
+        if trial.play_lost_expiry(timer.name, run.t):
+            yield trial.copy()
+            yield from _with_local_events_more(trial, run)
+
+
+def _with_lines_more(
+    before: StepComparer, following: Sequence[HandlerRun], others: OtherRecords
+) -> Iterator[StepComparer]:
+    """Yield copies of the reference. Each one has received answers to its last question, whose lines are lost. The line
+    of the expiry that ended the question can be lost as well.
+    """
+    for count in range(1, MAX_ANSWERS + 1):
+        for trial in _with_answers_more(before, following, others, count):
+            if count > 1:
+                yield trial
+            yield from _with_an_expiry_more(trial, following[0])
+
+
+def _with_answers_more(
+    before: StepComparer, following: Sequence[HandlerRun], others: OtherRecords, count: int
+) -> Iterator[StepComparer]:
+    """Yield copies of the reference. Each one has received `count` answers that have no line.
+
+    An agent counts only one answer of each sender. A sender whose answer has a line is therefore not the sender of a
+    lost answer.
+    """
+    run, state = following[0], before.state
+    answered = state.voters if state.voting_timer.active else state.reconcile_responders
+    silent = sorted(before.roster - {state.agent_id} - answered - _senders(following))
+    senders = {
+        message: [sender for sender in silent if others.may_have_arrived(sender, message, run.t)]
+        for message in _answers(state, run, others)
+    }
+    for messages in combinations_with_replacement(senders, count):
+        assigned = next(_assignments([senders[message] for message in messages]), None)
+        if assigned is None:
+            continue
+        trial = before.copy()
+        if all(trial.play_lost_message(*lost, run.t) for lost in zip(assigned, messages, strict=True)):
+            yield trial
+
+
+def _senders(runs: Iterable[HandlerRun]) -> set[int]:
+    """Return the senders of the answers that an agent received, until it ended its question or asked another one."""
+    senders = set()
+    for run in runs:
+        if not isinstance(run.trigger, MessageTrigger):
+            break
+        if run.handler in COUNTS:
+            senders.add(run.trigger.sender)
+    return senders
+
+
+def _assignments(choices: Sequence[Sequence[int]]) -> Iterator[tuple[int, ...]]:
+    """Yield tuples with one element of each sequence, in which no element occurs twice."""
+    if not choices:
+        yield ()
+        return
+    for rest in _assignments(choices[1:]):
+        yield from ((first, *rest) for first in choices[0] if first not in rest)
+
+
+def _answers(state: ReferenceState, run: HandlerRun, others: OtherRecords) -> Iterator[Message]:
     """Yield the possible answers to the query or request that the agent has sent last."""
     top = state.chain.top_chain_hash
     if state.voting_timer.active and state.candidate_block is not None:
@@ -241,10 +332,14 @@ def _answers(state: ReferenceState, run: HandlerRun) -> Iterator[Message]:
         for contained in (True, False):
             yield ChainContainResponse(top, contained)
     if state.phase_two_timer.active:
-        candidates = {block_hash: counted[1] for block_hash, counted in state.reconcile_response_dictionary.items()}
+        candidates = {b"": 0}
+        candidates |= {block_hash: counted[1] for block_hash, counted in state.reconcile_response_dictionary.items()}
         for block_hash, counted in (run.tally or {}).items():
             with suppress(ValueError):
                 candidates[bytes.fromhex(block_hash)] = counted[-1] if isinstance(counted, list) else 0
+        for _, sent in others.sent_by_others(NextInSequenceResponse.NAME):
+            if isinstance(sent, NextInSequenceResponse) and sent.chain_hash == top:
+                candidates[sent.block_hash or b""] = sent.timestamp_us
         for candidate, timestamp_us in candidates.items():
             with suppress(ValueError, TypeError):
                 yield NextInSequenceResponse(top, candidate or None, timestamp_us)

@@ -3,7 +3,7 @@
 import base64
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -142,6 +142,21 @@ class RecordedTrace:
                         with suppress(ValueError):
                             found.setdefault(key, []).append(base64.b64decode(datagram.text, validate=True))
         return found
+
+    def sent_by_others(self, kind: str) -> Iterable[tuple[int, Message]]:
+        """Return the recorded messages of this type from other agents, with their senders. Equal ones occur once."""
+        return self._sent_by_others.get(kind, ())
+
+    @cached_property
+    def _sent_by_others(self) -> dict[str, list[tuple[int, Message]]]:
+        """Type -> sender and message."""
+        found: dict[str, dict[tuple[int, Message], None]] = {}
+        for (sender, _), datagrams in self._datagrams.items():
+            for data in datagrams if sender != self.agent_id else ():
+                with suppress(MalformedDatagramError):
+                    message = decode(data).message
+                    found.setdefault(message.NAME, {})[sender, message] = None
+        return {kind: [*messages] for kind, messages in found.items()}
 
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
         """Return false if the records prove that this message did not reach the agent before `at_s`.

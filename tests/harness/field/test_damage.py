@@ -1,5 +1,6 @@
 """Test that damaged records of correct agents lead to no false accusation and no traceback."""
 
+import json
 import re
 import shutil
 from collections.abc import Iterator
@@ -147,6 +148,46 @@ def test_replay_of_trace_without_any_one_line_finds_no_deviation(run: Path) -> N
     for number in range(2, min(lines, 60), 3):
         found = RecordPlayer(open_record(_without(path, number))).to_end()
         assert [deviation.sentence(str) for deviation in found.deviations] == [], number
+
+
+ANSWER, VOTE = "receive_response_next_in_sequence", "receive_vote_add_block"
+
+
+@pytest.fixture(scope="module")
+def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with the records of five agents that often reconcile."""
+    home = tmp_path_factory.mktemp("five") / "home"
+    flight = scenario(agents=5, duration_s=300, network={"loss": 0.2}, events={"source": "random", "mean_s": 8})
+    bring_home(flight, 1, "sim", home.parent / "run", home)
+    return home
+
+
+@pytest.mark.parametrize(
+    "handlers",
+    [
+        (ANSWER,),
+        (ANSWER, ANSWER),
+        (ANSWER, ANSWER, ANSWER),
+        (VOTE, VOTE),
+        ("receive_phase_1_response", "reconcile_phase_1_timer_expiration"),
+        ("receive_request_next_in_sequence",),
+        ("process_next_deque_block", "build_data_block"),
+    ],
+)
+def test_replay_without_consecutive_lines_finds_no_deviation(handlers: tuple[str, ...], five: Path) -> None:
+    tried = 0
+    for agent in range(1, 6):
+        path = five / f"{agent}.trace.jsonl"
+        lines = path.read_bytes().splitlines(keepends=True)
+        ran = [json.loads(line).get("handler") for line in lines]
+        places = [place for place in range(1, len(lines)) if ran[place : place + len(handlers)] == [*handlers]]
+        for place in places[:2]:
+            path.write_bytes(b"".join([*lines[:place], *lines[place + len(handlers) :]]))
+            found = RecordPlayer(open_record(five, agent)).to_end()
+            assert [deviation.sentence(str) for deviation in found.deviations] == [], (agent, place)
+            tried += 1
+        path.write_bytes(b"".join(lines))
+    assert tried
 
 
 def test_ingest_reads_swapped_and_repeated_lines_once_and_in_order(run: Path, tmp_path: Path) -> None:
