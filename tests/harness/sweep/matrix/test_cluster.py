@@ -238,6 +238,7 @@ def test_budget_limits_the_runs_of_a_cluster(tmp_path: Path, dask: Cluster) -> N
     assert done.returncode == 0, done.stderr
     record = json.loads((out / "matrix.json").read_text())
     assert (record["outcome"], record["budget_s"]) == ("completed", 2)
+    assert record["cells"]
     assert {cell["loss"] for cell in record["cells"]} <= {0.1, 0.3}
 
 
