@@ -205,8 +205,8 @@ class RemoteAgents:
             channel = await hello.answer({"run": self._run, "name": self._scenario.name})
             if not vehicle.joined.is_set():
                 vehicle.delay_s = await _measured_delay(connection, channel)
-            vehicle.host, vehicle.session = host, str(hello.words.get("session"))[:MAX_TEXT]
-            vehicle.command = [str(word)[:MAX_TEXT] for word in hello.words.get("command") or ()]
+            vehicle.host, vehicle.session = host, hello.words["session"]
+            vehicle.command = [str(word)[:MAX_TEXT] for word in hello.words["command"]]
             vehicle.joins += 1
             await self._keep(vehicle, connection, channel)
             vehicle.joined.set()
@@ -227,12 +227,14 @@ class RemoteAgents:
         if words.get("protocol") != PROTOCOL or words.get("contract") != CONTRACT:
             mine = f"{PROTOCOL} and version {CONTRACT} of the agent contract"
             return None, f"this harness has {mine}: install the same version of ucp-harness on both computers"
-        agent_id = words.get("agent")
-        vehicle = self._vehicles.get(agent_id) if isinstance(agent_id, int) else None
+        agent_id, session, command = words.get("agent"), words.get("session"), words.get("command")
+        if type(agent_id) is not int or not isinstance(session, str) or not isinstance(command, list):
+            return None, "its hello lacks the agent, the session or the command"
+        vehicle = self._vehicles.get(agent_id)
         if vehicle is None:
             awaited = ", ".join(map(str, self._vehicles))
-            return None, f"this mission awaits agent {awaited}, not agent {str(agent_id)[:9]}: use --as {awaited}"
-        if vehicle.session not in ("", str(words.get("session"))) and _is_alive(vehicle):
+            return None, f"this mission awaits agent {awaited}, not agent {agent_id}: use --as {awaited}"
+        if vehicle.session not in ("", session) and _is_alive(vehicle):
             return None, f"agent {agent_id} has joined from {vehicle.host} already: end that one, or use another --as"
         return vehicle, ""
 

@@ -28,6 +28,7 @@ depot       exports, mission files and manifests at the depot
 matrix      a matrix file, the record of an earlier night, and results
 secured     an agent with keys, in any epoch and incarnation, with messages of senders with and without keys
 signed      the export of a secured run with signatures, or its public keys
+join        the handshake and the messages of a computer that joins a lab
 keys        bundles, public and private keys, revocations
 """
 
@@ -40,7 +41,7 @@ NAMES = (
     *("datagram", "layers", "agent", "store", "mission", "control", "answer", "virtual", "foreign"),
     *("telemetry", "scenario", "story", "trace", "events", "export", "run_record", "network"),
     *("tracks", "capture", "csv", "bag", "packed", "depot", "matrix", "by_hand", "keys"),
-    *("secured", "signed", "flight_log"),
+    *("secured", "signed", "flight_log", "join"),
 )
 
 
