@@ -4,6 +4,7 @@ The lab's computer has the address 192.168.7.1, and the far one 192.168.7.2. `cu
 them with nftables.
 """
 
+import os
 import subprocess
 import sys
 import time
@@ -62,6 +63,7 @@ class TwoComputers:
         process = subprocess.Popen(
             [*self._inside(computer), *COMMAND, *map(str, arguments)],
             cwd=self.directory,
+            env={**os.environ, "TMPDIR": str(self.directory)},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -78,6 +80,10 @@ class TwoComputers:
     def cut(self) -> None:
         """Let the cable lose everything."""
         self._spoil("drop")
+
+    def reset(self) -> None:
+        """Break all connections between the computers, and let no other succeed."""
+        self._spoil("tcp flags & (syn | rst) == 0 reject with tcp reset")
 
     def lose(self, percent: int) -> None:
         """Let the cable lose this share of the packets in each direction."""

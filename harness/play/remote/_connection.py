@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from harness.play.remote._wire import Channel, Kind, Message, WireError
 
@@ -32,12 +32,14 @@ class Connection(asyncio.Protocol):
         self._transport = None
         self._lost(self)
 
-    def send(self, kind: Kind, payload: bytes = b"") -> bool:
-        """Send a message. Return false if the connection has ended."""
-        if self._transport is None:
-            return False
-        self._transport.write(self._channel.encode(kind, payload))
-        return True
+    def send(self, kind: Kind, payload: bytes = b"") -> None:
+        """Send a message. If the connection has ended, do nothing."""
+        self.send_together([(kind, payload)])
+
+    def send_together(self, messages: Iterable[tuple[Kind, bytes]]) -> None:
+        """Send messages at once, so that the other end wakes once for all of them."""
+        if self._transport is not None:
+            self._transport.write(b"".join(self._channel.encode(kind, payload) for kind, payload in messages))
 
     @property
     def unsent(self) -> int:

@@ -156,18 +156,18 @@ HANDED_OVER_BYTES = 4096
 
 def bind_path(outside: socket.socket, path: Path) -> None:
     """Bind a Unix socket to a path of any length. Raises OSError."""
-    with _directory(path.parent) as directory:
+    with short_name(path.parent) as directory:
         outside.bind(f"{directory}/{path.name}")
 
 
 def connect_path(inside: socket.socket, path: Path) -> None:
     """Connect a Unix socket to a path of any length. Raises OSError."""
-    with _directory(path.parent) as directory:
+    with short_name(path.parent) as directory:
         inside.connect(f"{directory}/{path.name}")
 
 
 @contextmanager
-def _directory(path: Path) -> Iterator[str]:
+def short_name(path: Path) -> Iterator[str]:
     """Provide a short name of a directory, because the address of a socket has at most 107 bytes."""
     descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
     try:

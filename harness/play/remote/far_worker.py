@@ -34,6 +34,7 @@ from harness.play.remote._wire import (
     Kind,
     Message,
     WireError,
+    short_name,
     take_over,
 )
 from netem.far_network import FarNetwork, vehicle_at
@@ -237,10 +238,11 @@ class FarWorker:
 
     async def _connect_control(self, process: asyncio.subprocess.Process) -> None:
         """Connect to the control socket of the agent as soon as it exists."""
-        path = self._home / f"{self._agent_id}.control"
         while process.returncode is None:
             try:
-                reader, self._control = await asyncio.open_unix_connection(path, limit=MAX_ANSWER_BYTES)
+                with short_name(self._home) as home:
+                    path = f"{home}/{self._agent_id}.control"
+                    reader, self._control = await asyncio.open_unix_connection(path, limit=MAX_ANSWER_BYTES)
             except OSError:
                 await asyncio.sleep(READY_POLL_S)
                 continue
@@ -310,18 +312,17 @@ class FarWorker:
     def _leave(self) -> None:
         """Send the datagrams that the agent broadcast. Its trace has their lines already."""
         assert self._network is not None
-        for _ in range(FRAMES_PER_TURN):
-            try:
-                data = self._network.read()
-            except OSError:
-                return
-            if data is None:
-                continue
-            self._frames += 1
-            silent = self._loop.time() - self._pinged_s > SILENT_S
-            if self._can_send() and not silent:  # else the vehicle is cut off
-                self._send_new(Kind.TRACE)
-                self._send(Kind.DATAGRAM, data)
+        datagrams: list[bytes] = []
+        with contextlib.suppress(OSError):  # no frame is left
+            for _ in range(FRAMES_PER_TURN):
+                if (data := self._network.read()) is not None:
+                    datagrams.append(data)
+        self._frames += len(datagrams)
+        silent = self._loop.time() - self._pinged_s > SILENT_S
+        if datagrams and self._connection is not None and self._can_send() and not silent:  # else it is cut off
+            lines = iter(self._tails[Kind.TRACE].read, b"")
+            messages = [(Kind.TRACE, data) for data in lines] + [(Kind.DATAGRAM, data) for data in datagrams]
+            self._connection.send_together(messages)
 
     def _arrive(self, payload: bytes) -> None:
         """Let a datagram from the lab arrive: the sender's address of 4 bytes, and the data."""

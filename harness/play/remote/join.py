@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import os
 import secrets
 import shutil
@@ -16,7 +17,9 @@ import signal
 import socket
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +37,9 @@ CONNECT_LIMIT_S = 5.0
 RETRY_S = 1.0
 REJOIN_LIMIT_S = 60.0
 """Wall seconds after which a lost connection ends the incarnation of the agent."""
-END_LIMIT_S = 5.0
+DIRECTORY = "ucp-join-"
+NEW_S = 60.0
+"""Wall seconds after which a directory without a lock belongs to a killed process."""
 
 
 class JoinError(HarnessError):
@@ -95,6 +100,32 @@ def join(request: JoinRequest, say: Callable[[str], None]) -> None:
     asyncio.run(_Joining(request, first_process, say).run())
 
 
+@contextmanager
+def _directory() -> Iterator[Path]:
+    """Provide a directory for the agent's files. Remove it afterwards, and remove those of killed processes.
+
+    A lock shows that the process of a directory still runs. A new directory has no lock for a moment.
+    """
+    for path in Path(tempfile.gettempdir()).glob(f"{DIRECTORY}*"):
+        with contextlib.suppress(OSError):  # of another user, or in use
+            if time.time() - path.lstat().st_ctime > NEW_S:
+                with _locked(path):
+                    shutil.rmtree(path)
+    with tempfile.TemporaryDirectory(prefix=DIRECTORY) as name, _locked(Path(name)):
+        yield Path(name)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Lock a directory. Raises OSError if another process has locked it."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 class _Joining:
     """A far end that plays one incarnation of its agent after another."""
 
@@ -108,8 +139,8 @@ class _Joining:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             loop.add_signal_handler(number, ended.set)
-        with tempfile.TemporaryDirectory(prefix="ucp-join-") as directory:
-            playing = asyncio.create_task(self._play(Path(directory)))
+        with _directory() as directory:
+            playing = asyncio.create_task(self._play(directory))
             waiting = asyncio.create_task(ended.wait())
             await asyncio.wait({playing, waiting}, return_when=asyncio.FIRST_COMPLETED)
             waiting.cancel()

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from harness.play.remote import _far_clock
+from harness.play.remote import _far_clock, join
 from harness.play.remote._far_clock import FarClock, ping, pong
 from harness.play.remote._handshake import MAX_TEXT_BYTES, HandshakeError, RefusedError, introduce, receive_hello
 from harness.play.remote._wire import MAX_MESSAGE_BYTES, Channel, Kind, Message, WireError
@@ -197,6 +197,21 @@ def test_malformed_ping_or_pong_is_refused(payload: bytes) -> None:
         pong(payload, 0)
     with pytest.raises(WireError):
         FarClock().receive(payload)
+
+
+# The files of the far end
+
+
+def test_files_of_a_killed_far_end_are_removed_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with join._directory() as active:
+        (tmp_path / "ucp-join-killed").mkdir()
+        with join._directory() as second:
+            assert {*tmp_path.iterdir()} == {active, second, tmp_path / "ucp-join-killed"}, "it may be new"
+        monkeypatch.setattr(join, "NEW_S", -1.0)
+        with join._directory() as third:
+            assert {*tmp_path.iterdir()} == {active, third}
+    assert [*tmp_path.iterdir()] == []
 
 
 # The secret
