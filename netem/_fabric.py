@@ -4,7 +4,7 @@ A vehicle has the interface `eth0` with its address and a default route (ArduPil
 multicast). The other end, `v<ID>`, is a port of the bridge in the lab's own namespace. There the engines handle each
 packet on its way to the vehicle. The namespaces of the vehicles have no names. They exist as long as this process holds
 them open or a process runs in them. An existing namespace, such as that of a container, can also belong to a vehicle.
-The cable then ends in it.
+The cable then ends in this namespace.
 """
 
 from __future__ import annotations

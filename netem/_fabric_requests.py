@@ -51,8 +51,8 @@ def mtu(what: str, index: int, most_bytes: int) -> NetlinkRequest:
 def bridge(name: str, index: int) -> NetlinkRequest:
     """Return a request that creates and activates a bridge.
 
-    Without spanning tree and forward delay, ports forward at once. Without multicast snooping, multicast reaches all
-    vehicles, as it does by radio.
+    Without spanning tree and forward delay, ports forward packets immediately. Without multicast snooping, multicast
+    reaches all vehicles, as it does by radio.
     """
     settings = (
         number(_IFLA_BR_STP_STATE, 0),

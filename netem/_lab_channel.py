@@ -26,8 +26,8 @@ class _LabRequest:
 
 
 class LabConnection:
-    """The connection to the process `netem.init`. After this process has ended, each request fails with the same
-    error.
+    """The connection to the process `netem.init`. After the process `netem.init` has ended, each request fails with the
+    same error.
     """
 
     def __init__(self, control: socket.socket, log: Path) -> None:

@@ -1,10 +1,10 @@
 """Represent network conditions (conditions of links, and partitions) independently of the mechanism that applies them.
 
-As in the thesis, conditions belong to the receiver: each receiver of a broadcast loses it or receives it independently
-of the other receivers. In addition, a link can have its own conditions. A link leads from one sender to one receiver,
-in this direction only. `netem.link` defines the conditions of a link. A partition is a tuple of groups. A packet
-reaches only vehicles in the group of its sender. Vehicles in no group form a further group. A partition with a single
-group therefore separates it from all other vehicles.
+As in the thesis, conditions belong to the receiver: each receiver of a broadcast loses or receives the broadcast
+independently of the other receivers. In addition, a link can have its own conditions. A link leads from one sender to
+one receiver, in this direction only. `netem.link` defines the conditions of a link. A partition is a tuple of groups. A
+packet reaches only vehicles in the group of its sender. Vehicles in no group form a further group. A partition with a
+single group therefore separates this group from all other vehicles.
 """
 
 from __future__ import annotations

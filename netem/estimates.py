@@ -187,7 +187,9 @@ def _losses(received: ReceivedStream) -> list[bool]:
 
 
 def _independence(losses: Sequence[bool]) -> float:
-    """Return the number of independent draws that one draw of a correlated sequence is worth: (1 - c) / (1 + c)."""
+    """Return the share of independent draws in a correlated sequence of losses: (1 - c) / (1 + c), where c is the
+    correlation.
+    """
     loss = fmean(losses)
     if not 0 < loss < 1:
         return 1.0

@@ -33,8 +33,8 @@ class LabRequirement:
 
 
 def examine() -> list[LabRequirement]:
-    """Return all requirements of a virtual network. The list has a requirement after those on which it depends. This
-    takes about half a second.
+    """Return all requirements of a virtual network. In the list, each requirement follows the requirements on which it
+    depends. The examination takes about half a second.
     """
     ok, message = _namespaces.probe()
     requirements = [LabRequirement("namespaces", ok, message, "" if ok else _namespaces.way_out(message))]

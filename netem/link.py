@@ -109,18 +109,18 @@ class LinkConditions:
     `loss` is the probability, 0 to 1, that a packet is lost, drawn for each packet, or a model of bursts. `duplicate`
     is the probability that a packet arrives twice. It is drawn together with the loss: if a packet is both lost and
     duplicated, one copy remains. Otherwise loss and the other conditions are drawn separately for the second copy,
-    which is not duplicated again. `reorder` is the probability that a packet overtakes: it is sent at once, without
-    delay. It needs a delay above 0.
+    which is not duplicated again. `reorder` is the probability that a packet overtakes: it is sent without delay.
+    Reordering needs a delay above 0.
 
     `corrupt` is the probability that one bit of a packet flips. The receiver's UDP checksum finds the error, so the
     message is lost. (netem flips bits of the whole Ethernet frame. No checksum of a veth pair covers the 12 bytes of
     addresses, and a broadcast mostly arrives in spite of such an error.)
 
     `rate` is in bits per second of Ethernet frames, which are 42 bytes longer than the data of a UDP datagram. Each
-    link from one sender to one receiver has this rate for itself. A packet waits for its delay and for the packet
-    before it. The time that it then takes depends on its size and the rate. Packets therefore keep their order. `limit`
-    is the number of packets that may wait on a link for delay or rate, at least 1. A packet that arrives at a full link
-    is lost. Packets that overtake do not wait. Corrupted packets wait like all others.
+    link from one sender to one receiver has the full rate. A packet waits for its delay and for the packet before it.
+    The time of its transmission depends on its size and the rate. Packets therefore keep their order. `limit` is the
+    number of packets that may wait on a link for delay or rate, at least 1. A packet that arrives at a full link is
+    lost. Packets that overtake do not wait. Corrupted packets wait like all other packets.
     """
 
     loss: float | GilbertElliott = 0.0

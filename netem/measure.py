@@ -7,9 +7,9 @@ simulates packets in virtual time. A measurement is right if its 99.9 % interval
 requested value.
 
 Even with a right kernel, one of a thousand intervals does not contain the requested value. With thirty comparisons,
-this happens in one of about thirty measurements. Such a comparison is therefore repeated with a new stream. The second
-result counts, and the first one is shown beside it. A right kernel then fails a measurement of thirty comparisons once
-in 30,000 cases. A wrong kernel fails twice in a row.
+this happens in one of about thirty measurements. A wrong comparison is therefore repeated with a new stream. The second
+result counts, and the first result is shown beside it. A right kernel then fails a measurement of thirty comparisons
+once in 30,000 cases. A wrong kernel fails twice in a row.
 
 The requested value is the value that the engine can reach. For a delay, it is the mean and deviation of netem's table
 (`netem._distributions`). For corruption, it is the share of corrupted packets that checksums can detect.

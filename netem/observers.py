@@ -63,8 +63,9 @@ def in_lab(engine: EngineName) -> Observer:
     """Return a function that measures real packets, each time in a new virtual network.
 
     If the kernel's engine passed more packets than arrived, the machine lost them, because a receive buffer or a
-    processor's backlog was full. Such a stream is useless for the measurement. It is sent again more slowly. Raises
-    LabError if packets are still lost or the lab fails, and LabUnavailable if this machine cannot run the lab.
+    processor's backlog was full. A stream with such losses is useless for the measurement, and is sent again more
+    slowly. Raises LabError if packets are still lost or the lab fails, and LabUnavailable if this machine cannot run
+    the lab.
     """
 
     def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:

@@ -92,7 +92,7 @@ class PcapngFile:
             self.flush()
 
     def flush(self) -> None:
-        """Write all blocks that wait in memory. If writing fails, write none of them."""
+        """Write all blocks that wait in memory to the file. If writing fails, write none of these blocks."""
         if not self._pending:
             return
         data = memoryview(b"".join(self._pending))

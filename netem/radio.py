@@ -16,7 +16,7 @@ from netem.errors import ConditionsError
 from netem.link import GilbertElliott, LinkConditions
 
 MIN_DISTANCE_M = 1.0
-"""Reference distance of the path loss models, in metres. Shorter distances are treated as equal to it."""
+"""Reference distance of the path loss models, in metres. Shorter distances are treated like this distance."""
 
 STEPS = 100
 """Number of steps to which a loss rate is rounded. Because of the rounding, two hovering vehicles cause no change of

@@ -1,11 +1,11 @@
 """Capture packets in a separate process: `python -m netem.tap FOLDER VEHICLE...`, started in the virtual network.
 
-The program prints "ready" when it captures all ports. It then keeps frames in memory until SIGUSR1. By then, the caller
-has created the files FOLDER/<ID>.pcapng, and the program appends frames to them. SIGTERM ends the capture. The program
-then writes the remaining frames and the counters. The counters are at the end of each file, and for all files in one
-JSON object on standard output. A suspended process may receive SIGTERM before SIGUSR1. In this case the existence of
-the files shows that the mission began. Directions at a port are those of the switch, and directions in a file are those
-of the vehicle.
+The program prints "ready" when it captures all ports. It then keeps frames in memory until SIGUSR1. Before this signal,
+the caller creates the files FOLDER/<ID>.pcapng, and the program then appends the frames to these files. SIGTERM ends
+the capture. The program then writes the remaining frames and the counters. The counters are at the end of each file,
+and for all files in one JSON object on standard output. A suspended process may receive SIGTERM before SIGUSR1. In this
+case the existence of the files shows that the mission began. Directions at a port are seen from the switch, and
+directions in a file from the vehicle.
 """
 
 from __future__ import annotations

@@ -3,14 +3,14 @@
     status = uml.run(["my-command", "--flag"], cwd=Path.cwd(), env=os.environ)
 
 linux.uml (Debian: user-mode-linux) boots from the host's own files (hostfs). The command finds all programs and
-directories at their usual paths, and writes with the caller's rights. It needs no other rights. Inside the guest it is
-root. Only /run, with TMPDIR in it, is separate from the host. The guest has one processor, and a system call takes
-about twenty times as long as on the host.
+directories at their usual paths, and writes with the caller's rights. The command needs no other rights. Inside the
+guest it is root. Only /run, with TMPDIR in it, is separate from the host. The guest has one processor, and a system
+call takes about twenty times as long as on the host.
 
-The output of the command is copied at once. The terminal of the command is a console of the guest. Ctrl-C and SIGTERM
-reach it as Ctrl-C, and it has no other input. Another console is for shells (`netem.uml_shell`). On a further console,
-the guest prints an empty line every few seconds, and finally the exit status of the command. Without this status, `run`
-raises an error.
+The output of the command is copied without delay. The terminal of the command is a console of the guest. Ctrl-C and
+SIGTERM reach the command as Ctrl-C, and the command has no other input. Another console is for shells
+(`netem.uml_shell`). On a further console, the guest prints an empty line every few seconds, and finally the exit status
+of the command. Without this status, `run` raises an error.
 
 Programs inside keep their floating point and vector registers, also on processors that the kernel does not support
 (`netem._uml_registers`).

@@ -1,7 +1,7 @@
 """Run simulated vehicles: ArduPilot SITL or the embedded vehicle model, and a pilot that flies them over MAVLink.
 
 `__all__` lists the public names. A name is imported at its first use, because every embedded vehicle imports this
-package. A lazy import keeps its start fast.
+package. This lazy import keeps the start of the embedded vehicle fast.
 """
 
 from typing import TYPE_CHECKING

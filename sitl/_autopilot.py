@@ -341,7 +341,7 @@ class Autopilot:
     # The mission
 
     def _begin_item(self, number: int) -> None:
-        """Continue the mission with this item. Items without a duration are executed at once."""
+        """Continue the mission with this item. Items without a duration are executed immediately."""
         self._in_mission = True
         while number < len(self.mission) and self.mission[number].command == mavlink.MAV_CMD_DO_CHANGE_SPEED:
             self.set_speed(self.mission[number].param2)

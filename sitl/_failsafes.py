@@ -24,8 +24,8 @@ WIND, WIND_FROM = "SIM_WIND_SPD", "SIM_WIND_DIR"
 LOW_AT, CRITICAL_AT, LOW_FOR = "BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_TIMER"
 WHEN_LOW, WHEN_CRITICAL = "BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"
 BATTERY = {LOW_AT: 0.0, CRITICAL_AT: 0.0, LOW_FOR: 10.0, WHEN_LOW: 0.0, WHEN_CRITICAL: 0.0}
-"""ArduPilot's default parameters for the battery. With them, the battery is never low. A copter's battery can be low,
-but this has no effect.
+"""ArduPilot's default parameters for the battery. With these parameters, the battery is never low. Only the battery of
+a copter can be low, but this has no effect.
 """
 COPTER_LOW_V = 10.5
 
@@ -34,7 +34,9 @@ ACTIONS: dict[VehicleType, dict[float, str]] = {
     "plane": {1: "RTL", 2: "RTL"},
     "rover": {1: "RTL", 2: "HOLD", 3: "RTL", 4: "HOLD"},
 }
-"""The modes that the values of BATT_FS_..._ACT select if no better way home is known. Other values select no mode."""
+"""The modes that the values of BATT_FS_..._ACT select if the vehicle knows no better route home. Other values select no
+mode.
+"""
 
 RC_FAIL, RC_SILENT_S = "SIM_RC_FAIL", 1.0
 STATION = "MAV_GCS_SYSID"

@@ -1,6 +1,6 @@
 """Request the version and all parameters of a vehicle after it has booted.
 
-A vehicle that does not report some of them can still fly. It must report the parameters that the user has set.
+A vehicle that does not report some parameters can still fly. It must report the parameters that the user has set.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _GIVEN = ProcedureStep("the parameters that it was given")
 
 
 class VehicleIntroduction:
-    """The requests for version and parameters. The vehicle must have the parameters in `given`. The pilot sets those
-    whose values differ.
+    """The requests for version and parameters of a vehicle. The vehicle must have the parameters in `given`. The pilot
+    sets the parameters whose values differ from `given`.
     """
 
     purpose = "introduce itself"
@@ -62,7 +62,9 @@ class VehicleIntroduction:
                 link.request_parameter(name)  # ArduPilot lists none of a group that is switched off
 
     def _ask_for_list(self) -> None:
-        """Request all parameters until the first one arrives. When no more arrive, request those that are missing."""
+        """Request all parameters until the first parameter arrives. When no more parameters arrive, request the missing
+        ones.
+        """
         link = self._link
         if link.parameter_count is None:
             link.request_parameters()

@@ -20,7 +20,7 @@ def leg_by_leg(
     """Return the segments up to the last completed waypoint. They are followed by the motion of a vehicle that gets no
     further commands.
 
-    If a waypoint takes longer than the pilot's time limit, the flight ends with it.
+    If a waypoint takes longer than the pilot's time limit, the flight ends with this waypoint.
     """
     model, motion, goal = AT_ONCE[vehicle_type], start, None
     flown: list[MotionSegment] = []

@@ -47,11 +47,12 @@ class PilotLink(asyncio.Protocol):
     """A connection to one vehicle over a connected socket. It may be used in one event loop only.
 
     The link sends two kinds of heartbeats. The heartbeats of the pilot have the pilot's system ID. The heartbeats of a
-    ground station have the ID that the vehicle expects from its ground station, because its failsafe acts without them.
-    They stop while `station_is_heard` is false. A run with a real ground station sets `plays_station` to false.
+    ground station have the ID that the vehicle expects from its ground station, because its failsafe acts without such
+    heartbeats. The heartbeats of a ground station stop while `station_is_heard` is false. A run with a real ground
+    station sets `plays_station` to false.
 
-    `heard` is set when data arrives and when the connection ends. `closed` is set only when it ends. Times in
-    `heard_at`, `heartbeat_at` and `position_at` come from time.monotonic().
+    `heard` is set when data arrives and when the connection ends. `closed` is set only when the connection ends. Times
+    in `heard_at`, `heartbeat_at` and `position_at` come from time.monotonic().
     """
 
     def __init__(self, sysid: int, sock: socket.socket, tlog: Path, speedup: float, home: Home) -> None:

@@ -1,8 +1,8 @@
 """Compute the motion of a plane in arcs and straight lines, never slower than its minimum flying speed.
 
 The values are those of ArduPlane's SITL (plane.parm), or measurements with ArduPlane 4.7 where this is noted. Turns are
-the shortest ones, as in the paths of Dubins (1957). ArduPlane's L1 controller flies turns that differ by some tens of
-metres.
+as short as possible, as in the paths of Dubins (1957). ArduPlane's L1 controller flies turns that differ by some tens
+of metres.
 """
 
 from __future__ import annotations

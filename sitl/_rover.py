@@ -1,4 +1,4 @@
-"""Compute the motion of a rover, with ArduRover's default parameters and those of its SITL (rover.parm)."""
+"""Compute the motion of a rover, with ArduRover's default parameters and the parameters of its SITL (rover.parm)."""
 
 from __future__ import annotations
 

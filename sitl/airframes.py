@@ -1,6 +1,6 @@
 """List ArduPilot's frames: the type of vehicle, the model name, and the default parameters of each.
 
-The table contains those frames of ArduPilot's sim_vehicle.py that ArduPilot's own simulation flies. The default
+The table contains the frames of ArduPilot's sim_vehicle.py that ArduPilot's own simulation flies. The default
 parameters are files of ArduPilot's Tools/autotest, which are applied in order. Names must match exactly. ArduPilot's
 programs compare only the beginning of a name. They accept `hexacopter` as `hexa`, but such a vehicle never takes off
 without the parameters of a hexa.

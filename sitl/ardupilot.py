@@ -184,7 +184,8 @@ class ArduPilot:
     def _check_model(self, frame: str) -> None:
         """Raise VehicleError if the binary does not offer the frame.
 
-        An older binary lacks some frames. It would take a frame for another one whose name has the same start.
+        An older binary lacks some frames. It would confuse such a frame with another frame whose name has the same
+        beginning.
         """
         offered = models(self.binary)
         words = self.frame.lower().split("-")

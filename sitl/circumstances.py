@@ -1,9 +1,9 @@
 """Simulate faults and weather of a vehicle, by parameters of ArduPilot's simulation (SIM_...).
 
 The names of these parameters differ between versions. A fault therefore has several alternative sets of parameters. The
-one of the current version is first. The first alternative whose parameters all exist is used. ArduPilot does not answer
-a request for an unknown parameter, and it answers requests in order. An answer about a later alternative therefore
-shows that the earlier ones do not exist. A value counts as set when the vehicle reports it.
+alternative of the current version is first. The first alternative whose parameters all exist is used. ArduPilot does
+not answer a request for an unknown parameter, and it answers requests in order. An answer about a later alternative
+therefore shows that the earlier ones do not exist. A value counts as set when the vehicle reports it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Download files over HTTP, with limits on size and silence. An interrupted download is resumed.
 
 The received part is stored in `NAME.part`. `NAME.part.json` has the total size, and the validator of the file (ETag or
-Last-Modified). The rest is requested with Range and If-Range (RFC 9110, sections 13.1.5 and 14.2). If the answer does
-not fit, the download restarts. Proxies come from the environment (`https_proxy`, `no_proxy`:
+Last-Modified). The missing part is requested with Range and If-Range (RFC 9110, sections 13.1.5 and 14.2). If the
+answer does not fit, the download restarts. Proxies come from the environment (`https_proxy`, `no_proxy`:
 urllib.request.getproxies).
 """
 
@@ -161,7 +161,9 @@ def _broken_off(url: str) -> DownloadError:
 
 
 def _endless(url: str) -> DownloadError:
-    """Return the error for an answer without a size. Such a file cannot be checked for completeness."""
+    """Return the error for an answer without a size. Without a size, the harness cannot check that the downloaded file
+    is complete.
+    """
     return DownloadError(f"{urlsplit(url).netloc} does not say how large {url} is: use another --url")
 
 

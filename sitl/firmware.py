@@ -237,7 +237,7 @@ class _ReleaseServer:
         return None
 
     def _no_such_version(self) -> RequestError:
-        """Return the error for a release that does not exist, with the existing ones if the server lists them."""
+        """Return the error for a release that does not exist, with the existing releases if the server lists them."""
         try:
             listing = fetch_text(self._releases, TEXT_LIMIT, self._stall_s)
         except DownloadError:

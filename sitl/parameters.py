@@ -34,7 +34,7 @@ class ParameterError(VehicleError):
 def read(path: Path) -> dict[str, float]:
     """Return the parameters in a file, except those in `OURS`.
 
-    Of a repeated parameter the last value is used. Raises VehicleError.
+    If a parameter is repeated, the last value is used. Raises VehicleError.
     """
     values: dict[str, float] = {}
     for number, line in enumerate(text_of(path, MAX_BYTES).splitlines(), start=1):
@@ -69,7 +69,7 @@ def check(values: Mapping[str, float]) -> None:
 def unknown(asked: Iterable[str], known: Iterable[str]) -> str | None:
     """Return a phrase about the requested parameters that a vehicle does not have, with similar parameters that it has.
 
-    Return None if it has all of them.
+    Return None if the vehicle has all of these parameters.
     """
     names = set(known)
     missing = sorted(set(asked) - names)

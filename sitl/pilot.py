@@ -51,8 +51,8 @@ class Pilot:
         """Create the pilot. `sock` must be connected to the pilot port of the vehicle. `close` closes the socket.
 
         `sysid` is the MAVLink system ID. `tlog` is the file of the telemetry log. `speedup` (simulated seconds per
-        second) and `home` are those with which the vehicle was started. Error messages contain `vehicle_id`, which is
-        the system ID by default. Raises OSError if `tlog` cannot be opened.
+        second) and `home` are the values with which the vehicle was started. Error messages contain `vehicle_id`, which
+        is the system ID by default. Raises OSError if `tlog` cannot be opened.
         """
         self.link = PilotLink(sysid, sock, tlog, speedup, home)
         self.vehicle_type: VehicleType = vehicle_type

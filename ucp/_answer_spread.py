@@ -52,7 +52,7 @@ class WaitingAnswers:
         return self._waiting[0][0] if self._waiting else None
 
     def exchange(self, outbox: list[Outgoing], now: float) -> list[Outgoing]:
-        """Add the answers in `outbox` to the waiting ones. Return all messages to send now, in order.
+        """Add the answers in `outbox` to the waiting answers. Return all messages to send now, in order.
 
         An answer that has waited comes before the messages of the current input.
         """

@@ -1,8 +1,8 @@
-"""A limit for the space that dropped datagrams take in the trace, because any sender can send such datagrams.
+"""A limit for the size of dropped datagrams in the trace, because any sender can send such datagrams.
 
 A flood of datagrams that are dropped would fill the disk of a vehicle. The agent therefore writes complete datagrams
-only within a quota. It counts the other datagrams and writes their number. The trace thus accounts for each datagram,
-and its size does not depend on the flood.
+only within a quota. It counts the other datagrams and writes their number. The trace thus contains or counts each
+datagram, and its size does not depend on the flood.
 """
 
 from collections import Counter
@@ -13,7 +13,7 @@ from ucp.trace import DroppedDatagram, RecordedBytes
 QUOTA_BYTES = 1024 * 1024
 BYTES_PER_S = 128
 """Growth of the quota in bytes per mission second. Because the quota grows, the trace of a long flood contains samples
-of it.
+of the flood.
 """
 COUNTED_S = 10.0
 """Minimum number of mission seconds between two counts of dropped datagrams with the same reason."""

@@ -278,7 +278,8 @@ class Agent:
     def messages_to_send(self) -> list[tuple[int, Message]]:
         """Return the messages that handlers have sent since the previous call, in order, as (sequence number, message).
 
-        The setting `answer_spread_s` does not delay them. A driver with a network calls `datagrams_to_send` instead.
+        The setting `answer_spread_s` does not delay these messages. A driver with a network calls `datagrams_to_send`
+        instead.
         """
         return [(sequence, message) for sequence, message, _ in self._take_outbox()]
 

@@ -1,7 +1,7 @@
 """List the optional parts of the agent contract (features) that some missions need.
 
-A mission file lists the features that it needs. An agent that lacks one of them ends with status 127 instead of running
-a different mission.
+A mission file lists the features that it needs. An agent that lacks one of these features ends with status 127, because
+it would otherwise play a different mission.
 """
 
 from base64 import b64decode

@@ -302,8 +302,8 @@ def encode(sender: int, sequence: int, message: Message) -> bytes:
 
 
 def decode(datagram: bytes) -> Datagram:
-    """Return the content of a datagram. Raises MalformedDatagramError if it does not contain exactly one valid
-    message.
+    """Return the content of a datagram. Raises MalformedDatagramError if the datagram does not contain exactly one
+    valid message.
     """
     if len(datagram) < HEADER.size:
         raise MalformedDatagramError("truncated")

@@ -183,7 +183,7 @@ class Settings:
         """Return the settings as JSON for missions and traces. Newer settings (`ADDED`) with their default value are
         omitted.
 
-        An agent that does not know such a setting can then play a mission that does not need it.
+        An agent that does not know a newer setting can then play a mission that does not need this setting.
         """
         usual = Settings()
         values = {name: getattr(self, name) for name in self.__match_args__}

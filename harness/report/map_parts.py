@@ -154,8 +154,8 @@ def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]
 
 
 def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, most: int) -> list[NetworkDivision]:
-    """Return at most `most` divisions of the swarm: the first one, and those that lasted longest. The map shows each of
-    them until the next one.
+    """Return at most `most` divisions of the swarm: the first division, and the divisions that lasted longest. The map
+    shows each division until the next one.
     """
     if len(all_divisions) <= most:
         return list(all_divisions)

@@ -40,7 +40,7 @@ class ProcessResult:
     def raised_in(self, directory: Path) -> str | None:
         """Return the exception that ended the process, with the innermost line of its traceback in `directory`.
 
-        Return None if there is no such line.
+        Return None if no line of the traceback is in this directory.
         """
         if "Traceback (most recent call last)" not in self.stderr:
             return None
@@ -133,7 +133,7 @@ _GIT_LOCATION_VARIABLES = (
     "GIT_COMMON_DIR",
     "GIT_PREFIX",
 )
-"""Environment variables that a hook or `git bisect run` may have set. With them, git would use a different
+"""Environment variables that a hook or `git bisect run` may have set. With these variables, git would use a different
 repository.
 """
 

@@ -65,7 +65,7 @@ def sweep(
     - `what`: name of the tasks for a progress bar on standard error. None shows no bar.
 
     A HarnessError of `work` that means a wrong request or an unsuitable machine is raised here, because it would occur
-    in every task. Ctrl-C and SIGTERM raise KeyboardInterrupt. The end of the context ends all processes at once.
+    in every task. Ctrl-C and SIGTERM raise KeyboardInterrupt. The end of the context ends all processes immediately.
     """
     total = len(tasks) if isinstance(tasks, Sized) else None
     with sigterm_as_ctrl_c(), progress_bar(what, total) as count:
@@ -219,8 +219,8 @@ def sigterm_as_ctrl_c() -> Iterator[None]:
 def progress_bar(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]]:
     """Show a progress bar. Yield a function that counts the results passed to it.
 
-    It shows a bar on a terminal, and otherwise a line every few seconds. It draws without a thread, because forking a
-    process with threads is unsafe.
+    On a terminal it is a bar, and otherwise a line every few seconds. The function draws without a thread, because
+    forking a process with threads is unsafe.
     """
     if what is None:
         yield lambda outcome: outcome

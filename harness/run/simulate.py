@@ -53,10 +53,11 @@ def simulate(
     """Play a scenario in virtual time and check it in memory, without a run directory. Return the run.
 
     - `seed`: 0 or more. The same scenario and seed give the same run.
-    - `tracing`: record handler runs. Without them characteristic 1 cannot be judged, and 2 and 3 only at the end.
+    - `tracing`: record handler runs. Without handler runs, characteristic 1 cannot be judged, and characteristics 2 and
+      3 can be judged only at the end of the run.
     - `deliver_all`: also deliver messages that have no effect.
-    - `again`: give foreign agents their inputs a second time, and compare the answers. If the run is bad, this always
-      happens.
+    - `again`: give foreign agents their inputs a second time, and compare the answers. If the run has a bad verdict,
+      the comparison is always made.
 
     Raises ScenarioError if the scenario needs real processes, and HarnessError if an agent fails or behaves
     differently when it gets the same input again.
@@ -254,8 +255,8 @@ def choose_path(out: Path | None, name: str) -> Path:
 
 
 def write_new_file(path: Path, text: str) -> Path:
-    """Write a new file and return its path. If a file with this name exists by now, append a number to the name. Raises
-    MachineError.
+    """Write a new file and return its path. If a file with this name exists already, append a number to the name.
+    Raises MachineError.
     """
     free, number = path, 2
     while True:

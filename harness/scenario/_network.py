@@ -1,6 +1,6 @@
 """Describe the network of a scenario: loss, delay, partitions, and radio loss that depends on distance.
 
-The conditions have three layers: those of all links, those of single receivers, and those of single links. A layer
+The network conditions have three layers: the conditions of all links, of single receivers, and of single links. A layer
 replaces the keys that it contains. `netem.conditions` defines the values and their valid combinations. This module
 defines the notation of the values in a scenario. `NetworkModel` describes the network of the whole mission, and
 `NetworkLayer` a change of it.
@@ -148,8 +148,8 @@ VehicleIds = Annotated[
 
 
 class ConditionOverrides(StrictModel):
-    """Network conditions that replace those of an earlier or more general setting. A missing key keeps the value of
-    that setting.
+    """Network conditions that replace the conditions of an earlier or more general setting. If a key is missing, the
+    value of the earlier setting applies.
     """
 
     loss: Loss | None = None
@@ -163,7 +163,9 @@ class ConditionOverrides(StrictModel):
     required.
     """
     corrupt: Probability | None = None
-    """Probability that one bit of a message flips. The receiver drops such a message because of its checksum."""
+    """Probability that one bit of a message flips. The receiver drops a message with a flipped bit because of its
+    checksum.
+    """
     rate: Rate | None = None
     """Bits per mission second from each sender to each receiver, headers included, at least 8. With `none`, there is no
     limit.
@@ -246,7 +248,7 @@ class NetworkDisturbance(StrictModel):
     partition: list[list[VehicleId]] | None = None
     """Groups of vehicles. Messages between different groups are lost. Vehicles in no group form a further group."""
     network: NetworkLayer | None = None
-    """Other conditions of the network. Conditions that it does not contain do not change."""
+    """Other conditions of the network. Conditions that the key does not contain do not change."""
 
     @model_validator(mode="after")
     def _check_loss(self) -> "NetworkDisturbance":
@@ -281,7 +283,9 @@ class NetworkModel(StrictModel):
     reorder: Probability = 0.0
     """Probability that a message is sent without the delay, and so overtakes others. Above 0 it needs a `delay`."""
     corrupt: Probability = 0.0
-    """Probability that one bit of a message flips. The receiver drops such a message because of its checksum."""
+    """Probability that one bit of a message flips. The receiver drops a message with a flipped bit because of its
+    checksum.
+    """
     rate: Rate = "none"
     """Bits per mission second from each sender to each receiver, headers included, at least 8. With `none`, there is no
     limit.
@@ -297,7 +301,7 @@ class NetworkModel(StrictModel):
     radio: RadioModel | None = None
     """Additional loss that depends on the distance between two vehicles. Without it, distance has no effect."""
     channel: ChannelModel | None = None
-    """A radio channel that all vehicles share. Without it, all vehicles may send at the same time."""
+    """A radio channel that all vehicles share. Without a shared channel, all vehicles may send at the same time."""
 
     @model_validator(mode="after")
     def _check_values(self) -> "NetworkModel":
@@ -344,7 +348,7 @@ def _values_of(receivers: Mapping[int, ReceiverOverrides], links: Sequence[LinkO
 
 
 def overlay(network: NetworkValues, layer: NetworkValues) -> NetworkValues:
-    """Return the network conditions after the values in `layer` have replaced some of them."""
+    """Return the network conditions in which the values of `layer` have replaced the values of `network`."""
     return {scope: network.get(scope, {}) | layer.get(scope, {}) for scope in (*network, *layer)}
 
 

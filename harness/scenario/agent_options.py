@@ -178,7 +178,9 @@ MAX_DATA_CHARACTERS = 1400
 
 
 class ScriptedEvent(StrictModel):
-    """One event that an agent logs. Its data are a given number of zero bytes, or those of a recorded event."""
+    """One event that an agent logs. The data of the event are a given number of zero bytes, or the data of a recorded
+    event.
+    """
 
     at_s: MissionSecond
     """Mission second at which the agent logs the event."""
@@ -246,7 +248,7 @@ class RemoteOptions(StrictModel):
     secret_file: Annotated[str, Field(min_length=1, max_length=4000)]
     """File with the secret that the other computers also have. `ucp-harness join --new-secret FILE` makes one."""
     listen: Annotated[str, Field(max_length=300)] | None = None
-    """ADDRESS:PORT at which the harness waits for them. Default: the run needs the option `--listen`."""
+    """ADDRESS:PORT at which the harness waits for remote agents. Default: the run needs the option `--listen`."""
 
     @field_validator("listen")
     @classmethod

@@ -78,7 +78,7 @@ class _LastingInjection(_MatchingMessages):
 
 
 class Duplicate(_LastingInjection):
-    """The rogue node repeats each matching message at once."""
+    """The rogue node repeats each matching message immediately."""
 
     copies: Annotated[int, Field(ge=1, le=100)] = 1
     """Number of copies per message."""
@@ -102,7 +102,7 @@ class DelayedCopy(_LastingInjection):
 
 
 class CorruptedCopy(_LastingInjection):
-    """The rogue node repeats each matching message at once, with flipped bits and a valid UDP checksum."""
+    """The rogue node repeats each matching message immediately, with flipped bits and a valid UDP checksum."""
 
     bits: Annotated[int, Field(ge=1, le=1000)] = 1
     """Number of flipped bits per message."""

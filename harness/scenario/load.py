@@ -54,8 +54,8 @@ MAX_PROBLEM = 200
 """Maximum number of characters of a parser message that an error contains."""
 MAX_FILES_BESIDE = 1000
 MAX_SCENARIO_BYTES = 8 * 1024 * 1024
-"""Maximum size of a scenario file in bytes. The events of a flight of two hours with twenty vehicles take half of
-it.
+"""Maximum size of a scenario file in bytes. The events of a flight of two hours with twenty vehicles need half of this
+size.
 """
 
 

@@ -80,7 +80,9 @@ class NetworkStep:
     what: str
     keys: list[str]
     network: NetworkState
-    """The network after the change. It is valid only until the next step, which changes the same object."""
+    """The state of the network after the change. This object is valid only until the next step, which changes the same
+    object.
+    """
 
 
 def network_steps(

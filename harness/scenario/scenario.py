@@ -110,8 +110,8 @@ class Scenario(StrictModel):
     settings: Settings = Settings()
     """Timers and sizes of the agents, and their interpretations of ambiguous passages in the thesis."""
     stagger: Stagger = {}
-    """Timer -> mission seconds by which it is longer than the same timer of the agent with the next lower ID. The
-    mission file of each agent contains the agent's own durations.
+    """Timer -> mission seconds by which this timer is longer than the same timer of the agent with the next lower ID.
+    The mission file of each agent contains the agent's own durations.
     """
     security: SecurityOptions | None = None
     """Keys of a secured mission. Without this key, the mission is not secured, and agents accept every datagram."""
@@ -145,8 +145,9 @@ class Scenario(StrictModel):
     and its trace ends early when the share is used up. By default, the maximum is half of the free disk space.
     """
     gcs: Annotated[str, Field(max_length=300)] | None = None
-    """HOST:PORT of a ground station, usually 127.0.0.1:14550. It receives the telemetry of all vehicles by UDP, and may
-    command them."""
+    """HOST:PORT of a ground station, usually 127.0.0.1:14550. The ground station receives the telemetry of all vehicles
+    by UDP, and may command the vehicles.
+    """
     expect: Expect | None = None
     """Expected results. pytest collects a scenario file with this key as tests."""
 

@@ -66,7 +66,7 @@ class _TimelineEntryBase(NetworkDisturbance):
     replay: Replay | None = None
     """The rogue node repeats messages that it received before."""
     duplicate: Duplicate | None = None
-    """The rogue node repeats each message at once."""
+    """The rogue node repeats each matching message immediately."""
     delay: DelayedCopy | None = None
     """The rogue node repeats each message later."""
     corrupt: CorruptedCopy | None = None

@@ -124,7 +124,7 @@ class EachVehicle(StrictModel):
     frame: Frame | None = None
     """Frame that ArduPilot simulates. Default: the frame of all vehicles."""
     parameters: Parameters = {}
-    """ArduPilot parameters, in addition to those of all vehicles."""
+    """ArduPilot parameters, in addition to the parameters of all vehicles."""
     wind: Wind | None = None
     """Wind at this vehicle. Default: the wind of all vehicles."""
     home: Place | None = None
@@ -132,7 +132,7 @@ class EachVehicle(StrictModel):
     `vehicles.swarm`.
     """
     arguments: Arguments = []
-    """Arguments for ArduPilot, after those of all vehicles."""
+    """Arguments for ArduPilot, after the arguments of all vehicles."""
     debugger: Debugger | None = None
     """Debugger of this vehicle. Default: the debugger of all vehicles."""
 

@@ -39,10 +39,9 @@ class ChannelAccess(Protocol):
 
 
 class DutyCycle:
-    """The access rule of a station that sends at once, unless it has used up its duty cycle.
-
-    A frame of T seconds lets its station send again T / duty seconds after the beginning of this frame (ETSI EN 300
-    220, as LoRaWAN devices apply it).
+    """The access rule of a station that sends immediately, unless it has used up its duty cycle. // After a frame of T
+    seconds, its station may send again T / duty seconds after the beginning of this frame (ETSI EN 300 220, as LoRaWAN
+    devices apply it).
     """
 
     def __init__(self, count: int, radio: LoraRadio | TimeSlotRadio) -> None:
@@ -78,7 +77,7 @@ class DutyCycle:
 
 
 class TimeSlots(DutyCycle):
-    """The access rule of a station that sends only in its own time slot. A frame that does not fit into the rest of the
+    """The access rule of a station that sends only in its own time slot. A frame that is longer than the rest of the
     slot waits for the station's next slot.
     """
 

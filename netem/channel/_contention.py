@@ -1,8 +1,8 @@
 """Simulate carrier sense and the random waiting time (backoff) of IEEE 802.11 broadcasts (IEEE 802.11-2020, 10.3.4).
 
-A station with a frame sends at once if the channel has been idle for DIFS. If the channel is busy, the station draws a
-number of slots from 0 to the contention window. It begins to count after DIFS, counts down one slot whenever the
-channel was idle for the duration of a slot, and sends at 0. After a frame it draws again, even if no further frame
+A station with a frame sends immediately if the channel has been idle for DIFS. If the channel is busy, the station
+draws a number of slots from 0 to the contention window. It begins to count after DIFS, counts down one slot whenever
+the channel was idle for the duration of a slot, and sends at 0. After a frame it draws again, even if no further frame
 waits. A broadcast is never acknowledged, so the window never grows. After a frame with an error, a station waits for
 the longer interval EIFS instead of DIFS.
 
@@ -67,7 +67,7 @@ class CarrierSense:
         self.next_due = min(self.next_due, due)
 
     def begun(self, frames: list[RadioFrame], now: int) -> None:
-        """Make each station that senses these frames wait. A station with an earlier sending time sends
+        """Make each station that receives these frames wait. A station whose sending time is earlier than `now` sends
         nevertheless.
         """
         all_due, all_from, all_left, slot, notices = self._due, self._from, self._left, self._slot, now + self._sense

@@ -15,7 +15,7 @@ class FrameFate(StrEnum):
 
     RECEIVED = "received"
     COLLISION = "collision"
-    """Frames collided: the receiver sensed other frames at the same time, or it was receiving another one."""
+    """Frames collided: the receiver sensed other frames at the same time, or it was receiving another frame."""
     HALF_DUPLEX = "half_duplex"
     """The receiver was sending a frame itself at this time."""
     FADE = "fade"

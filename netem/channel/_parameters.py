@@ -1,8 +1,8 @@
 """Define the properties of radios: power, reception, the form of frames, and the rule for access to the channel.
 
-Each kind of radio is a class. Its fields are the keys of `network.channel` in a scenario, with the unit in the name.
-Times are seconds here. In this module times are seconds. The model of the channel counts whole nanoseconds, because it
-must recognise equal times: two stations collide if they start in the same slot.
+Each kind of radio is a class. Its fields are the keys of `network.channel` in a scenario, with the unit in the name. In
+this module times are seconds. The model of the channel counts whole nanoseconds, because it must recognise equal times:
+two stations collide if they start in the same slot.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class TimeSlotRadio(Radio):
 
 @dataclass(frozen=True, kw_only=True)
 class LoraRadio(Radio):
-    """A LoRa radio. It sends at once and without carrier sense, unless its duty cycle forbids it."""
+    """A LoRa radio. It sends immediately and without carrier sense, unless its duty cycle does not allow this."""
 
     spreading_factor: int
     bandwidth_hz: float

@@ -1,8 +1,9 @@
 """Deliberate errors (quirks) that an agent makes on request. They show which checks detect which errors.
 
 A quirk replaces a handler, or a helper that handlers use. An agent has quirks only if its mission, its scenario or the
-command `quirk` names them. The thesis's own mistakes are among them: `ignore_commit` (Section 4.2), and `crash_on_tie`,
-`early_phase3_expiry`, `stale_chain_hash`, `break_off_commit` and `wrong_topic` from its tests (Sections 4.2 and 4.3).
+command `quirk` names them. Some quirks repeat mistakes from the thesis: `ignore_commit` (Section 4.2), and
+`crash_on_tie`, `early_phase3_expiry`, `stale_chain_hash`, `break_off_commit` and `wrong_topic` from its tests (Sections
+4.2 and 4.3).
 """
 
 from collections.abc import Mapping
@@ -55,7 +56,7 @@ def check_quirk(name: str, value: object) -> None:
 
 
 def active_quirks(quirks: Mapping[str, bool | float]) -> dict[str, float]:
-    """Return the quirks that are switched on: those whose value is neither false nor 0."""
+    """Return the quirks that are switched on: the quirks whose value is neither false nor 0."""
     return {name: float(quirks[name]) for name in QUIRKS if quirks.get(name)} if quirks else {}
 
 

@@ -37,7 +37,7 @@ class PendingChallenges:
         self._due: set[int] = set()
         self._sent_at: dict[int, float] = {}
         self._pending: dict[int, int] = {}
-        """Target -> sequence number of the newest challenge to it."""
+        """Agent to which a challenge was sent -> sequence number of the newest challenge to this agent."""
         self._closed: dict[int, int] = {}
         """Sender -> sequence number from which on its echoes count."""
 

@@ -88,7 +88,9 @@ class EpochSecrets:
         return 0 <= later <= MAX_EPOCHS_AHEAD or (later == -1 and self._previous_secret is not None)
 
     def follow(self, epoch: int) -> None:
-        """Send in this epoch or in a later one. A vehicle with the group secret has already sent in it."""
+        """Send datagrams in this epoch or in a later one. Another vehicle with the group secret has already sent in
+        this epoch.
+        """
         self._followed = max(self._followed, min(epoch, self._bundle.epoch + MAX_EPOCHS_FOLLOWED))
 
     def _advance_to(self, epoch: int) -> None:
@@ -103,7 +105,9 @@ class EpochSecrets:
         self._save(self._bundle)
 
     def is_near(self, epoch: int) -> bool:
-        """Return whether the epoch is the clock's, the one in which this vehicle sends, or next to one of them."""
+        """Return true if the epoch is the clock's epoch, the epoch in which this vehicle sends, or next to one of these
+        two.
+        """
         return abs(epoch - self._bundle.epoch) <= 1 or abs(epoch - self.current) <= 1
 
     def cached_keys(self, epoch: int, sender: int, boot: bytes) -> SenderKeys | None:

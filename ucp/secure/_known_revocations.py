@@ -12,8 +12,8 @@ from ucp.secure.revocation import Revocation, RevocationError, listed_agents, re
 
 
 class KnownRevocations:
-    """The revocations that an agent keeps, all signed by the authority. Each of them lists an agent that no other one
-    lists.
+    """The revocations that an agent keeps, all signed by the authority. Each of these revocations lists an agent that
+    no other revocation lists.
     """
 
     def __init__(self, authority: bytes, mission: bytes) -> None:

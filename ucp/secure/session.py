@@ -110,7 +110,7 @@ class Session:
         before the start.
         """
         self._held: dict[int, _SenderIncarnation] = {}
-        """Senders that have answered a challenge. This vehicle does not trust them yet."""
+        """The boots of senders that have answered a challenge but that this vehicle does not trust yet."""
         self._challenged_by = {agent_id: ReceivedChallenges() for agent_id in self.public_keys}
         self._echoes: list[AnsweredRequest] = []
         """The challenges that this vehicle still has to answer."""
@@ -256,7 +256,9 @@ class Session:
         return decrypted(self._keys_of(clear, now), datagram, clear)
 
     def _accept_boot(self, clear: ClearHeader) -> _SenderIncarnation:
-        """Accept the sender's boot, which is later than all known ones. Echoes of older challenges no longer count."""
+        """Accept the boot of the sender, which is later than all boots of this sender that the vehicle knows. Echoes of
+        older challenges no longer count.
+        """
         self.challenges.close(clear.sender, self._control)
         incarnation = self._incarnations[clear.sender] = _SenderIncarnation(clear.boot)
         return incarnation
@@ -264,8 +266,8 @@ class Session:
     def receive_challenge(self, datagram: bytes, clear: ClearHeader, now: float) -> None:
         """Schedule an echo that answers a challenge. Raises MalformedDatagramError.
 
-        A challenge that is not newer than all known ones of its boot may be a replay. Its sender does not wait for an
-        answer.
+        A challenge that is not newer than all known challenges of its boot may be a replay. The sender of a replayed
+        challenge does not wait for an answer.
         """
         if not self.epochs.can_open(clear.epoch):
             raise MalformedDatagramError("epoch out of range")
@@ -313,7 +315,8 @@ class Session:
             self._held.clear()
 
     def _keys_of(self, clear: ClearHeader, now: float) -> SenderKeys:
-        """Return the keys that seal the datagram with this header. Raises MalformedDatagramError without a token.
+        """Return the keys that seal the datagram with this header. Raises MalformedDatagramError if the budget for
+        unknown boots has no token left.
 
         The keys of an accepted boot in the present epochs need no token. They are kept, so that an attacker cannot make
         the receiver derive them again.
@@ -361,8 +364,8 @@ class Session:
         """Return true if a response of type `code` to this request counts. It does not count if a newer request of the
         same type and sender is known.
 
-        If this vehicle sent the request, it must be its newest. A request of another vehicle need not have been
-        received.
+        If this vehicle sent the request, it must be the newest request of this vehicle. If another vehicle sent the
+        request, this vehicle need not have received it.
         """
         request_type = REQUEST_OF[code]
         if request.sender == self.agent_id:

@@ -150,7 +150,7 @@ class TelemetryEvents:
     def _status_text(self, message: Any, events: list[tuple[int, bytes]]) -> None:
         """Collect the parts of a text message. MAVLink 2 sends long texts in parts of 50 characters with the same ID.
 
-        A part with fewer characters is the last one.
+        A part with fewer than 50 characters is the last part of the text.
         """
         key = (message.id, message.severity)
         if self._text and (key != self._text_key or message.chunk_seq == 0):

@@ -1,9 +1,9 @@
 """The web server of the live page. It listens on 127.0.0.1 only, and requires the secret token in the page's address.
 
 The server lists the files that it serves at its start, so no address can reach another file. The
-Content-Security-Policy lets browsers load from this server only. Three checks reject other pages in the same browser.
-They do not know the token. The header Origin reveals their origin. And the header Host reveals a foreign host name that
-resolves to 127.0.0.1.
+Content-Security-Policy lets browsers load from this server only. Three checks reject requests from other pages in the
+same browser: other pages do not know the token, the header Origin shows their origin, and the header Host shows a
+foreign host name that resolves to 127.0.0.1.
 """
 
 import asyncio

@@ -125,7 +125,9 @@ class LivePage:
                 self._last_lines.append(line.strip())
 
     def _send(self, what: list[Any]) -> None:
-        """Queue a line for the web server, and return at once. A failed or hung server must not affect the run."""
+        """Queue a line for the web server, and return without waiting. A failed or hung server must not affect the
+        run.
+        """
         with suppress(queue.Full):
             self._outgoing.put_nowait(what)
 

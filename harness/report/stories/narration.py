@@ -23,8 +23,7 @@ from ucp.trigger import LocalTrigger, MessageTrigger, TimerTrigger
 
 INSTANT_S = 1.5
 """Maximum number of mission seconds between a cause and an effect that belong to the same instant. A timer with this
-lateness still counts as punctual. On a slow machine, timers are later in mission seconds the faster the mission is
-played.
+lateness still counts as punctual. On a slow machine, the lateness of timers in mission seconds grows with the speedup.
 """
 
 
@@ -37,7 +36,7 @@ class AgentReaction:
     """Index of the first handler run in the agent's trace."""
     runs: list[HandlerRun]
     cause: "AgentReaction | None" = None
-    """The action that sent the message that triggered this one. None if no message triggered it."""
+    """The action that sent the message by which this action was triggered. None if no message triggered this action."""
     receivers: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
     """Sequence number of a sent message -> the receivers of the message."""
     at_s: float = 0.0
@@ -223,7 +222,7 @@ def _set_cause(action: AgentReaction, sent: Mapping[tuple[int, int], Sequence[Ag
 
 
 def _actions(agent_id: int, trace: Trace) -> Iterator[AgentReaction]:
-    """Yield the actions in a trace. If a handler triggered another handler, both runs belong to the same action."""
+    """Yield the actions in a trace. If a handler run triggered another handler run, both belong to the same action."""
     action: AgentReaction | None = None
     for position, run in enumerate(trace.runs):
         if not has_possible_time(run):

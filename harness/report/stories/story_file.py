@@ -85,7 +85,7 @@ class Story:
 
 
 def is_story(path: Path) -> bool:
-    """Return true if the file is a story of this harness. Other tools use the same file name suffix."""
+    """Return true if the file is a story of this harness. Other tools use the file name suffix `.story` too."""
     try:
         lines = read_text(path, MAX_BYTES).splitlines()
         return any(_SENTENCE.fullmatch(line) for line in lines[:MAX_LINES])

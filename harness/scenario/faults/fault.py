@@ -75,8 +75,8 @@ class AgentOperations(Protocol):
 class Fault:
     """A fault of the agents `agents` at mission second `at_s`.
 
-    Further fields of a subclass are keys of its timeline entry. All of them are required. Their annotations declare the
-    allowed values. The class `Fault` itself represents an unknown fault, which has no effect.
+    Further fields of a subclass are keys of its timeline entry. All of these fields are required. The annotations of
+    the fields declare the allowed values. The class `Fault` itself represents an unknown fault, which has no effect.
     """
 
     at_s: float

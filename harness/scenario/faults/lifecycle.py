@@ -138,7 +138,7 @@ class Restart(Fault):
 
 
 class Resume(Fault):
-    """These paused agents continue, and receive the messages that waited for them."""
+    """These paused agents continue, and receive the messages that arrived during the pause."""
 
     what = "resume"
     states_before = (PAUSED,)

@@ -139,7 +139,9 @@ class RegainCompass(VehicleFault):
 
 
 class LoseGcs(VehicleFault):
-    """These vehicles receive nothing from their ground station, and it receives nothing from them."""
+    """These vehicles receive nothing from their ground station, and the ground station receives nothing from these
+    vehicles.
+    """
 
     what = "lose_gcs"
     mark = FALLING

@@ -1,9 +1,10 @@
 """Record the random parts of a run: the events that agents logged, and the messages that were lost.
 
 A scenario that contains these parts as a script plays the same run again. This works because the latencies of each
-sender come from a separate random stream, and a latency is drawn for every broadcast, even for a lost one. It does not
-work for networks that duplicate messages. There the network also draws a latency for the second copy, but a scripted
-fate drops either all copies or none. `_smaller.shrink` therefore checks that a recording reproduces the violation.
+sender come from a separate random stream, and a latency is drawn for every broadcast, even for a lost one. The method
+does not work for networks that duplicate messages. These networks also draw a latency for the second copy, but a
+scripted fate drops either all copies or none. `_smaller.shrink` therefore checks that a recording reproduces the
+violation.
 """
 
 from collections import Counter

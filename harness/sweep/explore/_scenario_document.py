@@ -161,9 +161,7 @@ def keep_agents(document: Document, kept: Collection[int]) -> Document:
 
 
 def _network(network: Document, kept: Collection[int]) -> Document:
-    """Return the network section with the conditions of only those receivers and links that are among the kept
-    agents.
-    """
+    """Return the network section that contains only the conditions of receivers and links among the kept agents."""
     receivers = {name: value for name, value in network.get("receivers", {}).items() if int(name) in kept}
     links = [_filter_lists(link, ("from", "to"), kept) for link in network.get("links", [])]
     network = with_key(network, "receivers", receivers)

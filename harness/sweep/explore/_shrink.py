@@ -110,9 +110,8 @@ class Shrinker:
 
 
 def _leaving_out(items: Sequence[T], parts: int) -> Iterator[list[T]]:
-    """Divide `items` into `parts` parts. For each part, yield all items outside it.
-
-    The last part comes first, because fewer other items depend on later ones.
+    """Divide `items` into `parts` parts. For each part, yield all items outside this part. // The last part comes
+    first, because fewer items depend on later items.
     """
     bounds = [len(items) * part // parts for part in range(parts + 1)]
     for part in reversed(range(parts)):

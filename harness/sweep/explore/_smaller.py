@@ -118,7 +118,9 @@ def _fewer_agents(shrinker: Shrinker) -> None:
 
 
 def _two_agents_fewer(shrinker: Shrinker, delay: Any) -> bool:
-    """Remove two agents at once, because an even number of voters may have to stay even. Return true on success."""
+    """Remove two agents in one step, because the violation may need an even number of voters. Return true on
+    success.
+    """
     base = with_key(shrinker.best, "network.delay", delay)
     agents = set(base["agents"])
     if len(agents) > MAX_PAIRED:

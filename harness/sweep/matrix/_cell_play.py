@@ -109,7 +109,7 @@ class RunPlayer:
     def refuse(self, points: Iterable[MatrixPoint]) -> None:
         """Before the first run, check that all combinations of values can be played.
 
-        Raises HarnessError if a backend or this machine cannot play one of them.
+        Raises HarnessError if a backend or this machine cannot play a combination.
         """
         for point in points:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))

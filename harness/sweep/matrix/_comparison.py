@@ -62,7 +62,7 @@ class CulpritCommit(BaseModel):
 class Culprit(CellRecord):
     """The commits that made a numeric result worse, in the run with this seed. The oldest commit is first.
 
-    `problem` is the reason why the search did not find all of them, or null.
+    `problem` is the reason why the search did not find all of these commits, or null.
     """
 
     metric: str

@@ -1,5 +1,5 @@
 """Find the commits that made a numeric result worse. The search plays one run with the code of commits between the
-earlier night and this one.
+earlier night and this night.
 
 A run in virtual time is always the same, so one run is enough: the run whose result changed most. A binary search finds
 the first commit with a different result. If this result is not the final one yet, the search continues after this
@@ -70,7 +70,7 @@ def _worst_seed(tonight: MatrixRecord, baseline: MatrixRecord, change: Change) -
 
 
 class _CulpritSearch:
-    """A search for the commits that changed one run. It appends them to the commits of `culprit`."""
+    """A search for the commits that changed one run. The search appends these commits to the commits of `culprit`."""
 
     def __init__(
         self,

@@ -57,7 +57,7 @@ ALSO_OVER_BLOCKS = ("messages", "bytes")
 
 @dataclass(frozen=True, slots=True)
 class ChartLineKey:
-    """The values that are the same along a line of a chart. The value that varies along the line is None."""
+    """The values that are the same along one line of a chart. The value that varies along the line is None."""
 
     backend: BackendName
     loss: float

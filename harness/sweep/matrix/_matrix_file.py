@@ -50,7 +50,7 @@ class Matrix(StrictModel):
     given, replace the scenario's keys of the same name. The scenario must not set a key that is replaced, because the
     two values could differ. All other parts of the scenario, such as its timeline, apply to every cell. Every cell has
     the same seeds, so the same blocks are built at the same times at every loss (common random numbers). A difference
-    between two such cells is therefore an effect of the loss.
+    between two cells that differ only in their loss is therefore an effect of the loss.
     """
 
     name: Annotated[str, Field(min_length=1, max_length=200)]

@@ -35,7 +35,8 @@ class HandlerStep(NamedTuple):
 class FirstChange(BaseModel):
     """The first handler run at which the run with this seed differs from the same run of the earlier night.
 
-    `handler` is null if the fingerprint does not include this handler run, or if the new run ended before it.
+    `handler` is null if the fingerprint of the run does not include this handler run, or if the new run ended before
+    this handler run.
     """
 
     seed: int

@@ -20,8 +20,8 @@ _TYPES = {
 def matrix_frame(finished: Finished) -> pl.DataFrame:
     """Return a table with one row for each run of a matrix. The columns of the table are those of `runs.csv`.
 
-    - `loss` (0 to 1), `agents`, `backend` and `seed` identify the run. So does `duration_s` if the matrix has several
-      mission lengths.
+    - `loss` (0 to 1), `agents`, `backend` and `seed` identify the run. `duration_s` also identifies the run if the
+      matrix has several mission lengths.
 
     - The numeric results of run.json follow, such as `mutual_chain`, `distinct_chains` and `messages`. Unknown figures
       are null.

@@ -96,8 +96,8 @@ def _cell_row(cell: Cell) -> dict[str, object]:
 
 
 def _place(point: MatrixPoint) -> dict[str, object]:
-    """Return the table columns that name a combination of values. If all runs have the same mission length, it has no
-    column.
+    """Return the table columns that name a combination of values. If all runs have the same mission length, the mission
+    length has no column.
     """
     return {axis: value for axis, value in point._asdict().items() if value is not None}
 

@@ -51,7 +51,9 @@ class MatrixRecord(BaseModel):
     """Runs in which an agent did not support a required feature."""
     against: Comparison | None = None
     results: list[Run] = []
-    """The judged runs in virtual time. A later night can compare its runs with these, in pairs with the same seed."""
+    """The judged runs in virtual time. A later night can compare its runs with these runs, in pairs with the same
+    seed.
+    """
     tried: MatrixCoverage | None = None
     """The share of the protocol that the runs covered, if requested."""
     growths: list[Growth] = []

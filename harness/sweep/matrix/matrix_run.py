@@ -78,14 +78,15 @@ def run_matrix(
     """Play every run of a matrix, and summarise the runs for each combination of values.
 
     - `out`: the directory of `results.jsonl`. It is new or empty, or contains earlier results of the same matrix. Runs
-      with a result are not played again. Without it, a new directory under `runs/`.
-    - `spread`: the function that distributes runs. Without it, the runs use all cores of this machine.
-    - `judge`: the function that plays and checks one run in virtual time. Without it, the simulation is used.
-    - `budget_s`: no run begins after this time. The most uncertain cells come first. Without it, all runs are played.
+      with a result are not played again. By default, a new directory under `runs/`.
+    - `spread`: the function that distributes runs. By default, the runs use all cores of this machine.
+    - `judge`: the function that plays and checks one run in virtual time. By default, the simulation is used.
+    - `budget_s`: no run begins after this time. The most uncertain cells come first. By default, all runs are played.
     - `elsewhere`: if true, the runs are played on other machines, and each of these checks that it can play them.
     - `covers`: if true, also measure the share of the protocol's states that the runs reach. This takes longer.
 
-    Ctrl-C ends the matrix early, with the runs that have ended. Raises HarnessError if it cannot be played.
+    Ctrl-C ends the matrix early, with the results of the runs that have ended. Raises HarnessError if the matrix cannot
+    be played.
     """
     with opened((out or default_path(matrix.name)).absolute(), matrix) as results:
         judge = judge or partial(simulated, tracing=matrix.traces)

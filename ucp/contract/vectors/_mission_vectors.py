@@ -333,7 +333,7 @@ def asks_after_commit() -> RecordedMission:
 
 def answer_spread() -> RecordedMission:
     """The mission uses the setting `answer_spread_s`. Each answer waits for its own time. All other messages are sent
-    at once.
+    immediately.
     """
     story = RecordedMission(answer_spread_s=2.0)
     block = others_block(A, 1, at_s=1)

@@ -1,4 +1,4 @@
-"""Test vectors for dropped datagrams: datagrams that an agent must drop, and similar ones that it must handle."""
+"""Test vectors for dropped datagrams: datagrams that an agent must drop, and similar datagrams that it must handle."""
 
 from collections.abc import Iterator
 

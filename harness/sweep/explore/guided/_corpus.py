@@ -2,7 +2,7 @@
 
 corpus.json    the scenario of the corpus
 runs/          a scenario for each kept run; its file name ends with the seed
-findings.json  the findings, with the first and last night that showed each
+findings.json  the findings, with the first and last night in which each was found
 findings/      the smallest scenario of each finding
 nights/        the results of each night, as JSON
 report.html    the last night
@@ -58,7 +58,9 @@ CHANGED = frozenset(
         "name",
     )
 )
-"""Scenario keys in which a stored run may differ from the scenario of the corpus. None of them affects this machine."""
+"""Scenario keys in which a stored run may differ from the scenario of the corpus. None of these keys affects this
+machine.
+"""
 LONGEST_S = 3600.0
 _NAME = re.compile(r"[0-9a-f]{12}-seed-(\d{1,10})\.yaml")
 Text = Annotated[str, Field(max_length=500)]

@@ -30,8 +30,8 @@ from harness.sweep.explore.guided._hunt_trial import (
 from harness.sweep.explore.guided._mutation import MutationLimits, mutate
 
 BITS = 1 << 28
-"""Size of the bit field in bits (32 MiB). With ten million numbers in it, about one new number in 30 is mistaken for a
-known one.
+"""Size of the bit field in bits (32 MiB). If the field stores ten million numbers, about one new number in 30 is
+mistaken for a known number.
 """
 
 
@@ -68,8 +68,8 @@ SEEDS = 1 << 16
 
 
 class CandidateRun(NamedTuple):
-    """A scenario document to play with a seed. Each run of it gets an additional phase at its end, so that the swarm
-    can become idle.
+    """A scenario document to play with a seed. Each run of the document gets an additional phase at its end, so that
+    the swarm can become idle.
     """
 
     document: Document
@@ -150,7 +150,7 @@ class Hunt:
     """Number of runs without a bad result in which the swarm only needed more time."""
     failures: int = 0
     failed: list[tuple[CandidateRun, str]] = field(default_factory=list)
-    """The first runs without a verdict, each with the reason. `failures` counts all such runs."""
+    """The first runs without a verdict, each with the reason. `failures` counts all runs without a verdict."""
     _dropped: list[CandidateRun] = field(default_factory=list)
     _known_divergences: set[Divergence] = field(default_factory=set)
     """Known differences between the chains of an idle swarm. The first run with each difference is played again with a
@@ -250,8 +250,8 @@ class Hunt:
         return CandidateRun(document, kept.candidate.seed if rng.random() < 0.8 else rng.randrange(SEEDS))
 
     def _pick(self, worth: Sequence[float]) -> KeptRun:
-        """Choose a stored document. Half of the choices are among the newest documents, and the others prefer a high
-        expected benefit.
+        """Choose a stored document. Half of the choices are among the newest documents, and the other choices prefer
+        documents with a high expected benefit.
 
         `worth` contains cumulative sums of the expected benefits.
         """

@@ -64,7 +64,7 @@ def timers_ended(evidence: Evidence) -> list[TimerEnd]:
 
 def failed_votes(timer_ends: Iterable[TimerEnd]) -> TimerPatterns:
     """Return the longest sequence of timer expiries without an approved vote, divided by agent. The result is empty if
-    fewer than two votes failed in it.
+    fewer than two votes failed in this sequence.
     """
     longest: Sequence[TimerEnd] = ()
     for approved, stretch in groupby(timer_ends, lambda each: (each.handler, each.branch) == APPROVED):

@@ -333,8 +333,8 @@ def _change_agents(document: Document, roster: Sequence[int], rng: Random) -> Do
 
 
 def _splice(document: Document, other: Document, rng: Random) -> Document:
-    """Replace randomly chosen parts of a document by those of another document: delivery rules, timeline, lateness,
-    network, clocks, settings or events.
+    """Replace randomly chosen parts of a document by the same parts of another document: delivery rules, timeline,
+    lateness, network, clocks, settings or events.
     """
     if document["agents"] != other["agents"]:
         return document

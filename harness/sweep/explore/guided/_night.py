@@ -1,6 +1,6 @@
 """Spend a night on the search: play known findings again, then continue from the stored runs until the time is over.
 
-New coverage and findings are written at once, so an interruption loses only the runs in progress.
+New coverage and findings are written immediately, so an interruption loses only the runs in progress.
 """
 
 import resource
@@ -225,7 +225,7 @@ class _NightRun:
     def _hunt(self, initial: list[CandidateRun]) -> None:
         """Continue the search from the runs in the corpus.
 
-        If there was time to play all of them, runs that reach no new states any more are removed.
+        If there was time to play all runs of the corpus, runs that reach no new states any more are removed.
         """
         hunt, before = self._night.hunt, self._corpus.runs()
         kept = set(map(id, self._kept_runs(hunt.begin([*initial, *before], self._jobs))))
@@ -246,7 +246,7 @@ class _NightRun:
         return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
 
     def _kept_runs(self, runs: Iterator[tuple[CandidateRun, bool]]) -> Iterator[CandidateRun]:
-        """Yield the runs to store. The method writes each of these runs and each new finding at once."""
+        """Yield the runs to store. The method writes each of these runs and each new finding immediately."""
         night, hunt = self._night, self._night.hunt
         for candidate, is_kept in runs:
             night.grow()

@@ -17,7 +17,7 @@ from harness.sweep.matrix.matrix_table import name_of
 from harness.sweep.matrix.report._heatmap import anchor
 
 MAX_ROWS = 12_000
-"""Maximum number of rows of all cells together. With it, the page stays below 3 MB."""
+"""Maximum number of rows of all cells together. With this limit, the page stays below 3 MB."""
 
 
 @dataclass(frozen=True, slots=True)

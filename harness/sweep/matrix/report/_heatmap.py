@@ -52,7 +52,8 @@ class HeatmapFigure:
 
 
 def known_figures(cells: Iterable[Cell]) -> list[HeatmapFigure]:
-    """Return the numeric results that are known for at least one run. Those from before the final reconcile come first.
+    """Return the numeric results that are known for at least one run. Results from before the final reconcile come
+    first.
 
     "violated" is always included.
     """

@@ -85,8 +85,8 @@ def to_html(finished: Finished, directory: Path, nights: StoredNights | None = N
 
 
 def _changed(record: MatrixRecord) -> Iterator[tuple[str, ChangedRuns, str]]:
-    """Yield an entry for each cell with changed runs: its name, these runs, and a command that compares one of them in
-    detail.
+    """Yield an entry for each cell with changed runs: its name, the changed runs, and a command that compares one of
+    these runs in detail.
     """
     against = record.against
     for changed in against.changed_runs if against else ():
