@@ -246,6 +246,12 @@ def keywords(cls: type[Any], value: Mapping[str, Any], at: str = "", required: t
 
 
 def _number(key: str, value: object, allowed: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+    if isinstance(value, bool) or not isinstance(value, int | float):
         raise ConditionsError(f"{key}: {value!r} is not a number; allowed is {allowed}")
-    return float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        raise ConditionsError(f"{key}: the number is too large; allowed is {allowed}") from None
+    if math.isnan(number):
+        raise ConditionsError(f"{key}: {value!r} is not a number; allowed is {allowed}")
+    return number
