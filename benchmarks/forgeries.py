@@ -182,6 +182,13 @@ def far_epochs(draw: Random) -> Iterator[bytes]:
         yield good[:14] + (EPOCH + 2 + draw.randrange(4000)).to_bytes(4, "big") + good[18:]
 
 
+def recorded_challenges(draw: Random) -> Iterator[bytes]:
+    """Yield a challenge to another agent again and again."""
+    two = session(2)
+    two.challenges.ask(3, NOW)
+    yield from cycle([*two.control_datagrams(0, NOW)])
+
+
 def unknown_boots(draw: Random) -> Iterator[bytes]:
     for good in cycle(pool(session(2), draw)):
         yield good[: CLEAR.size - 18] + make_boot(2_000_000, draw.randbytes(8)) + good[CLEAR.size - 2 :]
@@ -192,7 +199,7 @@ CLASSES: dict[str, Callable[[Random], Iterator[bytes]]] = {
     for made in (
         *(at_random, bits_flipped, truncated, another_sender, another_mission),
         *(an_old_epoch, unsigned, wrong_private_key, parts_swapped, lengths_that_lie),
-        *(forged_revocations, revocations_of_an_insider, far_epochs, unknown_boots),
+        *(forged_revocations, revocations_of_an_insider, far_epochs, unknown_boots, recorded_challenges),
     )
 }
 
