@@ -83,6 +83,8 @@ def damage_that_explains(
         return "two lines are in the wrong order"
     if (damage := _damage_to_events(before, line[1])) is not None:
         return damage
+    if _completes_unknown_block(before, deviation, line[1]):
+        return "a line is missing (its block may have an event that no line logs, and no record has the block)"
     if _has_impossible_top(before, deviation, line, following):
         return "the top chain hash on the line is damaged"
     if _is_malformed(line[1]):
@@ -214,9 +216,7 @@ def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
     try:
         earlier, last = decode_events(bytes(before.state.current_block)), event_of(run.input)
         events = Counter(decode_events(before.block(completed).event_data))
-    except NotOnRecordError:
-        return "a line is missing (its block may have an event that no line logs, and no record has the block)"
-    except MalformedEventsError:
+    except (NotOnRecordError, MalformedEventsError):
         return None
     for logged in (Counter([*earlier, last]), Counter(earlier)):  # a full block may lack the last event
         if logged < events:
@@ -227,6 +227,18 @@ def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
         ):
             return "one character of a line is damaged (its block has another event than the line logs)"
     return None
+
+
+def _completes_unknown_block(before: StepComparer, deviation: StepDeviation, run: HandlerRun) -> bool:
+    """Return true if a block is full earlier than with the logged events, and no record has the block."""
+    expected = deviation.expected
+    if deviation.run is not run or expected is None or run.handler != LOGS or expected.changes or not run.changes:
+        return False
+    try:
+        before.block(run.changes[0][1])
+    except NotOnRecordError:
+        return True
+    return False
 
 
 def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
