@@ -262,7 +262,7 @@ def test_trace_of_version_1_is_not_judged(honest: Evidence) -> None:
 
 
 def test_agent_with_a_setting_that_the_reference_lacks_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = [(name, object) for name in vars(Settings()) if name != "phase1_tie"]
+    known = [(name, object, value) for name, value in vars(Settings()).items() if name != "phase1_tie"]
     monkeypatch.setattr(trace_header, "ReferenceSettings", dataclasses.make_dataclass("Settings", known))
     assert judged(settings={"phase1_tie": "phase2"}).verdict == "as specified"
     judgement = judged(settings={"phase1_tie": "pop"})
