@@ -15,6 +15,7 @@ from harness.scenario import Scenario, faults
 from harness.scenario.agent_options import Stagger
 from harness.scenario.expect import Expect
 from harness.scenario.faults import DiskState
+from harness.scenario.strict_model import Lateness, VehicleKey
 from harness.scenario.verdict_names import FURTHER_CHECKS, CharacteristicVerdict, Verdict
 
 SCHEMA = "ucp-run/1"
@@ -512,6 +513,8 @@ class JudgedRecord(_RecordModel):
     mission_s: float | None = None
     stagger: Annotated[Stagger, Field(exclude=True)] = {}
     """The key `stagger` of the scenario: the differences between the timers of agents."""
+    lateness: Annotated[dict[VehicleKey, Lateness], Field(exclude=True)] = {}
+    """The key `lateness` of the scenario: agents with late timers in virtual time."""
     agents: dict[AgentKey, AgentRecord] = {}
     engine: str | None = None
     counters: Counters | None = None
@@ -607,9 +610,9 @@ class RunRecord(JudgedRecord):
     """A sentence for each file that the checker could not read completely."""
 
     @model_validator(mode="after")
-    def _copy_stagger_of_scenario(self) -> "RunRecord":
+    def _copy_timers_of_scenario(self) -> "RunRecord":
         if self.scenario is not None:
-            self.stagger = self.scenario.stagger
+            self.stagger, self.lateness = self.scenario.stagger, self.scenario.lateness
         return self
 
     @property

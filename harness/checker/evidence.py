@@ -34,6 +34,8 @@ from harness.play.rogue.rogue_line import OF_NO_INJECTION
 from harness.play.variant import VariantError, variant_in_use
 from harness.scenario import Scenario
 from harness.scenario.changes import NO_MORE_FATES
+from harness.scenario.faults.fault import SAME_TIME_S
+from harness.scenario.strict_model import parse_pairs
 from netem.conditions import NetworkConditions
 from netem.link import LinkConditions
 from ucp.block import HASH_BYTES
@@ -306,9 +308,12 @@ class Evidence:
 
     def was_delayed(self, agent_id: int, due_s: float, until_s: float) -> bool:
         """Return true if the agent could not run from one mission second until the other: it was paused in between, or
-        the measured lag explains this time.
+        the measured lag or a delay of the scenario explains this time.
         """
         if self.was_paused(agent_id, due_s, until_s):
+            return True
+        asked = self.record.lateness.get(agent_id, "") if self.record else ""
+        if until_s - due_s <= max((delay_s for _, delay_s in parse_pairs(asked)), default=0.0) + SAME_TIME_S:
             return True
         lag_s = self.lag.explains(agent_id, due_s, until_s) if self.lag else None
         speedup = self.traces[agent_id].header.clock.get("speedup")

@@ -171,6 +171,7 @@ class MemoryRecorder:
                 "channel": simulation.played.channel,
                 "mission_s": simulation.played.mission_s,
                 "stagger": simulation.scenario.stagger,
+                "lateness": simulation.scenario.lateness,
                 "agents": simulation.played.agents,
             }
         )

@@ -16,6 +16,7 @@ from harness.checker.evidence import Evidence
 from harness.checker.records.contradiction import in_virtual_time
 from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import RecordedTimerExpiry
+from harness.checker.steps.trace_header import ROUNDING_S
 
 SINGLE_WALL_S = 0.03
 """Seconds of wall time by which a single timer may be late without an explanation."""
@@ -46,10 +47,12 @@ class JudgedTimers:
         self, evidence: Evidence, trace: Trace, expiries: Sequence[RecordedTimerExpiry]
     ) -> Iterator[StepDeviation]:
         """Yield the expiries of an agent's timers that were later than the measured delays of the machine explain."""
-        speedup = trace.header.clock.get("speedup")
-        if in_virtual_time(trace) or not isinstance(speedup, int | float) or speedup <= 0:
+        agent_id, speedup = trace.header.agent_id, trace.header.clock.get("speedup")
+        if in_virtual_time(trace):
+            yield from _in_virtual_time(evidence, agent_id, expiries)
             return
-        agent_id = trace.header.agent_id
+        if not isinstance(speedup, int | float) or speedup <= 0:
+            return
         explained: dict[str, list[tuple[RecordedTimerExpiry, float]]] = defaultdict(list)
         for expiry in expiries:
             due_s = expiry.t - max(0.0, expiry.late_s)
@@ -61,6 +64,17 @@ class JudgedTimers:
                 explained[expiry.timer].append((expiry, lag_s * speedup))
         for timer, of_kind in explained.items():
             yield from _of_kind(agent_id, timer, of_kind, speedup)
+
+
+def _in_virtual_time(
+    evidence: Evidence, agent_id: int, expiries: Sequence[RecordedTimerExpiry]
+) -> Iterator[StepDeviation]:
+    """Yield each expiry that is later than the delays of the scenario explain. Virtual time has no lag."""
+    for expiry in expiries:
+        due_s = expiry.t - max(0.0, expiry.late_s)
+        if expiry.late_s > ROUNDING_S and not evidence.was_delayed(agent_id, due_s, expiry.t):
+            what = f"it ran {expiry.late_s:.3g} s after the {expiry.timer} timer expired, and virtual time has no lag"
+            yield StepDeviation(agent_id, expiry.line, expiry.t, expiry.handler, what)
 
 
 def _of_kind(

@@ -17,6 +17,7 @@ from harness.checker import check, gather
 from harness.checker.judgement import Judgement
 from harness.play.progress import SilentProgress
 from harness.run.run import Run, run
+from harness.run.simulate import simulate
 from tests.harness.mission import edit, edit_lines
 from tests.harness.virtual import scenario
 
@@ -79,6 +80,22 @@ def test_timer_later_than_the_measured_lag_is_a_deviation(late: Path, tmp_path: 
 @pytest.mark.parametrize("lag", [measured(0.6), measured(busy_s=0.6), measured(0.3, busy_s=0.3), measured(agents="")])
 def test_timer_that_the_lag_explains_is_no_deviation(late: Path, tmp_path: Path, lag: list[dict[str, Any]]) -> None:
     assert judged(late, tmp_path, lag=lag).verdict == "as specified"
+
+
+def test_late_timer_in_virtual_time_is_a_deviation(late: Path, tmp_path: Path) -> None:
+    shutil.copytree(late, tmp_path / "run")
+    for agent in "123":
+        edit_lines(tmp_path / f"run/agents/{agent}.trace.jsonl", lambda lines: lines[0]["clock"].update(epoch_us=0))
+    found = judged(late, tmp_path)
+    assert found.verdict == "deviates"
+    assert "it ran 0.5 s after the voting timer expired, and virtual time has no lag" in found.evidence[0].detail
+
+
+def test_timer_that_the_scenario_delays_is_no_deviation(tmp_path: Path) -> None:
+    asked = scenario(agents=3, duration_s=150, events=OFTEN, lateness={1: "0+0.5 3+2"})
+    result = run(asked, 1, tmp_path / "run", SilentProgress(), backend="sim").result
+    assert result.beside["steps"].verdict == "as specified", result.beside["steps"].evidence
+    assert simulate(asked, 1, tracing=True).result.beside["steps"].verdict == "as specified"
 
 
 def test_delay_of_seconds_that_the_lag_explains_is_no_deviation(late: Path, tmp_path: Path) -> None:
