@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from harness.play.child_processes import GRACE_S, RETRY_S
+from harness.play._child_processes import GRACE_S, RETRY_S
 from harness.play.containers.docker_engine import DockerEngine
 
 PROC = Path("/proc")

@@ -10,7 +10,7 @@ from typing import Any
 
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
-from harness.play.child_processes import passed_on
+from harness.play._child_processes import passed_on
 from harness.play.process._run_lab import LabProgram, MissionLab
 from harness.scenario.vehicles import Flight
 from netem.radio import Place

@@ -12,8 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol, Self
 
+from harness.play._child_processes import ChildProcesses
 from harness.play.agent_control import AgentControl, AgentSilentError, last_line_in
-from harness.play.child_processes import ChildProcesses
 from harness.play.process._run_lab import LabProgram
 
 START_LIMIT_S = 30.0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.play.child_processes import ChildProcesses
+from harness.play._child_processes import ChildProcesses
 from tests.harness.command import harness, write_scenario
 
 LEAVES_A_CHILD = f'setsid sleep 1000 </dev/null >/dev/null & exec {shlex.quote(sys.executable)} -P -m ucp.node "$0"'

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import IO
 
 from harness.archive.exports import MAX_EXPORT_BYTES
+from harness.play._child_processes import ChildProcesses
 from harness.play.agent_control import TAIL_BYTES, last_line, last_line_in
-from harness.play.child_processes import ChildProcesses
 from harness.play.simulation.foreign._answer import Outcome
 
 START_LIMIT_S = 30.0
