@@ -35,7 +35,7 @@ BEGINNING_OF_COUNT = {
     "reconcile_phase_2_timer_expiration": "reconcile_phase_2",
     "reconcile_phase_3_timer_expiration": "reconcile_phase_3",
 }
-"""Handler of a timer expiry -> the handler that began the count which decides the expiry."""
+"""Handler of a timer expiry -> the handler that began to count the answers on which this expiry depends."""
 
 _EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 _LEADING_EVENTS = {"Reconcile Begin", "Reconcile Phase 1"}

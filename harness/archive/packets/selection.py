@@ -82,7 +82,7 @@ def exchanges_about(
 
 
 def in_order(exchanges: Iterable[AnsweredMessage]) -> list[Transmission]:
-    """Return all messages in these exchanges in the order of sending, each once."""
+    """Return these messages and all answers to them in the order of sending, each message once."""
     by_number = {
         transmission.number: transmission
         for exchange in exchanges

@@ -239,7 +239,7 @@ def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterato
 
 
 def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer: bool) -> bool:
-    """Return true if this count is practically impossible in `number` random draws.
+    """Return true if `count` is practically impossible as the number of successes in `number` random draws.
 
     `means` contains the minimum and maximum of the mean of the draws. If `fewer` is true, the function tests whether
     the count is too low, and otherwise whether it is too high.

@@ -5,8 +5,8 @@ from ucp.secure.envelope import CONTROL_NAMES, NAMES, read_clear_header
 from ucp.secure.envelope import VERSION as SECURED
 
 OF_NO_INJECTION = -1
-"""Injection number of a datagram that belongs to no injection, because the scenario itself contains it
-(`harness.scenario.injection`).
+"""Number in the log for datagrams that belong to no injection of the rogue node, because the scenario contains the
+datagram itself (`harness.scenario.injection`).
 """
 
 

@@ -99,8 +99,8 @@ def not_taken(reached: ReachedStates) -> list[Branch]:
 
 
 def to_json(reached: ReachedStates, there: ExistingStates | None) -> dict[str, object]:
-    """Return the coverage as a JSON document. If `there` is given, the document also contains the shares of the
-    existing states and pairs.
+    """Return the coverage as a JSON document. If the existing states and pairs (`there`) are given, the document also
+    contains the share of them that the runs reached.
     """
     missing = not_taken(reached)
     document = {

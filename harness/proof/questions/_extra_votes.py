@@ -106,7 +106,8 @@ class ExtraVotes:
         return leads
 
     def _timers_lead(self, state: State, votes: int, tried: set[State], instants: int) -> bool:
-        """Search for a path to equal chains for each timer that may expire next. Return true if all were found.
+        """Search, for each timer that may expire next, for a path that leads to equal chains. Return true if the search
+        found a path for each of these timers.
 
         If timers may expire in any order, a path for one timer is enough.
         """

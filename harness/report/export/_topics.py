@@ -210,7 +210,9 @@ def _mavlink_schema(message: type[Any]) -> Schema:
 
 
 def _lengths(message: type[Any]) -> Iterable[int]:
-    """Return the number of elements of each field. The number is 0 for a field that is not an array."""
+    """Return the number of array elements of each field of a MAVLink message. The number is 0 for a field that is not
+    an array.
+    """
     in_order: Mapping[str, int] = dict(zip(message.ordered_fieldnames, message.array_lengths, strict=True))
     return [in_order[name] for name in message.fieldnames]
 

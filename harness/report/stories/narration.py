@@ -40,7 +40,7 @@ class AgentReaction:
     receivers: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
     """Sequence number of a sent message -> the receivers of the message."""
     at_s: float = 0.0
-    """Mission second at which the first cause would have happened if no timer had been late."""
+    """Mission second at which the first cause of this action would have happened if no timer had been late."""
     distance: int = 0
     """Number of messages between the first cause of the instant and this action."""
 
@@ -117,9 +117,11 @@ class StoryWriter:
             yield from (f"  {_listed(agents):<10}{line}" for line in lines)
 
     def _kind(self, action: AgentReaction) -> object:
-        """Return a key for an action. Actions of one agent with equal keys handle equal answers, and are merged.
+        """Return a key for an action. Actions of one agent with equal keys handle equal answers, and the story merges
+        them.
 
-        The reason is that the order of equal answers is random, and only the first one counts.
+        Equal answers arrive in random order, and only the first one counts, so separate actions would differ from run
+        to run.
         """
         run = action.runs[0]
         if action.cause is None or action.answer is None:
