@@ -190,12 +190,13 @@ def of_processes(directory: Path, **keys: Any) -> Path:
 def test_killed_worker_loses_no_run_of_processes(tmp_path: Path, dask: Cluster) -> None:
     """Each worker plays whole runs in its own directory, and their directories come back with the results."""
     address = dask.start_scheduler()
-    doomed, _ = (dask.start_worker(address, name) for name in ("one", "two"))
+    workers = {name: dask.start_worker(address, name) for name in ("one", "two")}
     asked, out = of_processes(tmp_path), tmp_path / "out"
     command = [*COMMAND, "matrix", str(asked), "--scheduler", address, "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        until(lambda: any(tmp_path.glob("dask/one/**/agents/*.trace.jsonl")))
-        doomed.kill()
+        until(lambda: any(tmp_path.glob("dask/*/**/agents/*.trace.jsonl")) or process.poll() is not None)
+        (begun, *_) = tmp_path.glob("dask/*/**/agents/*.trace.jsonl")
+        workers[begun.relative_to(tmp_path).parts[1]].kill()
         _, said = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, said
     assert all(line.endswith(" runs") for line in sentences(said)), "nothing but progress"
