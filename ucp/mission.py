@@ -108,7 +108,7 @@ def load_mission(path: Path) -> Mission:
 def parse_mission(document: Any) -> Mission:
     """Parse a mission. Raises MissionError, or UnsupportedMissionError if it needs a feature that this agent lacks."""
     if not isinstance(document, dict):
-        raise MissionError("not a mission: a JSON object is needed_features")
+        raise MissionError("not a mission: it must be a JSON object")
     if document.get("schema") != SCHEMA:
         raise MissionError(f"`schema` is {shown(document.get('schema'))}, and this agent reads {SCHEMA!r}")
     _check_features(document.get("features", []))
