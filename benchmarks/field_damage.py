@@ -1,6 +1,7 @@
 """Damage the records of correct agents in many ways, and count the commands' false accusations.
 
-    python -m benchmarks.field_damage [--simulated N] [--processes N] [--first NUMBER] [--only KIND]
+    python -m benchmarks.field_damage [--simulated N] [--processes N] [--containers N] [--first NUMBER]
+                                      [--only KIND]
 
 Each flight is damaged once in each way of `DAMAGES`. `reconstruct`, `replay`, `check` and `consolidate` then read the
 damaged files. The agents are right, so each accusation is false. The benchmark prints each accusation and each
@@ -282,9 +283,11 @@ def scenario(number: int, backend: BackendName, quirk: str | None = None) -> Sce
         document["settings"] = draw.choice(
             [{"vote_names_chain": True}, {"finalize_gap_s": 0}, {"max_block_bytes": 512}]
         )
-    if backend == "process":
+    if backend != "sim":
         document |= {"speedup": 20, "vehicles": {"kind": "none"}, "settle": {"limit_s": 300}}
-    if not capture or backend == "process":
+    if backend == "docker":
+        document["docker"] = {"image_from_host": True}  # no registry is needed
+    if not capture or backend != "sim":
         document["clocks"] = {
             agent: {"offset_s": draw.uniform(0, 100), "drift": draw.choice([1e-5, 1e-3, 1e-2]) * draw.uniform(-1, 1)}
             for agent in range(1, agents + 1)
@@ -435,6 +438,7 @@ def main() -> int:
     )
     parser.add_argument("--simulated", type=int, default=30, help="number of flights in virtual time")
     parser.add_argument("--processes", type=int, default=0, help="number of flights with processes")
+    parser.add_argument("--containers", type=int, default=0, help="number of flights in containers")
     parser.add_argument("--first", type=int, default=0, help="number of the first flight")
     parser.add_argument("--only", help="damage only in ways whose name contains this text")
     asked = parser.parse_args()
@@ -443,8 +447,10 @@ def main() -> int:
     with sweep(numbers, lambda number: fly(number, "sim", asked.only), JOBS, what="flights") as outcomes:
         for number, outcome in outcomes:
             _take_down(found, number, outcome)
-    for number in range(asked.first, asked.first + asked.processes):
-        _take_down(found, number, fly(number, "process", asked.only))
+    in_real_time: tuple[tuple[BackendName, int], ...] = (("process", asked.processes), ("docker", asked.containers))
+    for backend, flights in in_real_time:
+        for number in range(asked.first, asked.first + flights):
+            _take_down(found, number, fly(number, backend, asked.only))
     _show(found)
     return 1 if any(one.accusations or one.tracebacks for one in found) else 0
 

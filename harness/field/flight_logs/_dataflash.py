@@ -48,11 +48,19 @@ _FAILSAFES = {
     4: "battery failsafe",
     5: "ground station failsafe",
     6: "EKF failsafe",
+    7: "GPS glitch",
     10: "fence breached",
     11: "terrain failsafe",
+    17: "termination",
     19: "crash failsafe",
+    25: "failsafe",
+    29: "leak failsafe",
+    50: "dead reckoning failsafe",
+    51: "takeoff failsafe",
 }
-"""Number of ArduPilot's ModeReason -> description of the failsafe. Other reasons are no failsafes."""
+"""Number of ArduPilot's ModeReason (libraries/AP_Vehicle/ModeReason.h) -> description of the failsafe. A rover has the
+general reason 25 if it lost its radio or its ground station.
+"""
 _FIRMWARE = {"ArduPlane": 1, "ArduCopter": 2, "ArduRover": 10, "Rover": 10}
 """First word of the firmware's text -> type of the vehicle (MAV_TYPE)."""
 

@@ -117,10 +117,11 @@ def test_changes_of_gps_and_mode_are_in_time_order(tmp_path: Path) -> None:
     assert words == ["mode GUIDED", "armed", "mode LAND", "disarmed", "GPS without a fix", "GPS has a fix"]
 
 
-def test_failsafe_that_changed_the_mode_is_named(tmp_path: Path) -> None:
-    messages = [*flight_messages(seconds=5), dataflash("MODE", 12_000_000, 6, 6, 4)]
+@pytest.mark.parametrize(("reason", "name"), [(4, "battery failsafe"), (25, "failsafe")])
+def test_failsafe_that_changed_the_mode_is_named(reason: int, name: str, tmp_path: Path) -> None:
+    messages = [*flight_messages(seconds=5), dataflash("MODE", 12_000_000, 6, 6, reason)]
     words = [change.words for change in changes(matched(tmp_path / "1.bin", {7: []}, dataflash_file(messages)))]
-    assert words[-1] == "mode RTL, battery failsafe"
+    assert words[-1] == f"mode RTL, {name}"
 
 
 @pytest.fixture(scope="module")
