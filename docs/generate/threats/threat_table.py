@@ -38,7 +38,7 @@ def outcome(row: Row) -> Outcome:
             if judgement.verdict == "violated":
                 guilty[key].update({finding.agent_id for finding in judgement.evidence} or {SWARM})
         for agent in run.played.agents.values():
-            dropped.update(agent.get("dropped", {}))
+            dropped.update(agent.dropped or {})
     marks = {key: NONE if not agents else ITSELF if agents == {CAPTURED} else OTHERS for key, agents in guilty.items()}
     return Outcome(marks, [reason for reason, _ in dropped.most_common()])
 
