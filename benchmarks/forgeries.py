@@ -283,7 +283,7 @@ def replays(runs: int, loss: float) -> tuple[int, int, list[str]]:
         plain = simulate(request, seed, deliver_all=True)
         run = simulate_in_memory(MemoryRecorder(loss > 0), request, seed, deliver_all=True, air=ReplayingAir)
         same += run.result.chains == plain.result.chains
-        dropped += sum(agent["dropped"].get("replayed", 0) for agent in run.played.agents.values())
+        dropped += sum((agent.dropped or {}).get("replayed", 0) for agent in run.played.agents.values())
         bad += run.result.bad
     return same, dropped, bad
 

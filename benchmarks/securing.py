@@ -106,7 +106,7 @@ def per_mission(missions: int) -> None:
                     began = time.process_time()
                     run = simulate(request, seed, tracing=tracing)
                     seconds[which] += time.process_time() - began
-                    sent[which] += sum(agent["bytes_sent"] for agent in run.played.agents.values())
+                    sent[which] += sum(agent.bytes_sent or 0 for agent in run.played.agents.values())
         runs = len(LOSS) * missions
         milliseconds = [spent / runs * 1e3 for spent in seconds]
         say(
@@ -132,7 +132,7 @@ def matrix(seeds: int) -> None:
             simulated(keyed, seed)
             secured_s += time.process_time() - between
             plain_s += between - began
-        datagrams += sum(agent["messages_sent"] for agent in simulate(keyed, 1).played.agents.values())
+        datagrams += sum(agent.messages_sent or 0 for agent in simulate(keyed, 1).played.agents.values())
     runs = len(LOSS_OF_MATRIX) * seeds
     plain_ms, secured_ms, each = plain_s / runs * 1e3, secured_s / runs * 1e3, datagrams / len(LOSS_OF_MATRIX)
     key = Ed25519PrivateKey.generate()
