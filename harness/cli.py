@@ -85,92 +85,90 @@ COMMANDS = {
         "run", "harness.commands.join:join_command", "Let an agent on this computer take part in a run elsewhere."
     ),
     "runs": CommandEntry(
-        "past runs", "harness.commands.runs:runs_command", "List past runs with their verdicts, or open a report."
+        "look", "harness.commands.runs:runs_command", "List past runs with their verdicts, or open a report."
     ),
     "check": CommandEntry(
-        "past runs",
+        "look",
         "harness.commands.report:check_command",
         "Judge chain exports and traces by the six characteristics.",
     ),
-    "report": CommandEntry(
-        "past runs", "harness.commands.report:report_command", "Write the report files of a run again."
-    ),
+    "report": CommandEntry("look", "harness.commands.report:report_command", "Write the report files of a run again."),
     "watch": CommandEntry(
-        "past runs", "harness.commands.report:watch_command", "Show a recorded run as a film in the browser."
+        "look", "harness.commands.report:watch_command", "Show a recorded run as a film in the browser."
     ),
     "chain": CommandEntry(
-        "past runs",
+        "look",
         "harness.commands.chain:chain_command",
         "Print each agent's chain, or write its positions as a map.",
     ),
     "packets": CommandEntry(
-        "past runs",
+        "look",
         "harness.commands.packets:packets_command",
         "Print each captured datagram, its receivers and its answers.",
     ),
-    "diff": CommandEntry("past runs", "harness.commands.diff:diff_command", "Find where two runs first differ."),
+    "diff": CommandEntry("look", "harness.commands.diff:diff_command", "Find where two runs first differ."),
     "export": CommandEntry(
-        "past runs",
+        "look",
         "harness.commands.export:export_command",
         "Write a run for Foxglove, PlotJuggler, Perfetto or ROS 2.",
     ),
     "mission": CommandEntry(
-        "real flights", "harness.commands.mission:app", "Make the mission files of a swarm, and compare them."
+        "field", "harness.commands.mission:app", "Make the mission files of a swarm, and compare them."
     ),
     "keys": CommandEntry(
-        "real flights", "harness.commands.keys:app", "Make, distribute, inspect and revoke keys of a secure mission."
+        "field", "harness.commands.keys:app", "Make, distribute, inspect and revoke keys of a secure mission."
     ),
     "import": CommandEntry(
-        "real flights", "harness.commands.import_:import_command", "Convert records of any kind into one directory."
+        "field", "harness.commands.import_:import_command", "Convert records of any kind into one directory."
     ),
     "consolidate": CommandEntry(
-        "real flights",
+        "field",
         "harness.commands.consolidate:consolidate_command",
         "Merge the chains of all vehicles into one record.",
     ),
     "replay": CommandEntry(
-        "real flights", "harness.commands.replay:replay_command", "Feed an agent's trace to the reference, and compare."
+        "field", "harness.commands.replay:replay_command", "Feed an agent's trace to the reference, and compare."
     ),
     "reconstruct": CommandEntry(
-        "real flights",
+        "field",
         "harness.commands.reconstruct:reconstruct_command",
         "Make a scenario that reproduces a recorded flight.",
     ),
     "calibrate": CommandEntry(
-        "real flights",
+        "field",
         "harness.commands.calibrate:calibrate_command",
         "Fit the radio of a scenario to the records of a flight.",
     ),
     "matrix": CommandEntry(
-        "many runs",
+        "many",
         "harness.commands.matrix:matrix_command",
         "Play a scenario over loss rates, swarm sizes and many seeds.",
     ),
     "explore": CommandEntry(
-        "many runs",
+        "many",
         "harness.commands.explore:explore_command",
         "Play seeds until one violates a characteristic, and shrink it.",
     ),
     "bisect": CommandEntry(
-        "many runs", "harness.commands.bisect:app", "Find the commit that changes how a scenario or record plays."
+        "many", "harness.commands.bisect:app", "Find the commit that changes how a scenario or record plays."
     ),
     "prove": CommandEntry(
-        "proofs and tests",
+        "prove",
         "harness.commands.prove:prove_command",
         "Explore all states that a small swarm can reach within bounds.",
     ),
     "conformance": CommandEntry(
-        "proofs and tests",
+        "prove",
         "harness.commands.conformance:conformance_command",
         "Test one agent alone with thousands of generated cases.",
     ),
     "validate": CommandEntry(
-        "proofs and tests",
+        "prove",
         "harness.commands.coverage:validate_command",
         "Compare recorded runs with the TLA+ specification.",
     ),
     "coverage": CommandEntry(
-        "proofs and tests",
+        "prove",
         "harness.commands.coverage:coverage_command",
         "Report the share of all local states that runs reached.",
     ),

@@ -17,10 +17,10 @@ MARK = "<!-- commands -->"
 PROGRAM = "ucp-harness"
 GROUPS = {
     "run": "Play scenarios",
-    "past runs": "Examine runs",
-    "real flights": "Prepare missions and evaluate records",
-    "many runs": "Play many runs",
-    "proofs and tests": "Prove properties and test agents",
+    "look": "Examine runs",
+    "field": "Prepare missions and evaluate records",
+    "many": "Play many runs",
+    "prove": "Prove properties and test agents",
     "this machine": "Set up the machine",
 }
 """Name of a panel of `ucp-harness --help` -> heading on the page."""

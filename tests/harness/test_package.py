@@ -138,6 +138,7 @@ WORKING = [
     "prove --agents 2 --blocks 1",
     "conformance --only 1",
     "coverage run --json extra",
+    "join --new-secret lab.key",
     "doctor --help",
     "sitl path",
     "clean",

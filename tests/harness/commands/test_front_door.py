@@ -63,7 +63,7 @@ def panels(*command: str) -> dict[str, str]:
 
 def test_each_command_has_one_line_in_one_panel() -> None:
     shown = panels()
-    assert [*shown] == ["Options", "run", "past runs", "real flights", "many runs", "proofs and tests", "this machine"]
+    assert [*shown] == ["Options", "run", "look", "field", "many", "prove", "this machine"]
     listed = {title: re.findall(r"^│ (\S.*?) +│$", text, re.MULTILINE) for title, text in shown.items()}
     del listed["Options"]
     for name, (panel, _, summary) in COMMANDS.items():
