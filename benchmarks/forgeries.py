@@ -57,12 +57,21 @@ def session(agent_id: int, keys: KeySet = KEYS, now: float = NOW) -> Session:
 
 
 def listener() -> SecuredAgent:
-    """Return agent 1, which has received one datagram from each other agent."""
+    """Return agent 1, which has received one datagram from each other agent, and a challenge to agent 3."""
     agent = SecuredAgent(session(1), 1, ROSTER, b"test", tracing=False)
     for other in ROSTER[1:]:
         agent.receive_datagram(session(other).seal(0, messages(Random(0))[0], None, None, 0), NOW)
+    agent.receive_datagram(challenge_to_another(), NOW)
     agent.datagrams_to_send()
     return agent
+
+
+def challenge_to_another() -> bytes:
+    """Return a challenge of agent 2 to agent 3."""
+    two = session(2)
+    two.challenges.ask(3, NOW)
+    (challenge,) = two.control_datagrams(0, NOW)
+    return challenge
 
 
 def messages(draw: Random) -> list[Message]:
@@ -183,10 +192,8 @@ def far_epochs(draw: Random) -> Iterator[bytes]:
 
 
 def recorded_challenges(draw: Random) -> Iterator[bytes]:
-    """Yield a challenge to another agent again and again."""
-    two = session(2)
-    two.challenges.ask(3, NOW)
-    yield from cycle([*two.control_datagrams(0, NOW)])
+    """Yield the challenge that the listener has received."""
+    yield from cycle([challenge_to_another()])
 
 
 def unknown_boots(draw: Random) -> Iterator[bytes]:
