@@ -12,7 +12,6 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from harness import compiled
 from harness.errors import MachineError
 from netem import lab_doctor, uml
 from netem.errors import NetemError, UmlError
@@ -54,8 +53,7 @@ def examine() -> list[MachineRequirement]:
         )
         for requirement in lab_doctor.examine()
     ]
-    modules = MachineRequirement("Modules", True, False, compiled.in_use)
-    return [python, modules, *lab, _user_mode_linux(), _docker(), _ardupilot()]
+    return [python, *lab, _user_mode_linux(), _docker(), _ardupilot()]
 
 
 def _user_mode_linux() -> MachineRequirement:

@@ -189,8 +189,7 @@ class Simulation(EventLoop):
                 return agent_id
         self._sought, self._found = sought, None
         await self.until(mission_s)
-        found: int | None = self._found
-        self._sought = self._found = None
+        found, self._sought, self._found = self._found, None, None
         return found
 
     async def hold(self, fate: Fate) -> int:

@@ -4,12 +4,15 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from harness.play.memory_directory import memory_directory, remove_abandoned
+from tests.harness.command import DEADLINE_S
 
 PREFIX = f"ucp-test-{os.getpid()}-"
 PROGRAM = """
@@ -36,13 +39,13 @@ def killed() -> Iterator[Path]:
 
 
 def guard_of(directory: Path) -> int:
-    """Return the process ID of the guard of a directory."""
-    for entry in Path("/proc").glob("[0-9]*"):
-        try:
-            if (entry / "cmdline").read_bytes().endswith(b"guard\0" + bytes(directory) + b"\0"):
-                return int(entry.name)
-        except OSError:  # the process ended meanwhile
-            continue
+    """Return the process ID of the guard of a directory. Its arguments are visible shortly after its start."""
+    deadline = time.monotonic() + DEADLINE_S
+    while time.monotonic() < deadline:
+        for entry in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # the process ended meanwhile
+                if (entry / "cmdline").read_bytes().endswith(b"guard\0" + bytes(directory) + b"\0"):
+                    return int(entry.name)
     raise AssertionError("no process guards the directory")
 
 
