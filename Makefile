@@ -15,7 +15,7 @@ TARGETS ?=
 ESSENTIAL := tests/ucp tests/harness/archive tests/harness/checker tests/harness/run tests/harness/scenario \
   tests/harness/test_api.py tests/harness/test_rooms.py tests/harness/test_schemas.py tests/test_prose.py
 
-.PHONY: run check test test-netem test-ros fuzz docs lint setup clean
+.PHONY: run check test test-netem test-ros fuzz compiled docs lint setup clean
 
 run: setup
 	$(BIN)/ucp-harness run $(SCENARIO)
@@ -45,6 +45,11 @@ fuzz: setup
 	$(BIN)/python -c 'import atheris' 2>/dev/null || $(BIN)/pip install -q -e '.[fuzz]'
 	$(BIN)/python -m tests.fuzz --seconds $(FUZZ_SECONDS) $(TARGETS)
 
+# Compiled modules for this clone: docs/how-to/compile-the-harness.md.
+compiled: setup
+	$(BIN)/pip install -q 'mypy[mypyc]>=2.4' 'setuptools>=65'
+	$(BIN)/python -m docs.generate.compiled_modules
+
 # The documentation as a site, in site/index.html.
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
@@ -73,4 +78,4 @@ $(VENV)/installed: pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .ros .fuzz .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf harness/compiled_modules $(VENV) .ros .fuzz .pytest_cache .mypy_cache .ruff_cache .hypothesis

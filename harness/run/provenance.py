@@ -11,6 +11,7 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
+from harness import compiled
 from harness.checker import reference
 from harness.play.core_version import core_version
 from harness.play.variant import variant_in_use
@@ -32,6 +33,7 @@ def versions() -> dict[str, str]:
         **({"commit": commit} if commit else {}),
         "core": core_version(),
         "reference": _reference_version(),
+        "modules": compiled.in_use,
         **({"variant": variant.version} if (variant := variant_in_use()) is not None else {}),
         "python": platform.python_version(),
         "kernel": f"{platform.release()} (User Mode Linux)" if uml.inside() else platform.release(),

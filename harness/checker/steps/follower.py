@@ -24,6 +24,7 @@ from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_TIMER
 from harness.checker.reference.state import Handler, ReferenceState, Timer
 from harness.checker.steps._adopting_core import StateBeforeStep
+from harness.checker.steps._debugger_stop import stop_and_run
 from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.implementation import REFERENCE, CoreImplementation
 from harness.checker.steps.trace_header import CheckedHeader
@@ -114,7 +115,7 @@ class StepComparer:
         self.lost: str | None = None
         """The reason, with a trace line, why the comparison cannot continue. None while it can."""
         self.stops_before_handler = False
-        """Call `breakpoint()` before each handler. A debugger steps from there into the handler."""
+        """Stop in the debugger before each handler."""
         self._header = header
         self._parts = parts
         self._blocks = blocks
@@ -163,15 +164,17 @@ class StepComparer:
                 handler, sender, message = self._message(run, heard)
                 core.running = handler
                 if self.stops_before_handler:
-                    breakpoint()
-                branch = handler.run(core, sender, message)
+                    branch = stop_and_run(handler, core, sender, message)
+                else:
+                    branch = handler.run(core, sender, message)
             else:
                 handler, inputs = self._input(line, run, now)
                 core.running = handler
                 core.recorded_seal = sealed_of(run.sealed)
                 if self.stops_before_handler:
-                    breakpoint()
-                branch = handler.run(core, *inputs)
+                    branch = stop_and_run(handler, core, *inputs)
+                else:
+                    branch = handler.run(core, *inputs)
         except NotHandledError as error:
             self._differ(line, run.t, run.handler, f"it {error}")
         except (AssertionError, ValueError, KeyError, IndexError):  # the agent is where no agent comes to
@@ -276,13 +279,16 @@ class StepComparer:
 
     def copy(self) -> "StepComparer":
         """Return an independent copy of this object, without the differences found so far."""
-        keep = [self._header, self._parts, self._blocks, self._was_delayed, self._state, self._implementation]
-        keep.append(self._on_message)
-        keep += (*self._implementation.handlers.values(), *self._core.unchanging())
-        memo: dict[int, Any] = {id(kept): kept for kept in keep}
-        memo[id(self.deviations)] = []
-        memo[id(self.expiries)] = []
-        return deepcopy(self, memo)
+        twin = StepComparer(self._header, self._parts, self._blocks, self._was_delayed, self._implementation)
+        keep = [*self._implementation.handlers.values(), *self._core.unchanging()]
+        twin._core = deepcopy(self._core, {id(kept): kept for kept in keep})
+        twin._timers = {timer.name: timer for timer in twin._core.timers}
+        twin.lost, twin.stops_before_handler = self.lost, self.stops_before_handler
+        twin._ran = dict(self._ran)
+        twin._adopted, twin._began = self._adopted, self._began
+        twin._none_ends_before, twin._paused = self._none_ends_before, self._paused
+        twin._top, twin._top_hex, twin._state = self._top, self._top_hex, self._state
+        return twin
 
     def foresee(self, line: int, run: HandlerRun) -> list[StepDeviation]:
         """Return the missing or additional triggered handlers that the next handler run reveals. The method runs no

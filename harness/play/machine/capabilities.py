@@ -12,6 +12,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from harness import compiled
 from harness.errors import MachineError
 from netem import lab_doctor, uml
 from netem.errors import NetemError, UmlError
@@ -53,7 +54,8 @@ def examine() -> list[MachineRequirement]:
         )
         for requirement in lab_doctor.examine()
     ]
-    return [python, *lab, _user_mode_linux(), _docker(), _ardupilot()]
+    modules = MachineRequirement("Modules", True, False, compiled.in_use)
+    return [python, modules, *lab, _user_mode_linux(), _docker(), _ardupilot()]
 
 
 def _user_mode_linux() -> MachineRequirement:

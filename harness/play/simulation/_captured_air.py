@@ -60,7 +60,10 @@ class CapturedAir(VirtualAir):
         self._capture = capture
 
     def inputs_until(self, mission_s: float) -> Iterator[ScheduledInput]:
-        for scheduled in super().inputs_until(mission_s):
+        return self._recorded(super().inputs_until(mission_s))
+
+    def _recorded(self, inputs: Iterator[ScheduledInput]) -> Iterator[ScheduledInput]:
+        for scheduled in inputs:
             at, _, number, what = scheduled
             if isinstance(what, MessageInFlight):
                 frame = _frame(what.sender, what.sequence, what.message, what.sealed)

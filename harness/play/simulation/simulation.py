@@ -189,7 +189,8 @@ class Simulation(EventLoop):
                 return agent_id
         self._sought, self._found = sought, None
         await self.until(mission_s)
-        found, self._sought, self._found = self._found, None, None
+        found: int | None = self._found
+        self._sought = self._found = None
         return found
 
     async def hold(self, fate: Fate) -> int:

@@ -8,7 +8,6 @@ attributes of future versions. A value of an unknown type is an error and is nev
 
 from collections import Counter, deque
 from collections.abc import Callable
-from copy import copy
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
@@ -95,7 +94,7 @@ def put_back(agent: Agent, snapshot: Snapshot, since: Snapshot | None = None) ->
     """
     state = vars(agent.state)
     set_counts(agent, 0, NOW_S)
-    for name in HANDED_OVER & state.keys():
+    for name in HANDED_OVER.intersection(state):
         state[name].clear()
     for name in [name for name in state if name not in snapshot and name not in LEFT_OUT]:
         del state[name]  # an attribute that a handler adds later
@@ -185,9 +184,14 @@ class _TimerState:
 class _ChainState:
     __slots__ = ("kind", "parts")
 
-    def __init__(self, chain: Chain) -> None:
-        self.kind = type(chain)
-        self.parts = {name: _copied(value) for name, value in vars(chain).items() if name != "inception"}
+    def __init__(self, kind: type[Chain], parts: dict[str, Any]) -> None:
+        self.kind = kind
+        self.parts = parts
+
+    @classmethod
+    def of(cls, chain: Chain) -> "_ChainState":
+        parts = {name: _copied(value) for name, value in vars(chain).items() if name != "inception"}
+        return cls(type(chain), parts)
 
     def is_of(self, chain: Chain) -> bool:
         now = vars(chain)
@@ -199,9 +203,8 @@ class _ChainState:
             setattr(chain, name, _copied(value))
 
     def replaced(self, hash_of: Callable[[bytes], bytes], block_of: Callable[[Block], Block]) -> "_ChainState":
-        other = copy(self)
-        other.parts = {name: replaced(value, hash_of, block_of) for name, value in self.parts.items()}
-        return other
+        parts = {name: replaced(value, hash_of, block_of) for name, value in self.parts.items()}
+        return _ChainState(self.kind, parts)
 
 
 def _copied(value: Any) -> Any:
@@ -228,7 +231,7 @@ _COPIED: dict[type, Callable[[Any], Any]] = {
     **dict.fromkeys((list, deque, tuple), _each),
     dict: lambda value: {key: _copied(item) for key, item in value.items()},
     Timer: _TimerState,
-    Chain: _ChainState,
+    Chain: _ChainState.of,
 }
 
 
