@@ -16,7 +16,6 @@ pytestmark = pytest.mark.any_user
 REPOSITORY = Path(__file__).parents[2]
 ROOMS_WITH_READERS = ("scenario", "archive", "checker", "report", "run", "field", "sweep", "commands", "pytest_plugin")
 OWN_FILES = {
-    "archive/packed_parts.py": "traces of a run that it plays",
     "field/bisection/_live_replay.py": "outputs of programs that it started",
     "field/bisection/_scripted_peers.py": "a script that its parent wrote",
     "pytest_plugin/_yaml_files.py": "small regular files of a project, which may have a package `ucp` of its own",
