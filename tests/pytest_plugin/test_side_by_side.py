@@ -125,8 +125,8 @@ def test_project_without_the_plugin_imports_nothing(pytester: pytest.Pytester) -
 
     def test_theirs():
         assert {name for name in sys.modules if name.split(".")[0] in ("harness", "ucp", "netem", "pydantic")} == {
-            "harness", "harness.backend_names", "harness.pytest_plugin", "harness.pytest_plugin._stash",
-            "harness.pytest_plugin._yaml_files",
+            "harness", "harness.backend_names", "harness.compiled", "harness.pytest_plugin",
+            "harness.pytest_plugin._stash", "harness.pytest_plugin._yaml_files",
         }
     """)
     pytester.makeini("[pytest]\ntestpaths = .\naddopts = -p no:hypothesispytest")

@@ -20,7 +20,7 @@ from harness.cli import COMMANDS, OLD_NAMES, load_command
 from tests.harness.command import COMMAND, harness, sentences, write_scenario
 from tests.harness.mission import CONNECTED, fly, write_run
 
-IMPORTED_BY_HELP = {"harness", "harness.cli", "harness.errors", "harness.gc_pause"}
+IMPORTED_BY_HELP = {"harness", "harness.cli", "harness.compiled", "harness.errors", "harness.gc_pause"}
 
 
 def test_help_imports_no_command() -> None:

@@ -86,7 +86,7 @@ def test_ide_stops_in_a_handler_with_the_agent_state(calls_it: bool, record: Pat
             ide.attach({} if calls_it else {SOURCE: LINE})
             frame = ide.stopped_in()
             if calls_it:
-                assert frame["name"] == "follow"
+                assert frame["name"] == "stop_and_run"
                 ide.ask("stepIn", threadId=frame["thread"])
                 frame = ide.stopped_in()
             assert frame["name"] == "reconcile_phase_2_timer_expiration"

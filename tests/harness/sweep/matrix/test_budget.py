@@ -64,7 +64,6 @@ def test_run_that_did_not_begin_is_no_interruption(tmp_path: Path) -> None:
 
 
 def test_wrong_budget_is_refused() -> None:
-    for arguments, why in ((["--budget", "soon"], "is no time"), (["--budget", "1h", "--scheduler", "x"], "excludes")):
-        refused = harness("matrix", "growth_matrix", *arguments)
-        assert refused.returncode == 2
-        assert why in refused.stderr
+    refused = harness("matrix", "growth_matrix", "--budget", "soon")
+    assert refused.returncode == 2
+    assert "is no time" in refused.stderr
