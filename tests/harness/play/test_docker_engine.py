@@ -24,7 +24,7 @@ from harness.play.containers._images import ContainerImage
 from harness.play.keyring.key_directory import KeyDirectory
 from harness.scenario import Scenario
 from tests.harness.command import harness, sentences, write_scenario
-from tests.harness.secure.secrets import left_in, told
+from tests.harness.secure.secrets import leaks, left_in
 from tests.harness.secure.secrets import secrets as secrets_of
 
 
@@ -278,7 +278,7 @@ def test_a_compose_file_shows_each_agent_its_own_bundle_and_holds_no_secret(tmp_
     assert mission["security"] == {"bundle": "/run/secrets/2.bundle.json"}
     assert mission["features"] == ["secured", "sealed"]
     left = [("compose.yaml", (tmp_path / "compose.yaml").read_bytes()), *left_in(tmp_path / "compose")]
-    assert told(secrets_of(home, 2), left) == []
+    assert leaks(secrets_of(home, 2), left) == []
     for directory in ("fresh", str(home.directory)):
         asked = write_scenario(tmp_path, **keys, security={"keys": directory})
         refused = harness("run", asked, "--emit-compose", tmp_path / "other.yaml")

@@ -14,7 +14,7 @@ from harness.play.containers import ownership
 from harness.play.keyring.key_directory import KeyDirectory
 from tests.harness.command import Running, harness, processes, sentences, write_scenario
 from tests.harness.docker import BreakableConnection, containers, foreign_container
-from tests.harness.secure.secrets import left_in, secrets, told
+from tests.harness.secure.secrets import leaks, left_in, secrets
 
 pytestmark = pytest.mark.docker
 
@@ -125,7 +125,7 @@ def test_captured_keys_work_in_containers_and_leave_no_secret(tmp_path: Path) ->
     dropped = {reason for agent in record["agents"].values() for reason in agent["dropped"]}
     assert dropped >= {"not signed by its sender", "revoked sender"}
     left = [("its output", (done.stdout + done.stderr).encode()), *left_in(tmp_path / "run")]
-    assert told(secrets(home, 14), left) == []
+    assert leaks(secrets(home, 14), left) == []
     assert containers(tmp_path / "run") == []
 
 

@@ -141,9 +141,9 @@ def test_forged_commit_is_found_and_reported(tmp_path: Path) -> None:
 def test_invalid_rogue_record_is_left_out_of_the_report() -> None:
     hostile = {"at_s": 1, "what": "<script>", "detail": "x", "refused": {"<b>": 2}}
     record, _ = validate_leniently(RunRecord, {"rogue": [hostile, {"at_s": "soon"}]})
-    told = section(record.rogue)
-    assert told is not None
-    assert [(row.what, row.message, row.sent) for row in told.rows] == [("<script>", "none: <b>", "2")]
+    outcome = section(record.rogue)
+    assert outcome is not None
+    assert [(row.what, row.message, row.sent) for row in outcome.rows] == [("<script>", "none: <b>", "2")]
     assert section([]) is None
 
 

@@ -51,7 +51,7 @@ def forms(secret: bytes) -> Iterator[bytes]:
     yield repr(secret)[2:-1].encode()
 
 
-def told(known: dict[str, bytes], contents: Iterable[tuple[str, bytes]]) -> list[str]:
+def leaks(known: dict[str, bytes], contents: Iterable[tuple[str, bytes]]) -> list[str]:
     """Return the names of the secrets found, with their places."""
     looked_for = [(name, form) for name, secret in known.items() for form in forms(secret)]
     return [f"{name} in {where}" for where, content in contents for name, form in looked_for if form in content]

@@ -14,7 +14,7 @@ import pytest
 from harness.play.keyring.key_directory import KeyDirectory
 from tests.harness.command import Running, harness, processes, write_scenario
 from tests.harness.play.test_memory_directory import guard_of
-from tests.harness.secure.secrets import secrets, told
+from tests.harness.secure.secrets import leaks, secrets
 
 pytestmark = pytest.mark.lab
 
@@ -105,7 +105,7 @@ def test_arguments_and_environment_of_processes_contain_no_secret(tmp_path: Path
         run.process.communicate()
     assert sum(b"mission.json" in content for _, content in shown) >= 3
     assert any(b"PATH=" in content for _, content in shown)
-    assert told(secrets(home, 2), shown) == []
+    assert leaks(secrets(home, 2), shown) == []
 
 
 def visible(pid: int) -> Iterator[tuple[str, bytes]]:

@@ -12,7 +12,7 @@ import pytest
 
 from harness.play.keyring.key_directory import KeyDirectory
 from tests.harness.command import harness
-from tests.harness.secure.secrets import left_in, secrets, told
+from tests.harness.secure.secrets import leaks, left_in, secrets
 
 ROSTER = [1, 2, 3]
 SCENARIO = {
@@ -96,7 +96,7 @@ def test_command_prints_the_truth_and_no_secret(
     said = " ".join((done.stdout + done.stderr).split())
     assert (done.returncode, words in said) == (status, True), said
     left = [("its output", (done.stdout + done.stderr).encode()), *left_in(tmp_path), *left_in(flown)]
-    assert told(secrets(home, 12), left) == []
+    assert leaks(secrets(home, 12), left) == []
 
 
 def test_reconcile_at_the_depot_keeps_block_signatures(flown: Path, tmp_path: Path) -> None:
@@ -128,4 +128,4 @@ def test_captures_alone_are_flown_again_with_keys(home: KeyDirectory, tmp_path: 
     opened = harness("reconstruct", came, "--out", tmp_path / "opened.yaml", *keys)
     assert (opened.returncode, "reproduces all 3 chains" in opened.stdout) == (0, True), opened.stdout + opened.stderr
     left = [*left_in(tmp_path), ("its output", (opened.stdout + opened.stderr + closed.stderr).encode())]
-    assert told(secrets(home, 12), left) == []
+    assert leaks(secrets(home, 12), left) == []

@@ -12,7 +12,7 @@ from harness.play.keyring.key_directory import KeyDirectory, write_revocation
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from tests.harness.command import harness
-from tests.harness.secure.secrets import left_in, secrets, told
+from tests.harness.secure.secrets import leaks, left_in, secrets
 from tests.harness.virtual import scenario
 
 ROSTER = [1, 2, 3]
@@ -43,7 +43,7 @@ def test_the_home_of_the_keys_revokes_and_stays_as_it_was(home: KeyDirectory, tm
     ]
     assert told_by == [1, 2]
     assert {path.name: path.read_bytes() for path in home.directory.iterdir()} == before
-    assert told(secrets(home, 2), left_in(tmp_path / "run")) == []
+    assert leaks(secrets(home, 2), left_in(tmp_path / "run")) == []
 
 
 def test_bundles_revoke_by_the_message_that_was_made_at_home(home: KeyDirectory, tmp_path: Path) -> None:

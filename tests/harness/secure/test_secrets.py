@@ -10,7 +10,7 @@ import pytest
 
 from harness.play.keyring.key_directory import KeyDirectory
 from tests.harness.command import harness
-from tests.harness.secure.secrets import boots_in, forms, left_in, secrets, told
+from tests.harness.secure.secrets import boots_in, forms, leaks, left_in, secrets
 
 ROSTER = [1, 2, 3]
 EPOCHS = 14
@@ -58,7 +58,7 @@ def test_files_of_a_run_contain_no_secret(home: KeyDirectory, tmp_path: Path) ->
     assert {sender for sender, _ in boots} == {*ROSTER}
     known = secrets(home, EPOCHS, boots)
     assert len(known) > len(ROSTER) * EPOCHS
-    assert told(known, left) == []
+    assert leaks(known, left) == []
 
 
 @pytest.mark.lab
@@ -74,7 +74,7 @@ def test_files_of_a_failed_run_of_processes_contain_no_secret(
     assert status == 1, left[0]
     assert any(b"bundle" in content and b"PATH=" in content for name, content in left if name.endswith("2.log"))
     assert not any(b"a token" in content for _, content in left)
-    assert told(secrets(home, EPOCHS), left) == []
+    assert leaks(secrets(home, EPOCHS), left) == []
 
 
 @pytest.mark.lab
@@ -86,7 +86,7 @@ def test_agent_as_a_process_reads_keys_of_other_agents(home: KeyDirectory, tmp_p
     status, left = run(asked, "--backend", "process")
     assert status == 1, left[0]
     others = {"private key of 1": secrets(home, 1)["private key of 1"]}
-    assert told(others, left) == [f"private key of 1 in {tmp_path / 'run/agents/2.read'}"]
+    assert leaks(others, left) == [f"private key of 1 in {tmp_path / 'run/agents/2.read'}"]
 
 
 @pytest.mark.parametrize("tells", ["error", "version"])
@@ -106,7 +106,7 @@ def test_virtual_agent_that_repeats_its_input_reveals_no_secret(home: KeyDirecto
     if tells == "error":
         assert b"(a secret)" in left[0][1]
     shown = {name: secret[:8] for name, secret in secrets(home, EPOCHS).items()}
-    assert told(shown, left) == []
+    assert leaks(shown, left) == []
 
 
 @pytest.mark.lab
@@ -127,7 +127,7 @@ def test_captured_keys_forge_only_blocks_of_their_vehicle(home: KeyDirectory, tm
     )
     dropped = [reason for agent in record["agents"].values() for reason in agent["dropped"]]
     assert "not signed by its sender" in dropped
-    assert told(secrets(home, EPOCHS), left) == []
+    assert leaks(secrets(home, EPOCHS), left) == []
 
 
 @pytest.mark.parametrize("mistake", ["mode", "swapped", "cut off", "text"])
@@ -152,12 +152,12 @@ def test_no_error_message_has_a_secret(home: KeyDirectory, tmp_path: Path, mista
     status, left = run(asked, "--backend", "sim")
     assert (status, done.returncode) == (2, 2)
     assert "2.bundle.json" in done.stderr
-    assert told(secrets(home, EPOCHS), [*left, ("inspect", (done.stdout + done.stderr).encode())]) == []
+    assert leaks(secrets(home, EPOCHS), [*left, ("inspect", (done.stdout + done.stderr).encode())]) == []
 
 
 def test_each_form_of_a_secret_would_be_found() -> None:
     secret = os.urandom(32)
     for number, form in enumerate(forms(secret)):
-        assert told({"it": secret}, [("a file", b"before " + form + b" behind")]), number
+        assert leaks({"it": secret}, [("a file", b"before " + form + b" behind")]), number
     inside = json.dumps({"data": [1, *secret, 2]}).encode()
-    assert told({"it": secret}, [("a file", inside)])
+    assert leaks({"it": secret}, [("a file", inside)])

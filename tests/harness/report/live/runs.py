@@ -29,19 +29,19 @@ def played(directory: Path, **keys: Any) -> Path:
 def film(directory: Path, stride_s: float = 20.0) -> list[Change]:
     """Return all changes in a finished run, read `stride_s` mission seconds at a time."""
     feed = ChangeFeed(directory)
-    told, until_s = [feed.run_change(live=False)], 0.0
+    feed_changes, until_s = [feed.run_change(live=False)], 0.0
     while True:
         changes, more = feed.poll(until_s)
-        told += changes
+        feed_changes += changes
         if more:
             continue
         if (next_s := feed.next_s) is None:
             break
         until_s = max(until_s, next_s) + stride_s
-    told += feed.final_changes()
+    feed_changes += feed.final_changes()
     feed.close()
-    return told
+    return feed_changes
 
 
-def of_kind(kind: str, told: list[Change]) -> list[Change]:
-    return [change for change in told if change[0] == kind]
+def of_kind(kind: str, feed_changes: list[Change]) -> list[Change]:
+    return [change for change in feed_changes if change[0] == kind]

@@ -27,10 +27,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return played(tmp_path_factory.mktemp("watched") / "run")
 
 
-def chains_of(told: list[Change]) -> dict[int, list[str]]:
+def chains_of(feed_changes: list[Change]) -> dict[int, list[str]]:
     """Return each agent's final chain, computed from the changes."""
     chains: dict[int, list[str]] = {}
-    for kind, _, *rest in told:
+    for kind, _, *rest in feed_changes:
         if kind == "z":
             chains[rest[0]] = []
         elif kind == "c":
@@ -43,41 +43,41 @@ def chains_of(told: list[Change]) -> dict[int, list[str]]:
 
 
 def test_a_film_ends_with_the_chains_that_the_agents_exported(run: Path) -> None:
-    told = film(run)
+    feed_changes = film(run)
     exports = RunArchive(run).exports.by_agent
-    assert chains_of(told) == {
+    assert chains_of(feed_changes) == {
         agent: [block.block_hash[:KEY_LENGTH] for block in export.chain] for agent, export in exports.items()
     }
-    names = {change[2]: f"{change[3]}.{change[4]}" for change in of_kind("b", told)}
+    names = {change[2]: f"{change[3]}.{change[4]}" for change in of_kind("b", feed_changes)}
     assert len(names) == len(set(names.values())) > 5
 
 
 def test_changes_are_complete_and_in_time_order(run: Path) -> None:
-    told = film(run)
-    assert [told[0][0], told[-1][0]] == ["run", "end"]
-    timed = [change for change in told if change[0] in ("b", "c", "s", "n", "z", "p")]
+    feed_changes = film(run)
+    assert [feed_changes[0][0], feed_changes[-1][0]] == ["run", "end"]
+    timed = [change for change in feed_changes if change[0] in ("b", "c", "s", "n", "z", "p")]
     assert [change[1] for change in timed] == sorted(change[1] for change in timed)
-    whats = [(change[2], change[5]) for change in of_kind("n", told) if change[2]]
+    whats = [(change[2], change[5]) for change in of_kind("n", feed_changes) if change[2]]
     assert whats == [("start", ""), ("partition", ""), ("heal", ""), ("kill", "gone"), ("restart", "back")]
-    parts = [change[7] for change in of_kind("n", told) if change[7]]
+    parts = [change[7] for change in of_kind("n", feed_changes) if change[7]]
     assert parts[:3] == [[[1, 2, 3, 4]], [[1, 2], [3, 4]], [[1, 2, 3, 4]]]
-    assert [change[2] for change in of_kind("z", told)] == [4]
-    assert told[-1][1]["outcome"] == "completed"
-    assert {judgement[0] for judgement in told[-1][1]["judgements"]} >= {"1", "2", "3", "4", "5", "6"}
+    assert [change[2] for change in of_kind("z", feed_changes)] == [4]
+    assert feed_changes[-1][1]["outcome"] == "completed"
+    assert {judgement[0] for judgement in feed_changes[-1][1]["judgements"]} >= {"1", "2", "3", "4", "5", "6"}
 
 
 def test_message_change_names_its_receivers(run: Path) -> None:
-    told = film(run)
+    feed_changes = film(run)
     sent = sum(len(entry.sent) for trace in RunArchive(run).traces.values() for entry in trace.runs)
-    messages = of_kind("m", told)
+    messages = of_kind("m", feed_changes)
     assert len(messages) == sent
     masks = Counter(int(change[5], 16).bit_count() for change in messages)
     assert max(masks) == 3, "nobody hears itself"
 
 
 def test_changes_do_not_depend_on_the_size_of_reads(run: Path) -> None:
-    def facts(told: list[Change]) -> list[str]:
-        return sorted(json.dumps(change) for change in told if change[0] not in "t")
+    def facts(feed_changes: list[Change]) -> list[str]:
+        return sorted(json.dumps(change) for change in feed_changes if change[0] not in "t")
 
     assert facts(film(run)) == facts(film(run, 1e7)) == facts(film(run, 3.3))
 
@@ -90,15 +90,15 @@ def test_growing_files_give_the_same_changes(run: Path, tmp_path: Path) -> None:
     sources = [path for path in run.rglob("*.jsonl") if path.is_file()]
     content = {path: path.read_bytes() for path in sources}
     feed = ChangeFeed(growing)
-    told: list[Change] = []
+    feed_changes: list[Change] = []
     for share in range(0, 101, 7):
         for path, data in content.items():
             (growing / path.relative_to(run)).write_bytes(data[: len(data) * share // 98])
-        told += feed.poll()[0]
-    told += feed.final_changes()
+        feed_changes += feed.poll()[0]
+    feed_changes += feed.final_changes()
     feed.close()
-    assert chains_of(told) == chains_of(film(run))
-    assert len(of_kind("m", told)) == len(of_kind("m", film(run)))
+    assert chains_of(feed_changes) == chains_of(film(run))
+    assert len(of_kind("m", feed_changes)) == len(of_kind("m", film(run)))
 
 
 def late_film(run: Path, growing: Path, lag: int = 3) -> list[Change]:
@@ -108,21 +108,21 @@ def late_film(run: Path, growing: Path, lag: int = 3) -> list[Change]:
     shutil.copy(run / "network.jsonl", growing)
     content = {path: path.read_bytes().splitlines(keepends=True) for path in run.glob(f"agents/*{SUFFIX}")}
     feed = ChangeFeed(growing)
-    told = [feed.run_change(live=True)]
+    feed_changes = [feed.run_change(live=True)]
     for step in range(50):
         for path, lines in content.items():
             share = max(0, step - lag * int(path.name.partition(".")[0]))
             (growing / "agents" / path.name).write_bytes(b"".join(lines[: len(lines) * share // 36]))
-        told += feed.poll()[0]
-    told += feed.final_changes()
+        feed_changes += feed.poll()[0]
+    feed_changes += feed.final_changes()
     feed.close()
-    return told
+    return feed_changes
 
 
-def receivers(told: list[Change]) -> dict[tuple[int, int, float], str]:
+def receivers(feed_changes: list[Change]) -> dict[tuple[int, int, float], str]:
     """Return the receivers of each message, by sender, sequence number and time."""
     masks = {}
-    for kind, at_s, *rest in told:
+    for kind, at_s, *rest in feed_changes:
         if kind == "m":
             masks[rest[0], rest[4], at_s] = rest[3]
         elif kind == "h":
@@ -133,17 +133,17 @@ def receivers(told: list[Change]) -> dict[tuple[int, int, float], str]:
 
 def test_message_gets_the_receivers_that_record_it_late(tmp_path: Path) -> None:
     run = played(tmp_path / "run", timeline=[])
-    told = late_film(run, tmp_path / "live")
-    assert of_kind("h", told)
-    assert receivers(told) == receivers(film(run))
+    feed_changes = late_film(run, tmp_path / "live")
+    assert of_kind("h", feed_changes)
+    assert receivers(feed_changes) == receivers(film(run))
 
 
 def test_live_feed_reports_messages_while_it_is_behind(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(feeds, "LINES_AT_ONCE", 5)
-    feed, polls, told = ChangeFeed(run), 0, list[Change]()
-    while not of_kind("m", told):
+    feed, polls, feed_changes = ChangeFeed(run), 0, list[Change]()
+    while not of_kind("m", feed_changes):
         changes, more = feed.poll()
-        told, polls = told + changes, polls + 1
+        feed_changes, polls = feed_changes + changes, polls + 1
         assert more or of_kind("m", changes), "it has read everything before the first message"
     feed.close()
     assert polls < 10
@@ -173,9 +173,9 @@ def test_killed_run_is_shown_up_to_its_end(run: Path, tmp_path: Path) -> None:
     (killed / "report.html").unlink()
     trace = killed / "agents" / f"1{SUFFIX}"
     trace.write_bytes(trace.read_bytes()[: trace.stat().st_size // 2])
-    told = film(killed)
-    assert told[-1][1] == {"outcome": "running", "detail": None, "judgements": [], "report": False}
-    assert of_kind("note", told) == []
+    feed_changes = film(killed)
+    assert feed_changes[-1][1] == {"outcome": "running", "detail": None, "judgements": [], "report": False}
+    assert of_kind("note", feed_changes) == []
 
 
 def test_damage_is_reported_once_and_the_rest_is_shown(run: Path, tmp_path: Path) -> None:
@@ -187,13 +187,13 @@ def test_damage_is_reported_once_and_the_rest_is_shown(run: Path, tmp_path: Path
         file.writelines([*lines[:20], b"{\n", *lines[20:]])
     with (damaged / "network.jsonl").open("ab") as file:
         file.write(b'nonsense\n{"at_s":1,"what":"x","losses":{"1-99":0.5}}\n')
-    told = film(damaged)
-    assert sorted(note for _, note in of_kind("note", told)) == [
+    feed_changes = film(damaged)
+    assert sorted(note for _, note in of_kind("note", feed_changes)) == [
         "network.jsonl has damaged lines, which are left out",
         "network.jsonl has unknown lines, which are left out",
         "the trace of agent 2 is damaged, and is read up to the damage",
     ]
-    assert len(chains_of(told)) == 4
+    assert len(chains_of(feed_changes)) == 4
 
 
 def test_duplicate_block_is_reported_at_once(run: Path, tmp_path: Path) -> None:
@@ -214,11 +214,11 @@ def test_directory_without_a_run_is_refused_in_one_sentence(
         ChangeFeed(run)
 
 
-def intervals(told: list[Change]) -> list[tuple[str, float, float, str]]:
+def intervals(feed_changes: list[Change]) -> list[tuple[str, float, float, str]]:
     """Return each finished vote and reconcile: its kind, its start and end, and its result or reason."""
     began: dict[tuple[int, str], tuple[float, str]] = {}
     ended = []
-    for _, at_s, agent, doing, more in of_kind("s", told):
+    for _, at_s, agent, doing, more in of_kind("s", feed_changes):
         if doing in ("voting", "reconciling"):
             began[agent, doing] = at_s, more
         elif doing == "voted":
@@ -300,7 +300,7 @@ def late_run(run: Path, growing: Path, monkeypatch: pytest.MonkeyPatch) -> list[
     shutil.copy(run / "network.jsonl", growing)
     content = {path: path.read_bytes().splitlines(keepends=True) for path in run.glob(f"agents/*{SUFFIX}")}
     feed, clock = ChangeFeed(growing), SetClock()
-    told = [feed.run_change(live=True)]
+    feed_changes = [feed.run_change(live=True)]
     clock.now_s = 1e6
     for step in range(1, 61):
         for path, lines in content.items():
@@ -310,12 +310,12 @@ def late_run(run: Path, growing: Path, monkeypatch: pytest.MonkeyPatch) -> list[
         more = True
         while more:
             changes, more = feed.poll_live(clock)
-            told += changes
+            feed_changes += changes
             if clock.late_s and more:
                 break
-    told += feed.final_changes()
+    feed_changes += feed.final_changes()
     feed.close()
-    return told
+    return feed_changes
 
 
 def wrongly_lost(
@@ -337,14 +337,14 @@ def wrongly_lost(
 def test_late_feed_leaves_out_messages_and_reports_how_late_it_is(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told, whole = late_run(run, tmp_path / "live", monkeypatch), film(run)
-    late = of_kind("late", told)
+    feed_changes, whole = late_run(run, tmp_path / "live", monkeypatch), film(run)
+    late = of_kind("late", feed_changes)
     assert late[0] == ["late", 3, True]
     assert late[-1] == ["late", 0, False]
-    gaps = [at_s for _, at_s in of_kind("gap", told)]
+    gaps = [at_s for _, at_s in of_kind("gap", feed_changes)]
     assert gaps
-    assert chains_of(told) == chains_of(whole)
-    known, complete = receivers(told), receivers(whole)
+    assert chains_of(feed_changes) == chains_of(whole)
+    known, complete = receivers(feed_changes), receivers(whole)
     assert 0.1 < len(known) / len(complete) < 0.95
     assert wrongly_lost(known, complete, gaps) == []
     assert wrongly_lost(known, complete, []) != [], "without its gaps, a page would show losses that are none"

@@ -110,9 +110,9 @@ def test_live_page_and_film_show_the_loss_of_the_network(
     with page_of("watch", run) as (_, address):
         browser.show(address, width=1000, scheme="light")
         until(browser, "watch.story.end")
-        for name, told in stories.items():
+        for name, feed_changes in stories.items():
             browser.evaluate(f"window.{name} = new watch.story.constructor()")
-            browser.evaluate(f"for (const change of {json.dumps(told)}) {name}.take(change)")
+            browser.evaluate(f"for (const change of {json.dumps(feed_changes)}) {name}.take(change)")
         late = browser.evaluate("late.shareLost(0, 1000)")
         shares = {name: browser.evaluate(f"[70, 100, 130].map(t => {name}.shareLost(t - 60, t))") for name in stories}
     assert shares["live"] == shares["film"] == [pytest.approx(0.2, abs=0.04)] * 3
