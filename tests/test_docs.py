@@ -50,6 +50,14 @@ def test_site_has_every_page_and_every_link_target(site: Path) -> None:
                 assert (page.parent / target).is_file(), (page, target)  # a folder is no page without a server
 
 
+@pytest.mark.parametrize("page", sorted({*PAGES, *REPOSITORY.glob("*.md")}), ids=lambda page: page.stem)
+def test_brackets_of_every_paragraph_are_closed(page: Path) -> None:
+    without_code = re.sub(r"`[^`]*`", "", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL))
+    for paragraph in re.split(r"\n\s*\n", without_code):
+        assert paragraph.count("[") == paragraph.count("]"), paragraph
+        assert paragraph.count("(") == paragraph.count(")"), paragraph
+
+
 def test_site_has_every_schema_and_a_page_that_links_to_it(site: Path) -> None:
     page = (site / "reference/schemas.html").read_text()
     for path, text in texts().items():
