@@ -357,12 +357,7 @@ class Interventions(GrowingTimeline):
                 f"`{entry.injection[0]}` needs a rogue node; a run with other agents than the harness's own has one "
                 "only if the timeline of its scenario injects something"
             )
-        ready = {
-            agent_id
-            for fault in self._initial_scenario.faults_in_order()
-            if fault.disk_after == "kept"
-            for agent_id in fault.agents
-        }
+        ready = self._initial_scenario.with_disk()
         if (fault := entry.fault) is not None and fault.disk_after == "kept" and (diskless := {*fault.agents} - ready):
             raise ScenarioError(
                 f"agent {min(diskless)} has no disk: in a swarm with other agents than the harness's own an agent has "

@@ -4,9 +4,9 @@ The checker is the same as for other runs. The checker reads the evidence direct
 files.
 """
 
-from collections.abc import Callable, Coroutine, Iterable, Mapping
-from contextlib import closing, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -28,7 +28,7 @@ from harness.play.simulation.run_files import header
 from harness.play.simulation.simulation import Simulation
 from harness.play.simulation.virtual_time import SimulationBackend
 from harness.scenario import Scenario
-from harness.scenario.verdict_names import CHARACTERISTICS
+from harness.scenario.verdict_names import CHARACTERISTICS, ENDED, RUN_CHECKS
 from netem.radio import Place
 from ucp.trace import SCHEMA, Entry, in_base64
 
@@ -59,8 +59,11 @@ def simulate(
     - `again`: give foreign agents their inputs a second time, and compare the answers. If the run has a bad verdict,
       the comparison is always made.
 
-    Raises ScenarioError if the scenario needs real processes, and HarnessError if an agent fails or behaves
-    differently when it gets the same input again.
+    If an agent crashes or hangs, the other agents continue. The result has the verdict `ended`, or the verdict `steps`
+    names the handler that did not finish.
+
+    Raises ScenarioError if the scenario needs real processes, and HarnessError if an agent does not support the mission
+    or behaves differently when it gets the same input again.
     """
     return simulate_in_memory(MemoryRecorder(tracing), scenario, seed, again=again, deliver_all=deliver_all)
 
@@ -74,13 +77,18 @@ def simulate_in_memory(
     """
     SimulationBackend().refuse(scenario)
     simulation = Simulation(scenario, seed, memory, **options)
+
+    def evidence_at_end() -> Evidence:
+        simulation.end()
+        return memory.evidence(simulation)
+
     with closing(simulation):
         run_to_end(mission.play(simulation, scenario))
-        simulation.end()
-        if (failure := simulation.failed_program()) is not None:
-            raise failure
-        evidence = memory.evidence(simulation)
+        evidence = simulation.survive(evidence_at_end)
     result = checker.check(evidence)
+    found = [finding.detail for finding in result.beside["steps"].evidence]
+    if failures := [error for error in simulation.failures if not any(error.detail in detail for detail in found)]:
+        result = replace(result, beside={**result.beside, ENDED: _judge_failures(failures)})
     if (records := simulation.records()) and (again or result.bad):
         from harness.play.simulation.foreign.determinism import DeterminismCheck
 
@@ -94,11 +102,9 @@ def check_determinism(scenario: Scenario, seed: int) -> None:
     """Check that foreign agents (separate programs) give the same answers if they receive the same inputs a second
     time.
 
-    Raises HarnessError if an agent gives different answers or does not support the mission. A crashed or hung agent
-    raises no error here, because its run reports it.
+    Raises HarnessError if an agent gives different answers or does not support the mission.
     """
-    with suppress(AgentFailedError):
-        simulate(scenario, seed, tracing=True, again=True)
+    simulate(scenario, seed, tracing=True, again=True)
 
 
 def run_to_end(story: Coroutine[Any, Any, Returned]) -> Returned:
@@ -160,6 +166,9 @@ class MemoryRecorder:
         """Do nothing, because the checker reads the chains from the agents."""
 
     def evidence(self, simulation: Simulation) -> Evidence:
+        """Return the evidence of a run that has ended. Raises AgentFailedError if an agent fails to export its
+        chain.
+        """
         record = JudgedRecord.model_validate(
             {
                 "roster": simulation.roster,
@@ -205,26 +214,17 @@ Judge = Callable[[Scenario, int], Result]
 """A function that plays a scenario with a seed, and checks the run."""
 
 
-ENDED = "ended"
-"""Key of the verdict on an agent that crashed or hung during the mission."""
-
-
 @gc_paused()
 def simulated(scenario: Scenario, seed: int) -> Result:
-    """Simulate a scenario with traces, and return the verdict. If an agent crashes, the verdict covers only
-    this crash.
-    """
-    try:
-        return simulate(scenario, seed, tracing=True).result
-    except AgentFailedError as error:
-        return result_of_failure(error)
+    """Simulate a scenario with traces, and return the verdict."""
+    return simulate(scenario, seed, tracing=True).result
 
 
-def result_of_failure(error: AgentFailedError) -> Result:
-    """Return the verdict on a run that ended because an agent crashed or hung."""
-    finding = Finding(error.agent_id, f"{error.outcome}: it {error.detail}")
-    judgement = Judgement("every agent to the end", "violated", f"agent {error.agent_id} {error.outcome}", [finding])
-    return Result({}, {}, {ENDED: judgement})
+def _judge_failures(failures: Sequence[AgentFailedError]) -> Judgement:
+    """Return the verdict on agents that crashed or hung, and whose end is no deviation of a handler."""
+    reason = "; ".join(f"agent {error.agent_id} {error.outcome}" for error in failures)
+    findings = [Finding(error.agent_id, f"{error.outcome}: it {error.detail}") for error in failures]
+    return Judgement(RUN_CHECKS[ENDED], "violated", reason, findings)
 
 
 def evidence_lines(violated: dict[str, Judgement]) -> list[str]:

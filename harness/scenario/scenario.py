@@ -221,6 +221,10 @@ class Scenario(StrictModel):
         """Return all faults in order of time. Faults at the same time keep the order of their timeline entries."""
         return [fault for _, fault in self._faults_with_their_keys()]
 
+    def with_disk(self) -> set[int]:
+        """Return the agents that a fault of the timeline restarts with the data on their disks."""
+        return {agent for fault in self.faults_in_order() if fault.disk_after == "kept" for agent in fault.agents}
+
     def _faults_with_their_keys(self) -> list[tuple[str, Fault]]:
         begun = [(f"timeline.{index}", entry.fault) for index, entry in enumerate(self.timeline) if entry.fault]
         begun.sort(key=lambda keyed: keyed[1].at_s)

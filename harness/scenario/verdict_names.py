@@ -29,11 +29,18 @@ FURTHER_CHECKS = {"steps": "every step", "records": "every record", "liveness": 
 ALL_CHECKS = {**CHARACTERISTICS, **FURTHER_CHECKS}
 """All checks in the order of the report: number of a characteristic or key of a further check -> short name."""
 
+ENDED = "ended"
+"""Key of the verdict on agents that crashed or hung in a run in memory. Other runs have no such verdict."""
+
+RUN_CHECKS = {**ALL_CHECKS, ENDED: "every agent to the end"}
+"""All checks of a run in memory: number of a characteristic or key -> short name."""
+
 BAD_IN_WORDS = {
     **{number: f"characteristic {number} violated" for number in CHARACTERISTICS},
     "steps": "steps deviate",
     "records": "records contradict",
     "liveness": "swarm not finished",
+    ENDED: "an agent crashed or hung",
 }
 """Number or key of a check -> phrase for its bad verdict."""
 

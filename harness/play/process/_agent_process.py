@@ -430,8 +430,3 @@ class AgentProcess:
         self.outcome, self.detail = outcome, detail
         log = self._log.relative_to(self._rundir.path)
         return AgentFailedError(self.agent_id, outcome, f"{detail}; its log is {log}")
-
-
-def reboots_with_disk(agent_id: int, scenario: Scenario) -> bool:
-    """Return true if a fault of the scenario restarts the agent with the data on its disk."""
-    return any(fault.disk_after == "kept" and agent_id in fault.agents for fault in scenario.faults_in_order())

@@ -24,7 +24,7 @@ from harness.play._radio_range import TRACK_S, RadioRange
 from harness.play._vehicle_keys import KeyDirectories, key_directories
 from harness.play.agent_control import AgentRefusedError, AgentStatus
 from harness.play.mission import RunOutcome, SoughtRun
-from harness.play.process._agent_process import AgentProcess, reboots_with_disk
+from harness.play.process._agent_process import AgentProcess
 from harness.play.process._channel_process import ChannelProcess
 from harness.play.process._fleet import Fleet
 from harness.play.process._lag_meter import LagMeter
@@ -220,7 +220,7 @@ class ProgramRun:
     async def _start_agent(self, agent: AgentProcess, lab: MissionLab) -> None:
         """Start the agent. If the mission has already begun, the agent joins it."""
         with_vehicle = bool(self._fleet)
-        keeps_disk = self._keeps_disks or reboots_with_disk(agent.agent_id, self.scenario)
+        keeps_disk = self._keeps_disks or agent.agent_id in self.scenario.with_disk()
         epoch_us = self.clock.epoch_us
         await agent.start(
             lab, self.scenario, self.seed, self.initial_data, with_vehicle, keeps_disk, epoch_us, self._keys

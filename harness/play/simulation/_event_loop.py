@@ -103,6 +103,9 @@ class EventLoop:
         self._foreign_swarm = self._foreign_agents(programs) if scenario.foreign else None
         self._late = {self._number[agent_id]: LateTimers(text) for agent_id, text in scenario.lateness.items()}
         """Number of an agent with the key `lateness` -> its late timers."""
+        with_disk = self.roster if interactive else scenario.with_disk()
+        self._with_disk = {self._number[agent_id] for agent_id in with_disk}
+        """Numbers of the agents that may reboot with the data on their disks."""
         self._channel = self._shared_channel()
         self._medium = Medium(self.roster, seed, AT_ONCE if self._channel else LATENCY)
         self._script = fate_script(scenario.fates, self.roster, BlockNames(self.roster, self._incarnations).of)
@@ -319,9 +322,13 @@ class EventLoop:
         self._schedule_timer(number, incarnation)
 
     def _send_and_trace(self, number: int, incarnation: SimulatedIncarnation) -> None:
-        """Send the agent's messages, and write its trace."""
+        """Write the agent's trace and its disk, and send its messages."""
         if self._tracing:
             self._write_trace(incarnation, self._now)
+        if incarnation.state is not None:
+            incarnation.completed = len(incarnation.state.completed)
+            if number in self._with_disk:
+                incarnation.disk = _own_agent(incarnation).stored(self._now)
         if incarnation.secured is not None:
             self._send_sealed(number, incarnation, incarnation.secured)
             return
@@ -438,6 +445,7 @@ class EventLoop:
         self._air.started_at[number] = self._now
         self._recorder.begin(incarnation)
         if isinstance(stored, StoredState) and isinstance(agent, OwnAgent):
+            incarnation.disk = stored
             agent.boot(stored, local_s)
         self._finish_input(number, incarnation)
         self._schedule_event(number, incarnation)

@@ -10,6 +10,7 @@ from harness.scenario.scenario import AgentClock
 from ucp.clock import MICROSECONDS
 from ucp.events import RandomEvents
 from ucp.state import AgentState
+from ucp.store import StoredState
 
 if TYPE_CHECKING:
     from ucp.secure.secured_agent import OutgoingDatagram
@@ -50,6 +51,12 @@ class SimulatedIncarnation:
     handler_runs: int = 0
     """Number of handler runs. They are counted only if a trace is written."""
     ended_at: float | None = None
+    completed: int = 0
+    """Number of blocks that the agent had completed after its last input, if it runs in this process."""
+    disk: StoredState | None = None
+    """The content of the agent's disk after its last input. Only for an agent that runs in this process and may reboot
+    with its disk.
+    """
     logs: bool = True
     """True while the agent still logs events."""
 
@@ -60,6 +67,11 @@ class SimulatedIncarnation:
     @property
     def top_chain_hash(self) -> str:
         return self.agent.status().top_chain_hash if self.state is None else self.state.chain.top_chain_hash.hex()
+
+    def drop_unfinished_input(self) -> None:
+        """Drop the blocks that the agent completed in an input whose handlers did not finish. No record has them."""
+        if self.state is not None:
+            del self.state.completed[self.completed :]
 
     def local_s(self, mission_s: float) -> float:
         """Return the time on the agent's clock at this mission second."""

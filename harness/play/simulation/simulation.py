@@ -102,6 +102,8 @@ class Simulation(EventLoop):
         self._switched_off: dict[int, SimulatedIncarnation] = {}
         self._failures: dict[int, AgentFailedError | AgentLacksError] = {}
         """Number of an agent -> its last failure."""
+        self.failures: list[AgentFailedError] = []
+        """The failures of agents that crashed or hung, in the order of time."""
         self._failed_incarnations: list[list[AgentFailure]] = [[] for _ in self.roster]
         """Records of the failures of each agent."""
         self._reach = RadioRange(scenario)
@@ -365,11 +367,14 @@ class Simulation(EventLoop):
         number = self._number[error.agent_id]
         if (incarnation := self._alive[number]) is not None:
             incarnation.ended_at = self._now
+            incarnation.drop_unfinished_input()
         if self._foreign_swarm is not None:
             self._foreign_swarm.ended(error.agent_id)
         self._alive[number] = None
         self._air.remove_agent(number)
         self._failures[number] = error
+        if isinstance(error, AgentFailedError):
+            self.failures.append(error)
         which = len(self._incarnations[number]) + (incarnation is None)
         failure = AgentFailure(at_s=round(self._now, 3), incarnation=which, detail=error.detail)
         self._failed_incarnations[number].append(failure)
@@ -412,15 +417,6 @@ class Simulation(EventLoop):
         return silent_injections(self._injected, self._rogue.sent) if self._rogue is not None else []
 
     # State of the agents
-
-    def failed_program(self) -> AgentFailedError | None:
-        """Return the failure of a foreign agent. Return None if no foreign agent crashed or hung.
-
-        The judge finds the failures of other agents in the record of the run.
-        """
-        foreign = self._foreign_swarm or ()
-        failures = (error for error in self._failures.values() if error.agent_id in foreign)
-        return next((error for error in failures if isinstance(error, AgentFailedError)), None)
 
     def living(self) -> Iterator[SimulatedIncarnation]:
         return (incarnation for incarnation in self._alive if incarnation is not None)
@@ -498,8 +494,22 @@ class Simulation(EventLoop):
             incarnation.agent.end(incarnation.local_s(self._now))
             if self._foreign_swarm is not None:
                 self._foreign_swarm.ended(agent_id)
+        elif disk_kept and (stored := self._disk_after_death(number)) is not None:
+            self._disks[number] = stored
         self._alive[number] = None
         self._air.remove_agent(number)
+
+    def _disk_after_death(self, number: int) -> DiskContents | None:
+        """Return the content of the disk of an agent that died by itself. Return None if it stored nothing."""
+        if not self._incarnations[number]:
+            return None
+        dead = self._incarnations[number][-1]
+        if dead.state is not None:
+            return dead.disk
+        from harness.play.simulation.foreign._disk_after_death import disk_after_death
+
+        record = next(record for record in reversed(self.records()) if record.agent_id == self.roster[number])
+        return disk_after_death(record, tracing=self._tracing)
 
     async def begin_incarnation(self, agent_id: int, *, new_vehicle: bool = False) -> None:
         number = self._number[agent_id]

@@ -9,10 +9,9 @@ from harness.archive.run_record import Cycle
 from harness.checker import Result
 from harness.checker.judgement import Judgement
 from harness.checker.recurring_cycles import cycle_of
-from harness.errors import AgentFailedError
 from harness.play.variant import variant_in_use
 from harness.proof.bounds import Bounds
-from harness.run.simulate import evidence_lines, result_of_failure, simulate, write_new_file
+from harness.run.simulate import evidence_lines, simulate, write_new_file
 from harness.scenario.load import parse
 from harness.scenario.scenario_file import to_yaml
 
@@ -59,11 +58,8 @@ class PlayedExample:
 
 
 def play(document: Document) -> PlayedExample:
-    try:
-        simulated = simulate(parse(document), SEED, tracing=True)
-        result, cycle = simulated.result, simulated.evidence.cached(cycle_of)
-    except AgentFailedError as error:
-        result, cycle = result_of_failure(error), None
+    simulated = simulate(parse(document), SEED, tracing=True)
+    result, cycle = simulated.result, simulated.evidence.cached(cycle_of)
     return PlayedExample(document, _bad(result), cycle, len({*result.chains.values()}))
 
 

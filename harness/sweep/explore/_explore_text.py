@@ -6,11 +6,9 @@ from collections.abc import Iterator
 
 from rich.console import Console
 
-from harness.run.simulate import ENDED, evidence_lines
+from harness.run.simulate import evidence_lines
 from harness.scenario.verdict_names import BAD_IN_WORDS
 from harness.sweep.explore._exploring import Explored, SearchProgress, ViolatingRun
-
-_WORDS = {**BAD_IN_WORDS, ENDED: "an agent crashed or hung"}
 
 _MAX_SEEDS = 10
 """Maximum number of seeds that a sentence names."""
@@ -29,7 +27,7 @@ def watching(console: Console) -> Iterator[SearchProgress]:
     last = 0.0
 
     def on_violation(violation: ViolatingRun) -> None:
-        words = " and ".join(_WORDS[key] for key in violation.keys)
+        words = " and ".join(BAD_IN_WORDS[key] for key in violation.keys)
         console.print(f"seed {violation.seed}: {words}; shrinking", highlight=False)
 
     def on_step(runs: int, words: str) -> None:

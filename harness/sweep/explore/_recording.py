@@ -14,9 +14,8 @@ from functools import partial
 from typing import Any
 
 from harness.checker import Result
-from harness.errors import AgentFailedError
 from harness.play.simulation.fate_script import DecidedDelivery, FateScript, NameOf
-from harness.run.simulate import MemoryRecorder, result_of_failure, simulate_in_memory
+from harness.run.simulate import MemoryRecorder, simulate_in_memory
 from harness.scenario import Scenario
 from harness.scenario.fates import Fate
 from netem.medium import RandomDraws
@@ -61,12 +60,9 @@ class Recording:
 
 
 def record(scenario: Scenario, seed: int) -> Recording:
-    """Play a run and record it. If an agent crashes or hangs, the recording ends there."""
+    """Play a run and record it."""
     tape = _EventRecorder()
-    try:
-        result = simulate_in_memory(tape, scenario, seed, fate_script=partial(_RecordingScript, tape=tape)).result
-    except AgentFailedError as error:
-        result = result_of_failure(error)
+    result = simulate_in_memory(tape, scenario, seed, fate_script=partial(_RecordingScript, tape=tape)).result
     return Recording(result, tape.events, sorted(tape.lost, key=lambda lost: lost.at_s))
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
-from harness.scenario.verdict_names import ALL_CHECKS, UNFINISHED, Verdict, kind_of
+from harness.scenario.verdict_names import RUN_CHECKS, UNFINISHED, Verdict, kind_of
 from harness.sweep.matrix import _growth_metrics
 from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, estimate_share
 from harness.sweep.matrix._matrix_file import MatrixPoint, MatrixTask
@@ -96,7 +96,7 @@ def sum_up(point: MatrixPoint, runs: Sequence[Run], *, grows: bool = False) -> C
     estimates = {metric.name: metric.estimate(run.figures for run in judged) for metric in METRICS}
     further = BEFORE_FINAL_RECONCILE + (_growth_metrics.METRICS if grows else ())
     known = {metric.name: metric.estimate(run.figures for run in judged) for metric in further}
-    verdicts = {key: {run.seed: run.verdicts[key] for run in judged if key in run.verdicts} for key in ALL_CHECKS}
+    verdicts = {key: {run.seed: run.verdicts[key] for run in judged if key in run.verdicts} for key in RUN_CHECKS}
     bad = {key: [seed for seed, verdict in by_seed.items() if is_wrong(verdict)] for key, by_seed in verdicts.items()}
     wrong = {seed for seeds in bad.values() for seed in seeds}
     unfinished = [seed for seed, verdict in verdicts["liveness"].items() if verdict == UNFINISHED and seed not in wrong]

@@ -1,7 +1,7 @@
 """Return the runs of a matrix as a polars DataFrame, for notebooks."""
 
 from harness.present.polars import pl
-from harness.scenario.verdict_names import CHARACTERISTICS, FURTHER_CHECKS
+from harness.scenario.verdict_names import CHARACTERISTICS, ENDED, FURTHER_CHECKS
 from harness.sweep.matrix.matrix_outputs import run_rows
 from harness.sweep.matrix.matrix_run import Finished
 
@@ -10,7 +10,7 @@ _TYPES = {
     "backend": pl.String,
     "seed": pl.Int64,
     **{f"characteristic_{number}": pl.String for number in CHARACTERISTICS},
-    **dict.fromkeys(FURTHER_CHECKS, pl.String),
+    **dict.fromkeys((*FURTHER_CHECKS, ENDED), pl.String),
     "failed": pl.String,
     "unsupported": pl.String,
 }
@@ -25,7 +25,8 @@ def matrix_frame(finished: Finished) -> pl.DataFrame:
 
     - The numeric results of run.json follow, such as `mutual_chain`, `distinct_chains` and `messages`. Unknown figures
       are null.
-    - `characteristic_1` to `characteristic_6`, `steps`, `records` and `liveness` are verdicts.
+    - `characteristic_1` to `characteristic_6`, `steps`, `records` and `liveness` are verdicts. `ended` is `violated` if
+      an agent crashed or hung.
     - `failed` or `unsupported` is the reason why a run has no verdict.
 
     Raises MachineError if the extra `data` is not installed.

@@ -21,7 +21,7 @@ from typing import Any
 
 from harness.errors import MachineError
 from harness.present.junit import JunitCase, to_xml
-from harness.scenario.verdict_names import ALL_CHECKS, CHARACTERISTICS, FURTHER_CHECKS
+from harness.scenario.verdict_names import CHARACTERISTICS, ENDED, FURTHER_CHECKS, RUN_CHECKS
 from harness.sweep.matrix._cell import Cell, Run
 from harness.sweep.matrix._cell_scenarios import write_scenarios
 from harness.sweep.matrix._estimate import METRICS
@@ -92,7 +92,7 @@ def _cell_row(cell: Cell) -> dict[str, object]:
     for metric in METRICS:
         estimate = cell.estimates[metric.name]
         row |= {metric.name: estimate.mean, f"{metric.name}_low": estimate.low, f"{metric.name}_high": estimate.high}
-    return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in ALL_CHECKS}
+    return row | {f"violated_{key}": len(cell.violated.get(key, [])) for key in RUN_CHECKS}
 
 
 def _place(point: MatrixPoint) -> dict[str, object]:
@@ -113,7 +113,7 @@ def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
             "seed": run.seed,
             **{name: run.figures.get(name) for name in figures},
             **{f"characteristic_{number}": run.verdicts.get(number) for number in CHARACTERISTICS},
-            **{key: run.verdicts.get(key) for key in FURTHER_CHECKS},
+            **{key: run.verdicts.get(key) for key in (*FURTHER_CHECKS, ENDED)},
             "failed": run.failed,
             "unsupported": run.unsupported,
         }

@@ -15,8 +15,9 @@ from harness.run.run import run
 from harness.run.simulate import simulate
 from tests.harness.command import harness
 from tests.harness.virtual import scenario
-from ucp.agent import ON_MESSAGE, Agent
+from ucp.agent import ON_LOCAL_EVENT, ON_MESSAGE, Agent
 from ucp.core import Core
+from ucp.events import LoggableEvent
 from ucp.messages import BlockAddRequest
 
 FLIGHT: dict[str, Any] = {"agents": 3, "duration_s": 240, "events": {"source": "random", "mean_s": 8}, "capture": True}
@@ -67,6 +68,30 @@ def test_messages_to_a_dead_agent_are_not_lost(monkeypatch: pytest.MonkeyPatch, 
     assert finished.result.bad == ("steps",)
     assert [failure.incarnation for failure in finished.record.agents["3"].failures] == [1, 2]
     assert finished.result.judgements["steps"].reason.startswith("2 differences")
+
+
+@pytest.mark.parametrize("tracing", [True, False])
+def test_agent_that_died_reboots_with_its_disk(monkeypatch: pytest.MonkeyPatch, tracing: bool) -> None:
+    """The handler of Algorithm 1 completes a block and then raises an error. This block is not on the disk."""
+    right, dead = ON_LOCAL_EVENT["Build Data Block"], []
+
+    def dying(core: Core, event: LoggableEvent) -> str:
+        branch = right.run(core, event)
+        if core.agent_id == DEAD and len(core.completed) == 3 and not dead:
+            dead.append(list(core.completed))
+            raise KeyError("no such block")
+        return branch
+
+    monkeypatch.setitem(ON_LOCAL_EVENT, "Build Data Block", dataclasses.replace(right, run=dying))
+    reboot = [{"at_s": 200, "reboot": [DEAD], "down_s": 10, "disk": "kept"}]
+    flight = scenario(**FLIGHT | {"capture": False, "events": {"mean_s": 3}}, timeline=reboot, network={"loss": 0.0})
+    simulated = simulate(flight, 1, tracing=tracing)
+    agent = simulated.played.agents["3"]
+    assert (agent.outcome, agent.restarts, agent.reboots) == ("exported", 0, 1)
+    *on_disk, lost = [block.hex() for block in dead[0]]
+    completed = simulated.evidence.exports[DEAD].completed
+    assert completed[:2] == on_disk and lost not in completed
+    assert simulated.result.wrong == (("steps",) if tracing else ("ended",))
 
 
 def _end_of_record(home: Path) -> ReplayResult:

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from harness.errors import MachineError, ScenarioError
-from harness.play.process._agent_process import agent_command, reboots_with_disk
+from harness.play.process._agent_process import agent_command
 from harness.play.process.agent_mission import mission_file
 from harness.play.simulation._simulated_agent import DiskContents
 from harness.play.simulation.foreign._foreign_agent import ForeignAgent, IncarnationRecord
@@ -136,7 +136,7 @@ class ForeignSwarm:
             with_vehicle=False,
             incarnation=incarnation,
             epoch_us=0,
-            store="store" if reboots_with_disk(agent_id, self._scenario) else None,
+            store="store" if agent_id in self._scenario.with_disk() else None,
             bundle=f"{agent_id}.bundle.json" if self._keys else None,
         )
         mission["events"]["source"] = "none"

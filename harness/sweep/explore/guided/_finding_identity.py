@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from harness.archive.run_record import Cycle
 from harness.checker import Result
 from harness.checker.judgement import Judgement
-from harness.run.simulate import ENDED
 from harness.scenario import Scenario
-from harness.scenario.verdict_names import CHARACTERISTICS
+from harness.scenario.verdict_names import CHARACTERISTICS, ENDED
 from ucp.agent import ON_TIMER
 from ucp.settings import Settings
 
@@ -67,7 +66,7 @@ def _changed_settings(settings: Settings) -> str:
 
 def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) -> str:
     if key == ENDED:
-        return " ".join(judgement.reason.split()[2:])
+        return ", ".join(sorted({finding.detail.partition(":")[0] for finding in judgement.evidence}))
     if key == "6":
         holders = sorted(Counter(result.chains.values()).values(), reverse=True)
         return f"chains of {', '.join(map(str, holders))} agents"

@@ -16,14 +16,12 @@ from itertools import groupby
 from typing import NamedTuple
 
 from harness.checker import Evidence, Result
-from harness.checker.evidence import Watch
 from harness.checker.recurring_cycles import cycle_of
 from harness.checker.uniform_chain import common_prefix
-from harness.errors import INCOMPLETE, AgentFailedError
+from harness.errors import INCOMPLETE
 from harness.gc_pause import gc_paused
 from harness.proof.coverage import CoverageWatcher, ReachedStates
 from harness.proof.coverage.reached import simulate_watched
-from harness.run.simulate import result_of_failure
 from harness.scenario import Scenario
 from harness.sweep.explore._recording import RecordedEvent, record
 from harness.sweep.explore._scenario_document import Document, at, cut_after, document_of, timeline, with_key
@@ -116,11 +114,10 @@ class PlayedRun:
 def play_trial(scenario: Scenario, seed: int) -> PlayedRun:
     """Play a scenario, and return the result. Raises HarnessError if it cannot be played."""
     watcher = CoverageWatcher()
-    result, evidence = _played(scenario, seed, watcher.step)
+    simulated = simulate_watched(scenario, seed, watcher.step)
+    result, evidence = simulated.result, simulated.evidence
     divergence = None if scenario.final_reconcile or result.bad else _known_divergences(result)
-    found = identities(result, evidence.cached(cycle_of) if evidence else None, scenario)
-    if evidence is None:
-        return PlayedRun(watcher.reached, found)
+    found = identities(result, evidence.cached(cycle_of), scenario)
     timer_ends = timers_ended(evidence)
     moments = tuple(sorted({round(each.at_s, 3) for each in timer_ends if each.at_s <= scenario.duration_s}))
     patterns = failed_votes([each for each in timer_ends if each.at_s > scenario.duration_s])
@@ -138,16 +135,8 @@ def _known_divergences(result: Result) -> Divergence | None:
 
 def findings_of(scenario: Scenario, seed: int) -> tuple[FindingIdentity, ...]:
     """Return the findings of a run. Raises HarnessError if the scenario cannot be played."""
-    result, evidence = _played(scenario, seed, lambda state, run: None)
-    return identities(result, evidence.cached(cycle_of) if evidence else None, scenario)
-
-
-def _played(scenario: Scenario, seed: int, watch: Watch) -> tuple[Result, Evidence | None]:
-    try:
-        simulated = simulate_watched(scenario, seed, watch)
-    except AgentFailedError as error:
-        return result_of_failure(error), None
-    return simulated.result, simulated.evidence
+    simulated = simulate_watched(scenario, seed, lambda state, run: None)
+    return identities(simulated.result, simulated.evidence.cached(cycle_of), scenario)
 
 
 def with_liveness_phase(document: Document) -> Document:

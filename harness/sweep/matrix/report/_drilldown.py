@@ -8,7 +8,7 @@ from pathlib import Path
 
 from harness.present import text
 from harness.report.verdict_section import ICONS
-from harness.scenario.verdict_names import ALL_CHECKS, kind_of
+from harness.scenario.verdict_names import RUN_CHECKS, kind_of
 from harness.sweep.matrix._cell import Run, is_wrong
 from harness.sweep.matrix._cell_play import directory_name
 from harness.sweep.matrix._cell_scenarios import scenario_file
@@ -90,7 +90,7 @@ def _row(run: Run, figures: Sequence[str], directory: Path) -> RunRow:
     return RunRow(
         run.seed,
         kept if (directory / kept).exists() else None,
-        [] if not run.judged else [ICONS[kind_of(run.verdicts.get(key, ""))] for key in ALL_CHECKS],
+        [] if not run.judged else [ICONS[kind_of(run.verdicts.get(key, ""))] for key in RUN_CHECKS],
         [] if not run.judged else [text.value(run.figures.get(name)) for name in figures],
         run.failed,
         run.unsupported,

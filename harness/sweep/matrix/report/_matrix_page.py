@@ -9,7 +9,7 @@ from harness.errors import CANNOT_HERE
 from harness.present import svg, text
 from harness.report import html
 from harness.report.agent_programs import asked_for
-from harness.scenario.verdict_names import ALL_CHECKS
+from harness.scenario.verdict_names import RUN_CHECKS
 from harness.sweep.matrix import _growth_table
 from harness.sweep.matrix._cell_scenarios import scenario_file
 from harness.sweep.matrix._comparison import ChangedRuns
@@ -66,7 +66,7 @@ def to_html(finished: Finished, directory: Path, nights: StoredNights | None = N
         heatmaps=[_heatmap.heatmap(record, figure) for figure in shown],
         shades=range(_heatmap.SHADES),
         cells=drilldown(finished, directory),
-        judged=ALL_CHECKS,
+        judged=RUN_CHECKS,
         tried=list(describe_coverage(record.tried)) if record.tried else [],
         tried_cells=[(name_of(record.matrix, cell.point), cell) for cell in record.tried.cells] if record.tried else [],
         not_taken=record.tried.all_cells["branches"]["not_taken"] if record.tried else [],

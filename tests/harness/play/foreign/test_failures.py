@@ -1,17 +1,19 @@
 """Test errors of a foreign agent in virtual time. The record contains one sentence that names the agent."""
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from harness.errors import HarnessError, UnsupportedError
+from harness.errors import UnsupportedError
 from harness.play.progress import SilentProgress
 from harness.play.simulation.foreign import _foreign_agent, line_program
 from harness.run.run import Run, run
 from harness.run.simulate import simulate
+from harness.scenario.verdict_names import ENDED
 from tests.harness.play.foreign.agents import EXPORT, living, played_by, small
 from ucp.messages import BlockAddRequest, encode
 from ucp.trace import in_base64
@@ -146,6 +148,58 @@ def test_dead_program_does_not_end_the_run_for_others(tmp_path: Path) -> None:
         assert record.agents[agent].outcome == "exported" and last["t"] > 15
 
 
+@pytest.mark.parametrize("tracing", [True, False])
+def test_dead_program_is_a_finding_of_a_run_in_memory(tmp_path: Path, tracing: bool) -> None:
+    simulated = simulate(played_by({2: small(tmp_path, DIES)}, **{**SHORT, **BUSY}), 1, tracing=tracing)
+    assert simulated.played.mission_s >= 30
+    assert [simulated.played.agents[agent].outcome for agent in "123"] == ["exported", "crashed", "exported"]
+    assert simulated.result.wrong == (ENDED,)
+    (finding,) = simulated.result.judgements[ENDED].evidence
+    assert finding.agent_id == 2
+    assert finding.detail.startswith("crashed: it ended by itself with status 3 when it was given an event at 12.5 s")
+
+
+def test_program_that_fails_at_its_export_is_a_finding_in_memory(tmp_path: Path) -> None:
+    simulated = simulate(played_by({2: small(tmp_path)}, **{**SHORT, **BUSY}), 1, tracing=True)
+    assert "gave no `answer` to the command export" in simulated.result.judgements[ENDED].evidence[0].detail
+    assert [*simulated.evidence.exports] == [1, 3]
+
+
+ENDS_AT_FOURTH_EVENT = """
+import json, os
+from ucp import virtual
+answer, events = virtual.VirtualAgent.answer, 0
+def dying(agent):
+    global events
+    said = answer(agent)
+    events += '"trigger":{"event"' in said
+    return said if events < 4 else os._exit(7)
+virtual.VirtualAgent.answer = dying
+virtual.main()
+"""
+
+
+def test_dead_program_reboots_with_its_disk(tmp_path: Path) -> None:
+    (tmp_path / "dying.py").write_text(ENDS_AT_FOURTH_EVENT)
+    script = [{"at_s": 5.0 * number, "agent": 2, "bytes": 200} for number in range(1, 5)]
+    one = played_by(
+        {2: [sys.executable, str(tmp_path / "dying.py")]},
+        agents=2,
+        duration_s=100,
+        settings={"max_block_bytes": 300},
+        network={"loss": 0.0},
+        events={"source": "scripted", "script": script},
+        timeline=[{"at_s": 30, "reboot": [2], "down_s": 2, "disk": "kept"}],
+    )
+    finished = run(one, 1, tmp_path / "run", SilentProgress(), "sim")
+    agent = finished.record.agents["2"]
+    assert [failure.at_s for failure in agent.failures] == [20]
+    assert (agent.outcome, agent.restarts, agent.reboots) == ("exported", 0, 1)
+    completed = json.loads((tmp_path / "run/agents/2.chain.json").read_text())["completed"]
+    assert len(completed) == 3
+    assert not finished.result.bad
+
+
 def test_reboot_starts_a_dead_program_again(tmp_path: Path) -> None:
     reboot = [{"at_s": 16, "reboot": [2], "down_s": 2, "disk": "lost"}]
     dies_before_the_reboot = EXPORT + EVENT + "sys.exit(3) if given['t'] < 16 else None"
@@ -168,8 +222,9 @@ def test_agent_with_growing_number_of_datagrams_fails(tmp_path: Path, monkeypatc
     monkeypatch.setattr(_foreign_agent, "MAX_SENT_PER_S", 200)
     code = EVENT + "said['sent'] = ['AA==']\nif 'datagram' in given:\n    said['sent'] = ['AA==', 'AA==']"
     one = played_by(small(tmp_path, code), **SHORT)
-    with pytest.raises(HarnessError, match=r"agent \d sent more than 200 datagrams within a second, at 1\d"):
-        simulate(one, 1, tracing=True)
+    ended = simulate(one, 1, tracing=True).result.judgements[ENDED]
+    assert ended.reason == "agent 2 crashed; agent 1 crashed"
+    assert re.match(r"crashed: it sent more than 200 datagrams within a second, at 1\d", ended.evidence[0].detail)
 
 
 def test_stray_datagram_reaches_other_agents(tmp_path: Path) -> None:

@@ -13,6 +13,8 @@ import yaml
 from harness.errors import HarnessError
 from harness.play.simulation.foreign._program_pool import ProgramPool
 from harness.run.simulate import simulate
+from harness.scenario.verdict_names import ENDED
+from harness.sweep.matrix._cell import sum_up
 from harness.sweep.matrix._cell_play import RunPlayer
 from harness.sweep.matrix._matrix_file import Matrix
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
@@ -68,6 +70,15 @@ def test_matrix_checks_the_first_seed_of_each_cell(tmp_path: Path) -> None:
     first, *_ = matrix.tasks
     with pytest.raises(HarnessError, match="is not deterministic"):
         player(first)
+
+
+def test_dead_program_is_a_violation_in_a_matrix(tmp_path: Path) -> None:
+    command = {2: small(tmp_path, EXPORT + THIRD_EVENT_KILLS)}
+    document = {"name": "m", "loss": [0.0], "seeds": 1, "scenario": {**BUSY, "agent_command": command}}
+    matrix = Matrix.model_validate({**document, "backend": ["sim"]})
+    (task,) = matrix.tasks
+    cell = sum_up(task.point, [RunPlayer(matrix, tmp_path)(task)])
+    assert (cell.failed, cell.violated[ENDED]) == (0, [task.seed])
 
 
 def test_pool_reuses_programs_and_ends_them(tmp_path: Path) -> None:

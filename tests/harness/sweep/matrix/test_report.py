@@ -94,7 +94,7 @@ def test_the_runs_of_a_cell_begin_with_those_that_went_wrong() -> None:
     assert [row.seed for row in well.rows] == [1, 2, 3, 4]
     assert [row.seed for row in bad.rows] == [3, 2, 1, 4]
     assert bad.rows[0].failed is not None and bad.rows[0].failed.startswith("RuntimeError: </title>")
-    assert bad.rows[1].verdicts == [*"✓✓✗✓✓✓", *3 * ["\u2013"]]
+    assert bad.rows[1].verdicts == [*"✓✓✗✓✓✓", *4 * ["\u2013"]]
     assert bad.rows[1].figures[bad.figures.index("mutual chain")] == "20"
     assert bad.command == "ucp-harness run cells/loss-0.5-agents-5.yaml --backend sim --seed 3"
     assert bad.runs == "4 runs, 1 with violations, 1 failed"
