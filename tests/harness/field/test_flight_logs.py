@@ -10,7 +10,7 @@ from pymavlink import mavutil
 from pymavlink.DFReader import DFReader_binary
 
 from harness.errors import FieldError
-from harness.field.flight_logs import FlightLog, GpsTime, flight_log_kind, read_flight_log
+from harness.field.flight_logs import FlightLog, GpsTime, _reading, flight_log_kind, read_flight_log
 from tests.harness.field import flight_log_files as files
 
 WRITERS: dict[str, Callable[[], bytes]] = {"1.bin": files.dataflash_file, "1.tlog": files.telemetry_file}
@@ -259,6 +259,13 @@ def test_other_files_are_no_flight_logs(tmp_path: Path) -> None:
             read(tmp_path, name, data)
     with pytest.raises(FieldError, match="cannot be read"):
         read_flight_log(tmp_path)
+
+
+@pytest.mark.parametrize("beginning", [b"", b"{}", b'{"schema": "ucp-trace/2"}\n', b"Notes of \xfd5 November\n"])
+def test_other_files_need_no_message_definitions(monkeypatch: pytest.MonkeyPatch, beginning: bytes) -> None:
+    """The message definitions of pymavlink take 110 MiB of memory."""
+    monkeypatch.setattr(_reading, "_begins_with_frame", lambda beginning: pytest.fail("pymavlink is imported"))
+    assert flight_log_kind(Path("10.trace.jsonl"), beginning) is None
 
 
 def test_kind_is_recognised_by_content() -> None:
