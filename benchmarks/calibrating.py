@@ -1,10 +1,13 @@
 """Count how often the confidence intervals of `calibrate` contain the true parameters of simulated flights.
 
-    python -m benchmarks.calibrating [--flights N] [--first NUMBER]
+    python -m benchmarks.calibrating [--flights N] [--first NUMBER] [--channel PRESET]
 
 Each flight is a run in virtual time with captures. The number of a flight determines its scenario: the vehicles' plans,
 the exponent, the shadowing, the power and a loss at any distance. `calibrate` gets the directory of the run. The true
 values of `range_m`, `spread` and `floor` are those of `harness.field.calibrate._delivery_model`.
+
+With `--channel`, all vehicles share a radio channel with this preset. The shadowing of each link is then correlated in
+space and time, and frames collide.
 """
 
 import argparse
@@ -23,19 +26,28 @@ from harness.field.calibrate.calibration import CalibrationResult, calibrate, mo
 from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.scenario import Scenario
+from netem.channel import PRESETS
 from netem.radio import LogDistance
 
 
-def scenario_of(number: int, agents: int = 5, duration_s: float = 1200.0) -> tuple[dict[str, Any], DeliveryModel]:
-    """Return the scenario of a flight and its true parameters."""
+def scenario_of(
+    number: int, channel: str | None = None, agents: int = 5, duration_s: float = 1200.0
+) -> tuple[dict[str, Any], DeliveryModel]:
+    """Return the scenario of a flight and its true parameters. `channel` is the preset of a shared channel."""
     rng = Random(f"calibrating/{number}")
     log_distance = {
         "exponent": round(rng.uniform(2.0, 3.0), 2),
         "shadowing_db": round(rng.uniform(2.0, 6.0), 2),
     }
     range_m = rng.uniform(250.0, 600.0)
-    log_distance["power_dbm"] = round(20.0 - LogDistance(**log_distance).margin_db(range_m), 2)
+    receiver = {}
+    if channel is not None:
+        preset = PRESETS[channel]
+        receiver = {"sensitivity_dbm": preset.sensitivity_dbm, "frequency_hz": preset.frequency_hz}
+    default = LogDistance(**log_distance, **receiver)
+    log_distance["power_dbm"] = round(default.power_dbm - default.margin_db(range_m), 2)
     loss = rng.choice((0.0, 0.05, 0.15))
+    radio = {"channel": {"preset": channel, **log_distance}} if channel else {"radio": {"log_distance": log_distance}}
     plans = []
     for vehicle in range(2, agents + 1):
         places = [[round(rng.uniform(-1, 1) * 1.2 * range_m) for _ in range(2)] for _ in range(8)]
@@ -47,10 +59,10 @@ def scenario_of(number: int, agents: int = 5, duration_s: float = 1200.0) -> tup
         "agents": agents,
         "duration_s": duration_s,
         "capture": True,
-        "network": {"loss": loss, "radio": {"log_distance": log_distance}},
+        "network": {"loss": loss, **radio},
         "flight": plans,
     }
-    return scenario, model_of(LogDistance(**log_distance), loss)
+    return scenario, model_of(LogDistance(**log_distance, **receiver), loss)
 
 
 def calibrated(number: int, directory: Path, **options: Any) -> tuple[CalibrationResult, DeliveryModel]:
@@ -70,11 +82,11 @@ def covered(calibration: CalibrationResult, truth: DeliveryModel) -> dict[str, b
     return {name: getattr(truth, name) in intervals[name] for name in ("range_m", "spread", "floor")}
 
 
-def _results(numbers: range) -> Iterator[tuple[int, CalibrationResult, DeliveryModel]]:
+def _results(numbers: range, channel: str | None) -> Iterator[tuple[int, CalibrationResult, DeliveryModel]]:
     for number in numbers:
         with TemporaryDirectory() as directory:
             try:
-                yield number, *calibrated(number, Path(directory) / "run")
+                yield number, *calibrated(number, Path(directory) / "run", channel=channel)
             except HarnessError as error:
                 sys.stdout.write(f"{number}: {error}\n")
 
@@ -83,11 +95,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--flights", type=int, default=30)
     parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--channel", metavar="PRESET", choices=PRESETS)
     options = parser.parse_args()
     counts: Counter[str] = Counter()
     widths: list[float] = []
     scores: list[float] = []
-    for number, calibration, truth in _results(range(options.first, options.first + options.flights)):
+    for number, calibration, truth in _results(range(options.first, options.first + options.flights), options.channel):
         result = covered(calibration, truth)
         if calibration.fit is None or not result:
             counts["without a fit"] += 1

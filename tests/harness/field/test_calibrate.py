@@ -9,6 +9,7 @@ from random import Random
 import pytest
 
 from benchmarks.calibrating import calibrated, covered
+from harness.archive.traces import read_trace
 from harness.errors import FieldError
 from harness.field.calibrate._delivery_model import DeliveryModel, TransmissionAttempt, fit, student
 from harness.field.calibrate.calibration import CalibrationResult, calibrate, model_of, validate
@@ -17,6 +18,7 @@ from harness.scenario.load import load_scenario
 from netem.radio import LogDistance
 from tests.harness.command import harness
 from tests.harness.field import flight_log_files as files
+from ucp.trigger import MessageTrigger
 
 TRUTH = DeliveryModel(range_m=400.0, spread=0.4, floor=0.05)
 EPOCH_US = 1_790_000_000_000_000
@@ -149,6 +151,28 @@ def _taken_home(run: Path, directory: Path, vehicles: tuple[int, ...]) -> Path:
             messages.append(files.dataflash("POS", at_us, lat, lon, up, up, up))
         (directory / f"log{vehicle}.bin").write_bytes(files.dataflash_file(messages))
     return directory
+
+
+def test_flight_on_a_shared_channel_is_fitted(tmp_path: Path) -> None:
+    # An answer needs a good link to the agent that asked. If such answers counted, the interval would miss the range.
+    calibration, truth = calibrated(21, tmp_path / "run", channel="wifi_6")
+    assert covered(calibration, truth) == {"range_m": True, "spread": True, "floor": True}
+
+
+def test_answer_in_a_trace_does_not_count_at_the_agent_that_asked(
+    flown: tuple[Path, CalibrationResult, DeliveryModel], tmp_path: Path
+) -> None:
+    directory = _taken_home(flown[0], tmp_path / "home", (1, 2, 3, 4))
+    traces = {agent_id: read_trace(directory / f"{agent_id}.trace.jsonl") for agent_id in (1, 2, 3, 4)}
+    answers = {
+        (agent_id, round(run.t, 3)): run.trigger.sender
+        for agent_id, trace in traces.items()
+        for run in (trace.runs if trace else ())
+        if isinstance(run.trigger, MessageTrigger) and run.sent
+    }
+    attempts = [(each, answers.get((each.sender, round(each.at_s, 3)))) for each in calibrate([directory]).attempts]
+    assert len([each for each, asking in attempts if asking is not None]) > 20
+    assert not [each for each, asking in attempts if asking == each.receiver]
 
 
 def test_flight_logs_give_the_distances_of_the_run(
