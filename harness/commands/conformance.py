@@ -11,13 +11,18 @@ from rich.text import Text
 from harness.commands._shared_options import refuse_existing, write_new
 from harness.commands.terminal import complain, output, print_json
 from harness.conformance.conformance_page import read_agents, to_html
-from harness.conformance.conformance_run import ConformanceRequest, conform
+from harness.conformance.conformance_run import ConformanceRequest, conform, remote_agents
 from harness.conformance.results import TITLES, ConformanceResults
 from harness.conformance.results_table import progress, render, summary, to_junit
 from harness.conformance.vectors import generate, to_lines
 from harness.errors import HarnessError, MachineError
 from harness.play.agent_control import resolve_command
+from harness.play.remote.agent_pool import AgentPool
+from harness.play.remote.join import join_command
+from harness.play.remote.secret_file import read_secret
 from harness.run.parallel import sigterm_as_ctrl_c
+from sitl.address import ListenAddress
+from sitl.vehicle import VehicleError
 from ucp.agent import HANDLERS
 
 
@@ -49,6 +54,13 @@ def conformance_command(
     page: Annotated[Path, typer.Option(metavar="FILE", help="Page for the results of --matrix; must be new.")] = Path(
         "conformance.html"
     ),
+    listen: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS:PORT", help="Test an agent that joins from another computer, not COMMAND."),
+    ] = None,
+    secret_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="File with the secret that the other computer has, too.")
+    ] = None,
     write: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the generated vectors, and test nothing; must be new.")
     ] = None,
@@ -71,19 +83,23 @@ def conformance_command(
     if matrix is not None:
         if command:
             raise ConformanceRequestError("--matrix and the command of one agent exclude each other: give one of them")
-        if as_json or junit is not None or keep is not None:
-            raise ConformanceRequestError("--matrix excludes --json, --junit and --keep: leave them out")
+        if as_json or junit is not None or keep is not None or listen is not None:
+            raise ConformanceRequestError("--matrix excludes --json, --junit, --keep and --listen: leave them out")
         refuse_existing([page])
         raise typer.Exit(_test_all(read_agents(matrix), only, page, virtual=virtual))
-    if not command:
+    remote = _remote_agents(listen, secret_file, command, virtual=virtual)
+    if not command and remote is None:
         raise ConformanceRequestError(
             "the command of the agent is missing: for example, `ucp-harness conformance -- "
             "python3 -m ucp.node` tests the harness's own agent"
         )
     console = output(stderr=as_json, highlight=False)
+    if remote is not None:
+        complain(f"on the other computer, type: {join_command(remote.listen, remote.agent_id)}")
+    resolved = tuple(resolve_command(command, "the agent")) if command else ()
     place = keep or Path("conformance-failures")
     with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as show:
-        request = ConformanceRequest(tuple(resolve_command(command, "the agent")), only, _unused_path(place), virtual)
+        request = ConformanceRequest(resolved, only, _unused_path(place), virtual, remote=remote)
         results = conform(request, Path(scratch), show)
     if junit is not None:
         write_new(junit, [to_junit(results)])
@@ -94,6 +110,27 @@ def conformance_command(
     if results.interrupted:
         complain(f"interrupted; results so far: {summary(results)}")
     raise typer.Exit(results.exit_status)
+
+
+def _remote_agents(
+    listen: str | None, secret_file: Path | None, command: list[str] | None, *, virtual: bool
+) -> AgentPool | None:
+    """Return the agents on another computer. Return None if the agent runs here."""
+    if (listen is None) != (secret_file is None):
+        raise ConformanceRequestError("--listen and --secret-file need each other: give both of them")
+    if listen is None or secret_file is None:
+        return None
+    if command or virtual:
+        raise ConformanceRequestError(
+            "--listen excludes --virtual and a command: the other computer has the command, after `join ... --`"
+        )
+    try:
+        address = str(ListenAddress.parse(listen))
+    except VehicleError:
+        raise ConformanceRequestError(
+            f"--listen: {listen[:60]!r} is not ADDRESS:PORT, for example 192.168.7.1:14700"
+        ) from None
+    return remote_agents(address, read_secret(secret_file))
 
 
 def _test_all(agents: Mapping[str, Sequence[str]], only: str | None, page: Path, *, virtual: bool) -> int:

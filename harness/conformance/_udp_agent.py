@@ -109,7 +109,7 @@ class UdpAgent(AgentUnderTest):
         port = lab.take_port()
         try:
             process = await ProcessUnderTest.start(
-                lab, lab.new_directory(), lab.mission(variant, port, timing.speedup), AGENT
+                lab, lab.new_directory(), lab.mission(variant, port, timing.speedup), AGENT, port, timing.speedup
             )
         except BaseException:
             lab.return_port(port)
@@ -126,7 +126,7 @@ class UdpAgent(AgentUnderTest):
     async def _begin(self) -> None:
         self._epoch = time.time()
         epoch_us = round(self._epoch * MICROSECONDS)
-        await self.process.ask("start", epoch_us=epoch_us)
+        await self.process.start_mission(epoch_us)
 
     async def close(self) -> None:
         self.peer_socket.close()

@@ -7,7 +7,6 @@ Each agent has its own port, so agents that are tested in parallel do not receiv
 import asyncio
 import json
 import os
-import signal
 import socket
 import struct
 import sys
@@ -25,6 +24,8 @@ from harness.conformance._state_space import SettingsVariant
 from harness.errors import HarnessError, MachineError, UnsupportedError
 from harness.play.agent_control import AgentRefusedError, AgentSilentError, last_line_in
 from harness.play.process.controlled_program import ControlledProgram, ProgramEndedError
+from harness.play.process.lab_program import LabProgram
+from harness.play.remote.agent_pool import AgentPool, RemoteIncarnation
 from netem.errors import LabUnavailable, NetemError, SpawnError
 from netem.lab import Lab
 from ucp.features import UNSUPPORTED
@@ -68,9 +69,11 @@ class UdpLab:
     reserves a UDP port for an agent.
     """
 
-    def __init__(self, place: Path, command: Sequence[str], count: int) -> None:
+    def __init__(self, place: Path, command: Sequence[str], count: int, remote: AgentPool | None = None) -> None:
         self.place = place
         self.command = tuple(command)
+        self.remote = remote
+        """The agents on another computer. None if the agents under test run here."""
         self._ports = [FIRST_PORT + number for number in range(count)]
         self._lab: Lab | None = None
         self._sockets: dict[int, socket.socket] = {}
@@ -224,32 +227,38 @@ class PeerSocket:
 class ProcessUnderTest:
     """The process of an agent under test, with its control socket and its files."""
 
-    def __init__(self, directory: Path, agent_id: int, program: ControlledProgram) -> None:
+    def __init__(
+        self, directory: Path, agent_id: int, program: ControlledProgram, incarnation: RemoteIncarnation | None
+    ) -> None:
         self.directory = directory
         self.agent_id = agent_id
         self.program = program
+        self._incarnation = incarnation
         self.signalled = False
         """True if the harness has sent a signal. The agent may not answer after it."""
 
     @classmethod
     async def start(
-        cls, air: UdpLab, directory: Path, mission: dict[str, Any] | bytes, agent_id: int
+        cls, air: UdpLab, directory: Path, mission: dict[str, Any] | bytes, agent_id: int, port: int, speedup: float
     ) -> "ProcessUnderTest":
         """Start the process without waiting until it is ready. Raises NoAgentError if the program does not exist."""
         name = f"{agent_id}.mission.json"
         text = mission if isinstance(mission, bytes) else json.dumps(mission).encode()
         (directory / name).write_bytes(text)
+        incarnation = None
+        if air.remote is not None:
+            incarnation = RemoteIncarnation(air.remote, agent_id, AGENTS_VEHICLE, port, speedup)
         try:
             program = await ControlledProgram.start(
-                partial(air.lab.spawn, AGENTS_VEHICLE, role="agent"),
-                [*air.command, name],
+                partial(_spawn, air.lab, incarnation),
+                [*(incarnation.stand_in_command if incarnation else air.command), name],
                 directory=directory,
                 control=directory / f"{agent_id}.control",
                 log=directory / f"{agent_id}.out",
             )
         except SpawnError as error:
             raise NoAgentError(str(error)) from None
-        return cls(directory, agent_id, program)
+        return cls(directory, agent_id, program, incarnation)
 
     @property
     def last_line(self) -> str:
@@ -312,12 +321,27 @@ class ProcessUnderTest:
         self.signalled = True
         await self.program.process.send_signal(number)
 
+    async def start_mission(self, epoch_us: int) -> int:
+        """Start the mission. Return its start in the time of the agent's computer. Raises the errors of `ask`."""
+        await self.ask("start", epoch_us=epoch_us)
+        return epoch_us if self._incarnation is None else self._incarnation.epoch_us
+
+    async def left_behind(self) -> list[str]:
+        """End the processes that the ended agent left behind, and return their names."""
+        return [*self.program.process.left_behind, *await self.program.end_children()]
+
     async def pause(self) -> None:
-        await self.send_signal(signal.SIGSTOP)
+        self.signalled = True
+        await self.program.process.pause()
 
     async def resume(self) -> None:
         await self.program.process.resume()
         self.signalled = False
+
+
+async def _spawn(lab: Lab, incarnation: RemoteIncarnation | None, argv: Sequence[str], /, **options: Any) -> LabProgram:
+    program = await lab.spawn(AGENTS_VEHICLE, argv, role="agent", **options)
+    return program if incarnation is None else incarnation.controlled(program)
 
 
 def _timestamp(ancillary: Sequence[tuple[int, int, bytes]]) -> float:

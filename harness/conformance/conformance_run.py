@@ -12,6 +12,7 @@ from harness.conformance import _virtual_agent as virtual
 from harness.conformance._blame import BlameEvidence
 from harness.conformance._handwritten import handwritten
 from harness.conformance._kept_failures import keep
+from harness.conformance._reference_model import AGENT
 from harness.conformance._suite import (
     MAX_FAILURES_OF_A_KIND,
     MAX_SUSPICIONS,
@@ -25,6 +26,7 @@ from harness.conformance._udp_lab import UdpLab
 from harness.conformance.results import FURTHER_CHECKS, AlgorithmCounts, CaseResult, ConformanceResults
 from harness.conformance.vectors import VectorSet, generate
 from harness.errors import MachineError
+from harness.play.remote.agent_pool import PLACES, AgentPool
 
 VIRTUAL_WORKERS = 2
 """Number of processes of the agent in a test in virtual time."""
@@ -49,6 +51,13 @@ class ConformanceRequest:
     """True to play the handwritten cases as well, over UDP."""
     max_suspicions: int = MAX_SUSPICIONS
     limit_s: float = LIMIT_S
+    remote: AgentPool | None = None
+    """The agents on another computer, over UDP. `command` is then empty."""
+
+
+def remote_agents(listen: str, secret: bytes) -> AgentPool:
+    """Return the agents under test on another computer, which connects at the address `listen`."""
+    return AgentPool(AGENT, listen, secret)
 
 
 def conform(
@@ -82,8 +91,8 @@ async def _run(
     show_progress: Callable[[int], None],
     results: ConformanceResults,
 ) -> None:
-    until = time.monotonic() + request.limit_s
     if request.virtual:
+        until = time.monotonic() + request.limit_s
         start, programs = virtual.starter(request.command, place / "errors.log")
         try:
             await _play(
@@ -95,14 +104,42 @@ async def _run(
             for program in programs:
                 program.close()
         return
-    async with UdpLab(place, request.command, MAX_WORKERS + RETRY_WORKERS) as lab:
-        start = _udp_agent.starter(lab)
-        await _play(
-            VectorSuite(start, vector_sets, show_progress, workers=MAX_WORKERS, max_suspicions=request.max_suspicions),
-            until,
-            request,
-            results,
+    if request.remote is None:
+        await _play_over_udp(request, place, vector_sets, show_progress, results)
+        return
+    async with request.remote.opened(place):
+        await request.remote.wait()
+        results.command = request.remote.command
+        results.notes.append(
+            f"the agent ran on the computer {request.remote.host}, to which a message took "
+            f"{1000 * request.remote.delay_s:.2g} ms"
         )
+        playing = asyncio.create_task(_play_over_udp(request, place, vector_sets, show_progress, results))
+        watching = asyncio.create_task(request.remote.watch())
+        try:
+            await asyncio.wait({playing, watching}, return_when=asyncio.FIRST_COMPLETED)
+            for task in (watching, playing):
+                if task.done():
+                    task.result()
+        finally:
+            for task in (watching, playing):
+                task.cancel()
+            await asyncio.gather(watching, playing, return_exceptions=True)
+
+
+async def _play_over_udp(
+    request: ConformanceRequest,
+    place: Path,
+    vector_sets: Sequence[VectorSet],
+    show_progress: Callable[[int], None],
+    results: ConformanceResults,
+) -> None:
+    until = time.monotonic() + request.limit_s
+    workers = MAX_WORKERS if request.remote is None else PLACES
+    async with UdpLab(place, request.command, MAX_WORKERS + RETRY_WORKERS, request.remote) as lab:
+        start = _udp_agent.starter(lab)
+        suite = VectorSuite(start, vector_sets, show_progress, workers=workers, max_suspicions=request.max_suspicions)
+        await _play(suite, until, request, results)
         if request.handwritten:
             results.cases += await handwritten(lab, request.only)
 
@@ -181,7 +218,7 @@ def _keep_failures(results: ConformanceResults, request: ConformanceRequest) -> 
         for number, case in enumerate(results.cases, 1):
             if case.verdict == "failed":
                 place = request.keep / f"{number:02d}-{case.handler or 'program'}"
-                keep(case, request.command, place)
+                keep(case, results.command, place)
                 case = replace(case, directory=str(place))
             kept.append(case)
     except MachineError as error:

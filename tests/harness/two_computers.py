@@ -5,6 +5,7 @@ them with nftables.
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -12,11 +13,20 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import pytest
+
 from tests.harness.command import COMMAND, DEADLINE_S
 
 LAB, FAR = "192.168.7.1", "192.168.7.2"
 PORT = 14700
 LISTEN = f"{LAB}:{PORT}"
+
+
+needs_two_computers = [
+    pytest.mark.skipif(not os.access("/dev/net/tun", os.W_OK), reason="this user may not open /dev/net/tun"),
+    pytest.mark.skipif(os.geteuid() != 0, reason="only root can make two computers"),
+    pytest.mark.skipif(shutil.which("nft") is None, reason="nftables is not installed"),
+]
 
 
 class TwoComputers:

@@ -81,12 +81,14 @@ class BenchAgent:
         self.peer_socket = peer_socket
         self.agent_id = process.agent_id
         self.epoch_s = 0.0
+        self.epoch_us = 0
+        """The start of the mission in the time of the agent's computer."""
         self._sequence = 0
 
     async def begin(self, ahead_s: float = 0.0) -> None:
         """Start the mission in `ahead_s` seconds of wall time. A negative value sets the start in the past."""
         self.epoch_s = time.time() + ahead_s
-        await self.process.ask("start", epoch_us=round(self.epoch_s * MICROSECONDS))
+        self.epoch_us = await self.process.start_mission(round(self.epoch_s * MICROSECONDS))
 
     def mission_s(self) -> float:
         return (time.time() - self.epoch_s) * SPEEDUP
@@ -152,6 +154,11 @@ class CaseBench:
     def __init__(self, lab: UdpLab) -> None:
         self.lab = lab
 
+    def require_own_machine(self, what: str) -> None:
+        """Raise CannotJudgeError if the agent runs on another computer. `what` names the things not visible here."""
+        if self.lab.remote is not None:
+            raise CannotJudgeError(f"{what} of an agent on another computer cannot be seen from here")
+
     @asynccontextmanager
     async def agent(
         self,
@@ -201,7 +208,9 @@ class CaseBench:
             agent_id = int(keys.get("agent_id", AGENT))
             peer_socket = PeerSocket(self.lab, taken)
             try:
-                process = await ProcessUnderTest.start(self.lab, where, document if text is None else text, agent_id)
+                process = await ProcessUnderTest.start(
+                    self.lab, where, document if text is None else text, agent_id, taken, SPEEDUP
+                )
                 try:
                     yield BenchAgent(process, peer_socket)
                 finally:

@@ -24,6 +24,8 @@ STORE = {"store": STORE_FILE, "features": ["store"]}
 
 @case("a full disk ends the trace, and the agent continues", "contract, The program")
 async def _full(bench: CaseBench) -> None:
+    bench.require_own_machine("the disk")
+
     def prepare(directory: Path) -> None:
         (directory / f"{AGENT}.trace.jsonl").symlink_to("/dev/full")
 
@@ -40,6 +42,8 @@ async def _full(bench: CaseBench) -> None:
 
 @case("an export that cannot be written gives an error and exit status 1", "contract, The program")
 async def _no_export(bench: CaseBench) -> None:
+    bench.require_own_machine("the disk")
+
     def prepare(directory: Path) -> None:
         (directory / f"{AGENT}.chain.json" / "in the way").mkdir(parents=True)
 
@@ -95,6 +99,8 @@ async def _reboot(bench: CaseBench) -> None:
 
 @case("a store with a truncated end is valid up to its last whole entry", "contract, Store", 20)
 async def _torn(bench: CaseBench) -> None:
+    bench.require_own_machine("the store")
+
     def damage(path: Path) -> None:
         with path.open("ab") as file:
             file.write(b"\x00half an ent")

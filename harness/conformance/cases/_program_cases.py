@@ -110,6 +110,13 @@ async def _ends(bench: CaseBench, number: int) -> None:
         await agent.receive_one(BlockAddRequest, "an event that fills a block")
         export = await _exported(agent, number)
         require(len(export["completed"]) == 1, "one completed block in the export", len(export["completed"]))
+
+
+@case("the agent leaves no control socket and no other files at its end", "contract, The program")
+async def _files(bench: CaseBench) -> None:
+    bench.require_own_machine("the directory")
+    async with bench.agent() as agent:
+        await _exported(agent, signal.SIGTERM)
         socket = agent.process.directory / f"{agent.agent_id}.control"
         require(not socket.exists(), "no control socket any more", "it is there")
         own = {f"{agent.agent_id}.{each}" for each in ("mission.json", "chain.json", "trace.jsonl", "log", "out")}
@@ -153,6 +160,7 @@ async def _processes(agent: BenchAgent) -> list[int]:
 
 @case("a chain export replaces the earlier one in one step", "contract, The program")
 async def _whole_export(bench: CaseBench) -> None:
+    bench.require_own_machine("the files")
     async with bench.agent() as agent:
         await agent.process.export()
         with (agent.process.directory / f"{agent.agent_id}.chain.json").open() as earlier:
@@ -165,15 +173,17 @@ async def _whole_export(bench: CaseBench) -> None:
 @case("the agent leaves no process running at its end", "contract, The program")
 async def _children(bench: CaseBench) -> None:
     async with bench.agent() as agent:
-        await _processes(agent)
+        if bench.lab.remote is None:  # a far end sees all processes
+            await _processes(agent)
         await agent.process.send_signal(signal.SIGTERM)
         await agent.end()
-        left = await agent.process.program.end_children()
+        left = await agent.process.left_behind()
         require(not left, "no process that runs after the end of the agent", ", ".join(left))
 
 
 @case("inputs and clients leave no descriptors open", "contract, The program")
 async def _descriptors(bench: CaseBench) -> None:
+    bench.require_own_machine("the descriptors")
     async with bench.agent() as agent:
         before = _open_descriptors(await _processes(agent))
         for _ in range(INPUTS):
@@ -265,6 +275,7 @@ async def _unknown_keys(bench: CaseBench) -> None:
 
 @case("a port in use gives an error and exit status 2", "contract, The program")
 async def _port(bench: CaseBench) -> None:
+    bench.require_own_machine("the ports")
     port = bench.lab.take_port()
     try:
         async with bench.agent(port=port):
@@ -318,6 +329,7 @@ async def _control(bench: CaseBench) -> None:
 
 @case("two simultaneous clients of the control socket are both answered", "contract, Control socket")
 async def _two_clients(bench: CaseBench) -> None:
+    bench.require_own_machine("the control socket")
     async with bench.agent() as agent:
         status = b'{"command": "status"}'
         both = await asyncio.gather(_lines(agent, status, status), _lines(agent, status, status))

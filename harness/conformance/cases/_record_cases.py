@@ -94,7 +94,7 @@ async def _play_recorded_mission(bench: CaseBench) -> _CaseRecords:
         export_s = before_s, agent.mission_s()
         status = await agent.status()
         directory, agent_id = agent.process.directory, agent.agent_id
-        record, epoch_s = list(agent.peer_socket.record), agent.epoch_s
+        record, epoch_s, epoch_us = list(agent.peer_socket.record), agent.epoch_s, agent.epoch_us
         path = directory / f"{agent_id}{SUFFIX}"
         if not path.exists():
             raise CannotJudgeError("the agent writes no trace")
@@ -108,7 +108,7 @@ async def _play_recorded_mission(bench: CaseBench) -> _CaseRecords:
         raise WrongBehaviourError("a chain export that can be read", str(error)) from None
     to_agent = [((at_s - epoch_s) * SPEEDUP, data) for at_s, by_agent, data in record if not by_agent]
     sent = [data for _, by_agent, data in record if by_agent]
-    return _CaseRecords(trace, export, status, to_agent, sent, export_s, round(epoch_s * MICROSECONDS))
+    return _CaseRecords(trace, export, status, to_agent, sent, export_s, epoch_us)
 
 
 def _bytes(recorded: RecordedBytes | None) -> bytes:

@@ -36,9 +36,10 @@ from harness.play.agent_control import (
     last_line,
     resolve_command,
 )
-from harness.play.process._run_lab import LabProgram, MissionLab
+from harness.play.process._run_lab import MissionLab
 from harness.play.process.agent_mission import mission_file
 from harness.play.process.controlled_program import ControlledProgram, ProgramEndedError
+from harness.play.process.lab_program import LabProgram
 from harness.play.trace_space import trace_quota
 from harness.play.variant import variant_in_use
 from harness.scenario import Scenario

@@ -364,7 +364,7 @@ class ProgramRun:
 
     def _remote_agent(self, agent_id: int) -> AgentProcess:
         controlled = partial(self._remote.program, agent_id)
-        command = self._remote.stand_in_command()
+        command = self._remote.stand_in_command(agent_id)
         return AgentProcess(agent_id, self.rundir, command, self.clock.now, controlled=controlled)
 
     async def _cut_off(self) -> None:

@@ -10,44 +10,13 @@ from types import TracebackType
 from typing import Literal, Protocol, Self
 
 from harness.archive.directory import RunDirectory
+from harness.play.process.lab_program import LabProgram
 from harness.scenario import Scenario
 from netem.conditions import NetworkConditions
 from netem.engine import AppliedConditions
 from netem.lab import Lab as NetworkLab
 
 Role = Literal["agent", "vehicle"]
-
-
-class LabProgram(Protocol):
-    """A program that runs in the virtual network. Its methods raise NetemError if the network fails."""
-
-    @property
-    def returncode(self) -> int | None:
-        """The exit status, or the negative number of the signal that killed the program. None while it runs."""
-
-    @property
-    def end(self) -> str:
-        """A phrase for the user that describes how the program ended."""
-
-    @property
-    def left_behind(self) -> Sequence[str]:
-        """The names of the processes that `terminate` ended together with the container of the program. Without a
-        container, they run on, and the list is empty.
-        """
-
-    async def wait(self) -> int:
-        """Wait for the program to end and for all its output to be in its files. Return `returncode`."""
-
-    async def send_signal(self, number: int) -> None:
-        """Send a signal to the program. Do nothing if it has ended."""
-
-    async def pause(self) -> None:
-        """Suspend the program until `resume`."""
-
-    async def resume(self) -> None: ...
-
-    async def terminate(self, grace_s: float) -> int:
-        """End the program with SIGTERM, and after `grace_s` seconds with SIGKILL. Return `returncode`."""
 
 
 class MissionLab(Protocol):

@@ -11,7 +11,8 @@ from typing import Any
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
 from harness.play._child_processes import passed_on
-from harness.play.process._run_lab import LabProgram, MissionLab
+from harness.play.process._run_lab import MissionLab
+from harness.play.process.lab_program import LabProgram
 from harness.scenario.vehicles import Flight
 from netem.radio import Place
 from sitl.circumstances import SimulatedFailure

@@ -14,7 +14,7 @@ from typing import Any, Protocol, Self
 
 from harness.play._child_processes import ChildProcesses
 from harness.play.agent_control import AgentControl, AgentSilentError, last_line_in
-from harness.play.process._run_lab import LabProgram
+from harness.play.process.lab_program import LabProgram
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0

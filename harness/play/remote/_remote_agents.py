@@ -1,4 +1,4 @@
-"""Wait for agents on other computers, and pass their connections to the stand-ins of a run.
+"""Let agents on other computers take part in a run.
 
 A far end may connect at any time of a run. Its connection waits here until a stand-in needs it, or replaces the lost
 connection of a stand-in. Each connection carries at most one incarnation of an agent. After it, the far end connects
@@ -8,11 +8,7 @@ again.
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import json
-import secrets
 import socket
-import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
@@ -22,29 +18,15 @@ from typing import Any
 from harness.archive.directory import RunDirectory
 from harness.archive.run_record import CutOff, RemoteRecord
 from harness.errors import MachineError, ScenarioError
-from harness.play.process._run_lab import LabProgram
-from harness.play.remote._far_clock import FarClock, ping
-from harness.play.remote._handshake import PROTOCOL, HandshakeError, Hello, receive_hello
+from harness.play.process.lab_program import LabProgram
+from harness.play.remote._far_ends import JOIN_LIMIT_S, SOCKET, FarEnd, FarEnds
 from harness.play.remote._remote_program import RemoteProgram
-from harness.play.remote._wire import Channel, Kind, WireError, bind_path, hand_over, prepare
+from harness.play.remote._stand_in_task import StandInTask
 from harness.play.remote.secret_file import read_secret
 from harness.scenario import Scenario
-from harness.scenario.agent_options import RemoteOptions
 from harness.scenario.changes import NetworkChange, timeline_of
 from netem.conditions import Delay, LinkConditions, NetworkConditions
-from sitl.address import ListenAddress
-from ucp.features import CONTRACT
-
-SOCKET = "join"
-JOIN_LIMIT_S = 300.0
-"""Wall seconds in which all remote agents must join before the run."""
-PINGS = 20
-PING_LIMIT_S = 10.0
-MAX_HANDSHAKES = 16
-"""Maximum number of connections in their handshake. Further connections are closed at once."""
-MAX_COMPLAINTS = 10
-MAX_STAND_IN_BYTES = 4096
-MAX_TEXT = 200
+from ucp.messages import PORT
 
 
 @dataclass
@@ -55,7 +37,7 @@ class _RemoteVehicle:
     host: str = ""
     command: list[str] = field(default_factory=list)
     session: str = ""
-    held: tuple[socket.socket, Channel] | None = None
+    held: FarEnd | None = None
     """The connection that waits for a stand-in."""
     stand_in: socket.socket | None = None
     offset_s: float | None = None
@@ -72,17 +54,20 @@ class _RemoteVehicle:
     joins: int = 0
     joined: asyncio.Event = field(default_factory=asyncio.Event)
 
+    @property
+    def is_alive(self) -> bool:
+        """True if the far end that joined before still has a connection."""
+        if self.held is not None:
+            return self.held.is_connected
+        return self.stand_in is not None and not self.cut_off
+
 
 class RemoteAgents:
     """The agents of a run that are on other computers. Without such agents, all methods do nothing."""
 
     def __init__(self, scenario: Scenario, rundir: RunDirectory, now: Callable[[], float]) -> None:
         self._scenario, self._rundir, self._now = scenario, rundir, now
-        self._run = secrets.token_hex(8)
         self._vehicles = {agent: _RemoteVehicle(agent) for agent in (scenario.remote.agents if scenario.remote else ())}
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._handshakes = 0
-        self._complaints = 0
         self._ended = False
         self.when_cut_off: Callable[[], None] = lambda: None
         """Called when a vehicle was cut off, or came back."""
@@ -107,9 +92,10 @@ class RemoteAgents:
         """Return the program that the harness controls in place of the stand-in."""
         return RemoteProgram(stand_in, lambda: self._vehicles[agent_id].left_behind)
 
-    def stand_in_command(self) -> list[str]:
+    def stand_in_command(self, agent_id: int) -> list[str]:
         """Return the command of a stand-in, without the mission file."""
-        return [sys.executable, "-P", "-m", "harness.play.remote.stand_in", str(self._rundir.path / SOCKET)]
+        task = StandInTask(agent_id, agent_id, agent_id, PORT, self._scenario.speedup, measures_lag=True)
+        return task.command(self._rundir.path / SOCKET)
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[None]:
@@ -119,36 +105,18 @@ class RemoteAgents:
             yield
             return
         secret = read_secret(Path(options.secret_file))
-        listener = _listening(options)
-        inside = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        path = self._rundir.path / SOCKET
-        try:
-            with listener, inside:
-                bind_path(inside, path)
-                path.chmod(0o600)
-                inside.listen()
-                inside.setblocking(False)
-                accepting = [
-                    asyncio.create_task(self._accept(listener, secret)),
-                    asyncio.create_task(self._accept_stand_ins(inside)),
-                ]
-                try:
-                    yield
-                finally:
-                    for task in (*accepting, *self._tasks):
-                        task.cancel()
-                    await asyncio.gather(*accepting, *self._tasks, return_exceptions=True)
-                    self._close()
-        finally:
-            path.unlink(missing_ok=True)
-
-    def _close(self) -> None:
-        for vehicle in self._vehicles.values():
-            if vehicle.held is not None:
-                vehicle.held[0].close()
-            if vehicle.stand_in is not None:
-                asyncio.get_running_loop().remove_reader(vehicle.stand_in)
-                vehicle.stand_in.close()
+        if options.listen is None:
+            named = ", ".join(map(str, options.agents))
+            raise ScenarioError(
+                f"agent {named} joins from another computer, but no address is set for it: add `--listen ADDRESS:PORT`"
+            )
+        async with FarEnds(self, self._scenario.name).opened(options.listen, secret, self._rundir.path):
+            try:
+                yield
+            finally:
+                for vehicle in self._vehicles.values():
+                    if vehicle.held is not None:
+                        vehicle.held.connection.close()
 
     async def wait(self, show: Callable[[str], None]) -> None:
         """Wait until all agents have joined. Raises MachineError after `JOIN_LIMIT_S`, and ScenarioError if the
@@ -170,125 +138,46 @@ class RemoteAgents:
             if isinstance(change, NetworkChange):
                 self.compensated(change.conditions.at_speed(self._scenario.speedup))
 
-    # Far ends
+    # The methods of harness.play.remote._far_ends.Host
 
-    def _start(self, coroutine: Any) -> None:
-        task = asyncio.create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def _accept(self, listener: socket.socket, secret: bytes) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                connection, address = await loop.sock_accept(listener)
-            except OSError:  # no file descriptor is free, or the client has gone
-                await asyncio.sleep(1.0)
-                continue
-            if self._handshakes >= MAX_HANDSHAKES:
-                connection.close()
-                continue
-            self._handshakes += 1
-            self._start(self._greet(connection, str(address[0]), secret))
-
-    async def _greet(self, connection: socket.socket, host: str, secret: bytes) -> None:
-        """Check a new connection, and keep it for a stand-in."""
-        try:
-            prepare(connection)
-            hello = await receive_hello(connection, secret)
-            vehicle, refused = self._vehicle_for(hello, host)
-            if vehicle is None:
-                await hello.answer({"refused": refused})
-                self._complain(f"{host} was refused: {refused}")
-                connection.close()
-                return
-            channel = await hello.answer({"run": self._run, "name": self._scenario.name})
-            if not vehicle.joined.is_set():
-                vehicle.delay_s = await _measured_delay(connection, channel)
-            vehicle.host, vehicle.session = host, hello.words["session"]
-            vehicle.command = [str(word)[:MAX_TEXT] for word in hello.words["command"]]
-            vehicle.joins += 1
-            await self._keep(vehicle, connection, channel)
-            vehicle.joined.set()
-        except (HandshakeError, WireError) as error:
-            self._complain(f"{host} {error}")
-            connection.close()
-        except (OSError, TimeoutError):
-            connection.close()
-        except asyncio.CancelledError:
-            connection.close()
-            raise
-        finally:
-            self._handshakes -= 1
-
-    def _vehicle_for(self, hello: Hello, host: str) -> tuple[_RemoteVehicle | None, str]:
-        """Return the vehicle that a far end asks for, or a sentence that refuses it."""
-        words = hello.words
-        if words.get("protocol") != PROTOCOL or words.get("contract") != CONTRACT:
-            mine = f"{PROTOCOL} and version {CONTRACT} of the agent contract"
-            return None, f"this harness has {mine}: install the same version of ucp-harness on both computers"
-        agent_id, session, command = words.get("agent"), words.get("session"), words.get("command")
-        if type(agent_id) is not int or not isinstance(session, str) or not isinstance(command, list):
-            return None, "its hello lacks the agent, the session or the command"
+    def refusal(self, agent_id: int, session: str, host: str) -> str:
         vehicle = self._vehicles.get(agent_id)
         if vehicle is None:
             awaited = ", ".join(map(str, self._vehicles))
-            return None, f"this mission awaits agent {awaited}, not agent {agent_id}: use --as {awaited}"
-        if vehicle.session not in ("", session) and _is_alive(vehicle):
-            return None, f"agent {agent_id} has joined from {vehicle.host} already: end that one, or use another --as"
-        return vehicle, ""
+            return f"this mission awaits agent {awaited}, not agent {agent_id}: use --as {awaited}"
+        if vehicle.session not in ("", session) and vehicle.is_alive:
+            return f"agent {agent_id} has joined from {vehicle.host} already: end that one, or use another --as"
+        return ""
 
-    async def _keep(self, vehicle: _RemoteVehicle, connection: socket.socket, channel: Channel) -> None:
+    async def receive(self, far_end: FarEnd) -> None:
+        vehicle = self._vehicles[far_end.agent_id]
+        if not vehicle.joined.is_set():
+            vehicle.delay_s = await far_end.measured_delay()
+        vehicle.host, vehicle.session, vehicle.command = far_end.host, far_end.session, far_end.command
+        vehicle.joins += 1
         if vehicle.stand_in is not None:
-            self._hand_over(vehicle, connection, channel)
-            return
-        await asyncio.get_running_loop().sock_sendall(connection, channel.encode(Kind.IDLE))
-        if vehicle.held is not None:
-            vehicle.held[0].close()
-        vehicle.held = connection, channel
-
-    def _hand_over(self, vehicle: _RemoteVehicle, connection: socket.socket, channel: Channel) -> None:
-        assert vehicle.stand_in is not None
-        with contextlib.suppress(OSError):  # the stand-in has ended
-            hand_over(vehicle.stand_in, connection, {**channel.to_json(), "offset_s": vehicle.offset_s})
-
-    def _complain(self, sentence: str) -> None:
-        self._complaints += 1
-        if self._complaints <= MAX_COMPLAINTS:
-            sys.stderr.write(f"ucp-harness: {sentence}\n")
-
-    # Stand-ins
-
-    async def _accept_stand_ins(self, inside: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            connection, _ = await loop.sock_accept(inside)
-            first = json.loads(await loop.sock_recv(connection, MAX_STAND_IN_BYTES))
-            vehicle = self._vehicles[first["agent"]]
-            vehicle.stand_in = connection
-            vehicle.lost_before += vehicle.lost
-            vehicle.lost, vehicle.left_behind = 0, ()
-            loop.add_reader(connection, self._hear, vehicle, connection)
+            far_end.hand_over(vehicle.stand_in, vehicle.offset_s)
+        else:
+            await far_end.keep()
             if vehicle.held is not None:
-                held, vehicle.held = vehicle.held, None
-                self._hand_over(vehicle, *held)
+                vehicle.held.connection.close()
+            vehicle.held = far_end
+        vehicle.joined.set()
 
-    def _hear(self, vehicle: _RemoteVehicle, stand_in: socket.socket) -> None:
-        """Read a message of a stand-in."""
-        try:
-            data = stand_in.recv(MAX_STAND_IN_BYTES)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if not data:
-            asyncio.get_running_loop().remove_reader(stand_in)
-            stand_in.close()
-            if vehicle.stand_in is stand_in:
-                vehicle.stand_in = None
-                self._set_cut_off(vehicle, False)
-            return
-        message = json.loads(data)
+    def begin(self, number: int, stand_in: socket.socket) -> None:
+        vehicle = self._vehicles[number]
+        vehicle.stand_in = stand_in
+        vehicle.lost_before += vehicle.lost
+        vehicle.lost, vehicle.left_behind = 0, ()
+        if vehicle.held is not None:
+            vehicle.held.hand_over(stand_in, vehicle.offset_s)
+            vehicle.held = None
+
+    def hear(self, number: int, stand_in: socket.socket, message: dict[str, Any]) -> None:
+        vehicle = self._vehicles[number]
+        if not message and vehicle.stand_in is stand_in:
+            vehicle.stand_in = None
+            self._set_cut_off(vehicle, False)
         vehicle.offset_s = message.get("offset_s", vehicle.offset_s)
         vehicle.epoch_us = message.get("epoch_us", vehicle.epoch_us)
         if (measured := message.get("clock")) is not None:
@@ -358,56 +247,3 @@ def _sooner(link: LinkConditions, delay: Delay, cost_s: float, pair: tuple[int, 
             "`speedup`, a greater delay, or a faster connection"
         )
     return replace(link, delay=replace(delay, mean_s=delay.mean_s - cost_s))
-
-
-def _is_alive(vehicle: _RemoteVehicle) -> bool:
-    """Return true if the far end that joined before still has a connection."""
-    if vehicle.held is not None:
-        try:
-            return vehicle.held[0].recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) != b""
-        except BlockingIOError:
-            return True
-        except OSError:
-            return False
-    return vehicle.stand_in is not None and not vehicle.cut_off
-
-
-async def _measured_delay(connection: socket.socket, channel: Channel) -> float:
-    """Return the median delay of a new connection in one direction, in seconds. Raises OSError or WireError."""
-    loop, clock = asyncio.get_running_loop(), FarClock()
-    async with asyncio.timeout(PING_LIMIT_S):
-        for _ in range(PINGS):
-            await loop.sock_sendall(connection, channel.encode(Kind.PING, ping()))
-            answers: list[Any] = []
-            while not answers:
-                if not (data := await loop.sock_recv(connection, 1024)):
-                    raise HandshakeError("closed the connection before the run")
-                answers = channel.decode(data)
-            clock.receive(answers[0].payload)
-    return clock.delay_s
-
-
-def _listening(options: RemoteOptions) -> socket.socket:
-    if options.listen is None:
-        named = ", ".join(map(str, options.agents))
-        raise ScenarioError(
-            f"agent {named} joins from another computer, but no address is set for it: add `--listen ADDRESS:PORT`"
-        )
-    address = ListenAddress.parse(options.listen)
-    try:
-        family, kind, protocol, _, place = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind, protocol)
-        try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind(place)
-            listener.listen(MAX_HANDSHAKES)
-        except OSError:
-            listener.close()
-            raise
-    except OSError as error:
-        raise MachineError(
-            f"the harness cannot listen at {options.listen} ({error.strerror}): name an address of this machine, and a "
-            "free port"
-        ) from None
-    listener.setblocking(False)
-    return listener

@@ -5,7 +5,7 @@ import contextlib
 import signal
 from collections.abc import Callable, Sequence
 
-from harness.play.process._run_lab import LabProgram
+from harness.play.process.lab_program import LabProgram
 
 KILL_LIMIT_S = 3.0
 

@@ -10,6 +10,7 @@ continues where it was.
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import json
 import os
@@ -98,6 +99,7 @@ class FarWorker:
         """The numbers of the requests that the agent has not answered, oldest first."""
         self._lag: asyncio.subprocess.Process | None = None
         self._speedup = 1.0
+        self._measures_lag = False
         self._store: Path | None = None
         self._tails: dict[Kind, FileTail] = {}
         self._ended: dict[str, Any] | None = None
@@ -138,7 +140,7 @@ class FarWorker:
         await self._loop.create_connection(lambda: protocol, sock=connection)
 
     def _lost(self, connection: Connection) -> None:
-        if connection is not self._connection:
+        if connection is not self._connection or self._over.is_set():
             return
         self._connection = None
         if self._incarnation is None:
@@ -191,25 +193,28 @@ class FarWorker:
 
     async def _begin(self, order: dict[str, Any]) -> None:
         self._in_step = True
-        mission = order["mission"]
-        self._incarnation, self._agent_id = _name(order["incarnation"]), int(mission["agent_id"])
-        self._speedup = float(mission["speedup"])
+        self._incarnation, self._agent_id = _name(order["incarnation"]), int(order["agent_id"])
+        self._speedup, self._measures_lag = float(order["speedup"]), bool(order["measures_lag"])
         self._home = self._directory / self._incarnation
         self._home.mkdir()
-        if order["store"] is not None:
+        mission = order.get("mission")
+        if mission is not None and "store" in order:
             disks = self._directory / "disks"
             disks.mkdir(exist_ok=True)
             self._store = disks / _name(order["store"])
             mission["store"] = os.path.relpath(self._store, self._home)
         path = self._home / f"{self._agent_id}.mission.json"
-        write_json_atomically(path, mission)
+        if mission is None:
+            path.write_bytes(base64.b64decode(order["text"]))
+        else:
+            write_json_atomically(path, mission)
         log = self._home / f"{self._agent_id}.log"
         self._tails = {
             Kind.TRACE: FileTail(self._home / f"{self._agent_id}.trace.jsonl"),
             Kind.LOG: FileTail(log),
             Kind.LAG: FileTail(self._home / "lag.jsonl"),
         }
-        self._network = FarNetwork(self._agent_id, int(mission["network"]["port"]))
+        self._network = FarNetwork(int(order["vehicle"]), int(order["port"]))
         most = order["max_file_bytes"]
         with log.open("ab") as output:
             try:
@@ -233,8 +238,8 @@ class FarWorker:
         await self._connect_control(self._process)
         if self._control is not None:
             self._send(Kind.READY)
-            if mission["epoch_us"] is not None:
-                await self._measure_lag(int(mission["epoch_us"]))
+            if mission is not None and type(mission.get("epoch_us")) is int:
+                await self._measure_lag(mission["epoch_us"])
 
     async def _connect_control(self, process: asyncio.subprocess.Process) -> None:
         """Connect to the control socket of the agent as soon as it exists."""
@@ -259,7 +264,7 @@ class FarWorker:
         self._control.write(line)
         with contextlib.suppress(ValueError, RecursionError, AttributeError):
             request = json.loads(line)
-            if request.get("command") == "start" and isinstance(request.get("epoch_us"), int) and self._lag is None:
+            if request.get("command") == "start" and isinstance(request.get("epoch_us"), int):
                 self._start(self._measure_lag(request["epoch_us"]))
 
     async def _forward_answers(self, reader: asyncio.StreamReader) -> None:
@@ -353,6 +358,8 @@ class FarWorker:
 
     async def _measure_lag(self, epoch_us: int) -> None:
         """Measure the delays of this computer, as the harness does on its own machine."""
+        if not self._measures_lag or self._lag is not None:
+            return
         network = Path("/proc/self/ns/net").stat().st_ino
         self._lag = await asyncio.create_subprocess_exec(
             *(sys.executable, "-I", "-S", str(LAG_PROBE), str(self._home / "lag.jsonl")),

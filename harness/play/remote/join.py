@@ -1,6 +1,7 @@
 """Let an agent on this computer join the labs of a harness on another computer.
 
-For each incarnation, this process connects to the harness, proves that it knows the secret, and starts a process in a
+A run needs one incarnation of the agent at a time, and a conformance test needs several at the same time. For each
+incarnation, this process connects to the harness, proves that it knows the secret, and starts a process in a
 private network (`harness.play.remote.far_worker`). It hands the connection over, and makes another one when the worker
 asks for it. The worker runs the agent.
 """
@@ -22,7 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from harness.errors import HarnessError, MachineError
 from harness.play.remote._handshake import PROTOCOL, HandshakeError, RefusedError, introduce
@@ -37,6 +38,7 @@ CONNECT_LIMIT_S = 5.0
 RETRY_S = 1.0
 REJOIN_LIMIT_S = 60.0
 """Wall seconds after which a lost connection ends the incarnation of the agent."""
+MAX_PLACES = 32
 DIRECTORY = "ucp-join-"
 NEW_S = 60.0
 """Wall seconds after which a directory without a lock belongs to a killed process."""
@@ -71,6 +73,8 @@ class _Connected:
     channel: Channel
     run: str
     name: str
+    places: int
+    """Number of incarnations of the agent that the harness needs at the same time."""
 
 
 def join_commands(scenario: Scenario) -> list[str]:
@@ -78,10 +82,15 @@ def join_commands(scenario: Scenario) -> list[str]:
     remote = scenario.remote
     if remote is None or remote.listen is None:
         return []
-    address = ListenAddress.parse(remote.listen)
+    return [join_command(remote.listen, agent) for agent in remote.agents]
+
+
+def join_command(listen: str, agent_id: int) -> str:
+    """Return the command that lets an agent join a harness that listens at this address."""
+    address = ListenAddress.parse(listen)
     host = "ADDRESS-OF-THIS-COMPUTER" if address.host in ("0.0.0.0", "::") else address.host  # noqa: S104
     where = str(ListenAddress(host, address.port))
-    return [f"ucp-harness join {where} --as {agent} --secret-file FILE -- COMMAND" for agent in remote.agents]
+    return f"ucp-harness join {where} --as {agent_id} --secret-file FILE -- COMMAND"
 
 
 class _RunOverError(Exception):
@@ -150,7 +159,6 @@ class _Joining:
 
     async def _play(self, directory: Path) -> None:
         joined = False
-        run = ""
         while True:
             try:
                 connected = await self._connect()
@@ -169,12 +177,30 @@ class _Joining:
                 self._say_once(str(error))
                 await asyncio.sleep(RETRY_S)
                 continue
-            if connected.run != run:
-                run = connected.run
-                shutil.rmtree(directory / "disks", ignore_errors=True)
             joined = True
+            shutil.rmtree(directory / "disks", ignore_errors=True)
             self._say_once(f"agent {self._request.agent_id} has joined {connected.name!r} at {self._request.address}")
-            await self._play_incarnation(connected, directory)
+            await self._play_run(connected, directory)
+
+    async def _play_run(self, first: _Connected, directory: Path) -> None:
+        """Play incarnations until the harness accepts no further connection."""
+        places = [
+            self._play_place(connected, first.run, directory) for connected in (first, *[None] * (first.places - 1))
+        ]
+        ended = await asyncio.gather(*places, return_exceptions=True)
+        for error in ended:
+            if not isinstance(error, JoinError | _RunOverError):
+                raise error
+
+    async def _play_place(self, connected: _Connected | None, run: str, directory: Path) -> NoReturn:
+        """Play one incarnation after another. Raises JoinError or _RunOverError when the run is over."""
+        while True:
+            if connected is not None:
+                await self._play_incarnation(connected, directory)
+            connected = await self._connect()
+            if connected.run != run:
+                connected.connection.close()
+                raise _RunOverError("another run has begun")
 
     def _say_once(self, sentence: str) -> None:
         if sentence != self._said:
@@ -262,7 +288,8 @@ class _Joining:
                 prepare(connection)
                 await loop.sock_connect(connection, place)
             channel, welcome = await introduce(connection, request.secret, hello)
-            return _Connected(connection, channel, str(welcome["run"]), str(welcome["name"]))
+            places = min(MAX_PLACES, int(welcome["places"]))
+            return _Connected(connection, channel, str(welcome["run"]), str(welcome["name"]), places)
         except BaseException as error:
             if connection is not None:
                 connection.close()

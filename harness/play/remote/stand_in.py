@@ -1,8 +1,8 @@
-"""Stand in for an agent on another computer: `python -m harness.play.remote.stand_in SOCKET MISSION_FILE`.
+"""Stand in for an agent on another computer: `python -m harness.play.remote.stand_in SOCKET TASK MISSION_FILE`.
 
 The program runs in the network of a vehicle and follows the agent contract. It carries datagrams, requests and files
 between the lab and the far end, which runs the agent. SOCKET belongs to the harness, which sends connected sockets
-through it (see `harness.play.remote._remote_agents`), and receives measurements.
+through it (see `harness.play.remote._far_ends`), and receives measurements. TASK is a `StandInTask`.
 
 - The trace, the log and the export arrive before the datagrams and answers that depend on them.
 - If the connection is lost, the vehicle is cut off. The agent goes on, and so does this program: it answers `status`
@@ -14,6 +14,7 @@ through it (see `harness.play.remote._remote_agents`), and receives measurements
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import hashlib
 import json
@@ -23,11 +24,13 @@ import secrets
 import signal
 import socket
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from harness.play.remote._connection import Connection
 from harness.play.remote._far_clock import FarClock, ping
+from harness.play.remote._stand_in_task import StandInTask
 from harness.play.remote._wire import (
     NUMBER_BYTES,
     SILENT_S,
@@ -38,10 +41,11 @@ from harness.play.remote._wire import (
     connect_path,
     take_over,
 )
+from netem import addresses
 from ucp.agent_files import write_atomically
 from ucp.clock import MICROSECONDS
 from ucp.mission import MAX_MISSION_BYTES
-from ucp.plain_file import parse_json, read_json
+from ucp.plain_file import parse_json, read_plain_file
 
 PINGS_BEFORE_START = 8
 PING_EVERY_S = 0.5
@@ -60,10 +64,14 @@ FAILED = 1
 class StandIn:
     """One incarnation of an agent on another computer, as the lab sees it."""
 
-    def __init__(self, outside: socket.socket, mission: dict[str, Any], directory: Path) -> None:
+    def __init__(self, outside: socket.socket, task: StandInTask, mission: bytes, directory: Path) -> None:
+        """Create the object. `mission` is the content of the mission file, which may be wrong."""
         self._loop = asyncio.get_running_loop()
-        self._outside, self._mission, self._directory = outside, mission, directory
-        self._agent_id = int(mission["agent_id"])
+        self._outside, self._task, self._directory = outside, task, directory
+        self._mission = mission
+        self._store: Path | None = None
+        self._address = addresses.address(task.vehicle)
+        self._agent_id = task.agent_id
         self._incarnation = secrets.token_hex(8)
         self._over: asyncio.Future[int] = self._loop.create_future()
         self._connection: Connection | None = None
@@ -92,11 +100,11 @@ class StandIn:
 
     async def run(self) -> int:
         """Run until the agent has ended, and return its exit status or the negative number of a signal."""
-        self._tell({"agent": self._agent_id})
+        self._tell({"number": self._task.number})
         self._loop.add_reader(self._outside, self._take_over)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            self._loop.add_signal_handler(number, self._terminate, number)
         for number, handler in {
-            signal.SIGTERM: self._terminate,
-            signal.SIGINT: self._terminate,
             signal.SIGUSR1: self._pause,
             signal.SIGUSR2: self._resume,
             signal.SIGQUIT: self._kill,
@@ -146,7 +154,10 @@ class StandIn:
     def _ended(self, connection: Connection) -> None:
         if connection is self._connection:
             self._connection = None
-            self._cut()
+            if self._begun:
+                self._cut()
+            else:
+                self._tell({"waits": True})
 
     async def _ping(self) -> None:
         while True:
@@ -181,9 +192,9 @@ class StandIn:
             case Kind.EXPORT:
                 self._write_file(f"{self._agent_id}.chain.json", message.payload)
             case Kind.STORE:
-                if self._mission.get("store"):
+                if self._store is not None:
                     with contextlib.suppress(OSError):
-                        (self._directory / self._mission["store"]).write_bytes(message.payload)
+                        self._store.write_bytes(message.payload)
             case Kind.EXIT:
                 self._exit(message.document())
             case _:
@@ -208,17 +219,23 @@ class StandIn:
     def _begin(self, connection: Connection) -> None:
         """Send the mission to the far end, with its beginning in the time of the far clock."""
         self._begun = True
-        mission = dict(self._mission)
-        if mission["epoch_us"] is not None:
-            mission["epoch_us"] = self._far_us(mission["epoch_us"])
-        store = mission["store"] and (self._directory / mission["store"]).resolve()
-        order = {
-            "incarnation": self._incarnation,
-            "mission": mission,
-            # The far end names the disk after its path here, because a reboot names the same path.
-            "store": store and hashlib.sha256(str(store).encode()).hexdigest()[:16],
-            "max_file_bytes": None if (most := resource.getrlimit(resource.RLIMIT_FSIZE)[0]) < 0 else most,
-        }
+        order: dict[str, Any] = {"incarnation": self._incarnation, **asdict(self._task)}
+        try:
+            mission = parse_json(self._mission)
+        except ValueError:
+            mission = None
+        if isinstance(mission, dict):
+            if type(mission.get("epoch_us")) is int:
+                mission["epoch_us"] = self._far_us(mission["epoch_us"])
+            if isinstance(mission.get("store"), str):
+                self._store = (self._directory / mission["store"]).resolve()
+                # The far end names the disk after its path here, because a reboot names the same path.
+                order["store"] = hashlib.sha256(str(self._store).encode()).hexdigest()[:16]
+            order["mission"] = mission
+        else:
+            order["text"] = base64.b64encode(self._mission).decode("ascii")
+        most_bytes = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+        order["max_file_bytes"] = None if most_bytes < 0 else most_bytes
         connection.send(Kind.BEGIN, json.dumps(order).encode())
 
     def _far_us(self, epoch_us: int) -> int:
@@ -268,7 +285,7 @@ class StandIn:
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.setblocking(False)
         self._udp.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        self._udp.bind(("", self._mission["network"]["port"]))
+        self._udp.bind(("", self._task.port))
         self._loop.add_reader(self._udp, self._arrive)
         self._opening = self._loop.create_task(self._serve())
 
@@ -280,7 +297,7 @@ class StandIn:
                 data, (address, _) = self._udp.recvfrom(MAX_DATAGRAM_BYTES)
             except OSError:
                 return
-            if address == self._mission["network"]["address"]:
+            if address == self._address:
                 continue  # the echo of the agent's own broadcast
             if self._connection is not None and not self._cut_off and self._connection.unsent < MAX_UNSENT_BYTES:
                 self._connection.send(Kind.DATAGRAM, socket.inet_aton(address) + data)
@@ -289,9 +306,8 @@ class StandIn:
         """Broadcast a datagram of the agent in the lab."""
         self._released += 1
         if self._udp is not None:
-            network = self._mission["network"]
             with contextlib.suppress(OSError):
-                self._udp.sendto(data, (network["broadcast"], network["port"]))
+                self._udp.sendto(data, (addresses.BROADCAST, self._task.port))
 
     # Files
 
@@ -407,11 +423,11 @@ class StandIn:
         if self._connection is not None:
             self._connection.send(Kind.SIGNAL, json.dumps({"number": int(number)}).encode())
 
-    def _terminate(self) -> None:
+    def _terminate(self, number: int) -> None:
         if self._connection is None or self._cut_off or not self._begun:
             self._end(FAILED, "the connection to the far computer is lost, so the agent could not export its chain")
         else:
-            self._send_signal(signal.SIGTERM)
+            self._send_signal(number)
 
     def _pause(self) -> None:
         """Suspend the agent. Datagrams wait in the socket of this program, as they would in the agent's socket."""
@@ -445,8 +461,8 @@ class StandIn:
 
 
 def main() -> None:
-    path = Path(sys.argv[2])
-    mission = read_json(path, MAX_MISSION_BYTES)
+    task = StandInTask.parse(sys.argv[2])
+    mission = read_plain_file(Path(sys.argv[3]), MAX_MISSION_BYTES)
     outside = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         connect_path(outside, Path(sys.argv[1]))
@@ -455,7 +471,7 @@ def main() -> None:
     outside.setblocking(False)
 
     async def run() -> int:
-        return await StandIn(outside, mission, Path.cwd()).run()
+        return await StandIn(outside, task, mission, Path.cwd()).run()
 
     status = asyncio.run(run())
     if status >= 0:

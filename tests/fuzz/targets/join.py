@@ -11,6 +11,7 @@ from typing import Any, cast
 
 from harness.archive.directory import RunDirectory
 from harness.play.remote._far_clock import FarClock, ping, pong
+from harness.play.remote._far_ends import FarEnds
 from harness.play.remote._handshake import PROTOCOL, HandshakeError, Hello, RefusedError, introduce, receive_hello
 from harness.play.remote._remote_agents import RemoteAgents
 from harness.play.remote._wire import Channel, Kind, WireError
@@ -63,10 +64,9 @@ def _hello(data: bytes) -> None:
         return
     with socket.socket() as connection:
         hello = Hello(words, connection, SECRET, b"", b"")
-        vehicle, refused = _agents()._vehicle_for(hello, "192.168.7.2")
-    require((vehicle is None) == bool(refused), "it neither accepts nor refuses")
+        refused = FarEnds(_agents(), "join").refusal(hello, "192.168.7.2")
     require("\n" not in refused and len(refused) < 500, "an error that is no sentence")
-    require(vehicle is None or vehicle.agent_id == words["agent"], "another vehicle")
+    require(bool(refused) or words["agent"] == 2, "another vehicle")
 
 
 def _messages(data: bytes) -> None:

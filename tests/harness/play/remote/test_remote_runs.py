@@ -12,14 +12,9 @@ import pytest
 
 from harness.play.remote.secret_file import create_secret
 from tests.harness.command import harness, sentences, write_scenario
-from tests.harness.two_computers import FAR, LISTEN, TwoComputers, wait_until
+from tests.harness.two_computers import FAR, LISTEN, TwoComputers, needs_two_computers, wait_until
 
-pytestmark = [
-    pytest.mark.lab,
-    pytest.mark.skipif(not os.access("/dev/net/tun", os.W_OK), reason="this user may not open /dev/net/tun"),
-    pytest.mark.skipif(os.geteuid() != 0, reason="only root can make two computers"),
-    pytest.mark.skipif(shutil.which("nft") is None, reason="nftables is not installed"),
-]
+pytestmark = [pytest.mark.lab, *needs_two_computers]
 
 DEADLINE_S = 120.0
 

@@ -1,0 +1,35 @@
+"""Describe the task of a stand-in, which the harness passes on its command line.
+
+The task does not come from the mission file, because a conformance test also uses mission files that are wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class StandInTask:
+    """The agent for which a program stands in."""
+
+    number: int
+    """The number by which the harness knows the stand-in."""
+    agent_id: int
+    vehicle: int
+    """The vehicle whose network and address the agent has."""
+    port: int
+    speedup: float
+    measures_lag: bool
+    """The far end measures the lag of its computer."""
+
+    def command(self, socket: Path) -> list[str]:
+        """Return the command of the stand-in, without the mission file. `socket` belongs to the harness."""
+        stand_in = [sys.executable, "-P", "-m", "harness.play.remote.stand_in"]
+        return [*stand_in, str(socket), json.dumps(asdict(self))]
+
+    @classmethod
+    def parse(cls, text: str) -> StandInTask:
+        return cls(**json.loads(text))
