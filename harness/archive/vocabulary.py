@@ -7,8 +7,7 @@ on an unknown name is "not applicable" or "unknown", never a violation.
 from collections.abc import Collection, Iterable
 from typing import Literal
 
-from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER
-from ucp.quirks import CRASHED, QUIRKS
+from ucp.messages import TYPE_CODES
 from ucp.trace import HandlerRun
 from ucp.trigger import KINDS, LocalTrigger, MessageTrigger, TimerTrigger, UnknownTrigger
 
@@ -17,38 +16,84 @@ Kind = Literal["trigger", "handler", "timer", "branch", "message", "operation", 
 UnknownNames = dict[Kind, str]
 """Kind -> a description of the first unknown name of that kind, such as "unknown timer name 'x'"."""
 
-TIMERS = frozenset(ON_TIMER)
-MESSAGES = frozenset(message.NAME for message in ON_MESSAGE)
+CRASHED = "crashed by quirk"
+"""The branch of a wrong agent's handler that raised an exception."""
+
+BRANCHES = {
+    name: frozenset((*branches, CRASHED))
+    for name, branches in {
+        "build_data_block": ("building", "full"),
+        "process_next_deque_block": ("reconcile in progress", "vote running", "deque empty", "proposed"),
+        "receive_request_add_block": ("reconcile in progress", "approve", "disapprove"),
+        "receive_vote_add_block": (
+            "no vote running",
+            "another block",
+            "another round",
+            "counted already",
+            "yes",
+            "no",
+        ),
+        "vote_timer_expiration": ("reconcile in progress", "chain changed", "approved", "not approved"),
+        "receive_commit_block": (
+            "reconcile in progress",
+            "does not succeed",
+            "held already",
+            "committed",
+            "ignored by quirk",
+        ),
+        "reconcile_begin": ("already in progress", "begun"),
+        "reconcile_phase_1": ("asked",),
+        "receive_request_chain_contain": ("reconcile in progress", "yes", "no"),
+        "receive_phase_1_response": ("not in phase 1", "another chain", "counted already", "yes", "no"),
+        "reconcile_phase_1_timer_expiration": ("no response", "not contained", "at inception", "contained"),
+        "reconcile_phase_2": ("asked",),
+        "receive_request_next_in_sequence": ("reconcile in progress", "top of chain", "successor", "diverged"),
+        "receive_response_next_in_sequence": (
+            "not in phase 2",
+            "another chain",
+            "counted already",
+            "new candidate",
+            "counted",
+        ),
+        "reconcile_phase_2_timer_expiration": (
+            "no response",
+            "top of chain",
+            "block",
+            "tie: top of chain",
+            "tie: block",
+        ),
+        "reconcile_phase_3": ("from the stack", "held already", "asked"),
+        "receive_request_block_for_hash": ("reconcile in progress", "sent", "not held"),
+        "receive_response_block_for_hash": ("not in phase 3", "another block", "committed"),
+        "reconcile_phase_3_timer_expiration": ("gave up",),
+        "reconcile_finalize": ("asked who follows", "recommitted, more to come", "done"),
+    }.items()
+}
+"""Handler -> the branches that it can take, including those of wrong agents. They are written out here, because the
+checker must not read them from the agent core that it judges.
+"""
+
+TIMER_OF = {
+    "vote_timer_expiration": "voting",
+    "reconcile_phase_1_timer_expiration": "phase one",
+    "reconcile_phase_2_timer_expiration": "phase two",
+    "reconcile_phase_3_timer_expiration": "phase three",
+    "reconcile_finalize": "finalize gap",
+}
+"""Handler -> the timer whose expiry triggers it."""
+TIMERS = frozenset(TIMER_OF.values())
+MESSAGES = frozenset(message.NAME for message in TYPE_CODES)
 OPERATIONS = frozenset(("complete", "chain+", "chain-", "deque+", "deque-", "stack+", "stack-"))
 VOTES = frozenset(("yes", "no"))
-BRANCHES = {
-    name: frozenset(
-        (
-            *handler.branches,
-            *(
-                branch
-                for quirk in QUIRKS.values()
-                if handler.algorithm in quirk.algorithms
-                for branch in quirk.branches
-            ),
-            CRASHED,
-        )
-    )
-    for name, handler in HANDLERS.items()
-}
-"""Handler -> the branches that it can take, including those of wrong agents."""
-TALLIES = {
-    name: VOTES if handler.tally in ("vote_count", "reconcile_vote_count") else None
-    for name, handler in HANDLERS.items()
-}
-"""Handler -> the keys of its tally. None if the keys are block hashes."""
+COUNTS_VOTES = frozenset(
+    ("process_next_deque_block", "receive_vote_add_block", "reconcile_phase_1", "receive_phase_1_response")
+)
+"""Handlers whose tally has the keys of `VOTES`. The keys of other tallies are block hashes."""
 
 IGNORED_KINDS: frozenset[Kind] = frozenset(("branch", "tally", "timer"))
 """Kinds of unknown names that do not prevent the comparison of a step. A step with an unknown name of another kind
 cannot be compared. Names of timers are among them, because the handler determines the timer.
 """
-
-_TIMER_OF = {handler.name: timer for timer, handler in ON_TIMER.items()}
 
 MAX_SHOWN = 40
 """Maximum number of characters of an unknown name that a message shows."""
@@ -60,7 +105,7 @@ def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
     """
     unknown: UnknownNames = {}
     for handler, branch in dict.fromkeys((run.handler, run.branch) for run in runs):
-        if handler not in HANDLERS:
+        if handler not in BRANCHES:
             unknown.setdefault("handler", f"unknown handler name {_shown(handler)}")
         elif branch not in BRANCHES[handler]:
             unknown.setdefault("branch", f"unknown branch {_shown(branch)} of {handler}")
@@ -71,10 +116,10 @@ def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
                 unknown.setdefault("message", f"unknown message name {_shown(trigger.message)}")
         elif isinstance(trigger, TimerTrigger):
             if trigger.timer not in TIMERS:
-                kind: Kind = "timer" if run.handler in _TIMER_OF else "trigger"
+                kind: Kind = "timer" if run.handler in TIMER_OF else "trigger"
                 unknown.setdefault(kind, f"unknown timer name {_shown(trigger.timer)}")
         elif isinstance(trigger, LocalTrigger):
-            if trigger.handler not in HANDLERS:
+            if trigger.handler not in BRANCHES:
                 unknown.setdefault("handler", f"unknown handler name {_shown(trigger.handler)}")
         elif isinstance(trigger, UnknownTrigger) and has_unknown_kind(trigger):
             unknown.setdefault("trigger", f"unknown trigger {_shown(next(iter(trigger.fields)))}")
@@ -95,8 +140,7 @@ def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
 
 def tally_is_known(run: HandlerRun) -> bool:
     """Return true if all keys of the vote count are defined for the handler."""
-    keys = TALLIES.get(run.handler)
-    return not run.tally or keys is None or keys.issuperset(run.tally)
+    return not run.tally or run.handler not in COUNTS_VOTES or VOTES.issuperset(run.tally)
 
 
 def has_unknown_kind(trigger: UnknownTrigger) -> bool:
@@ -112,7 +156,7 @@ def timer_that_ended(run: HandlerRun, trigger: TimerTrigger) -> str:
     If the name is unknown, return the timer whose expiry triggers the handler of this run, or None.
     """
     name = trigger.timer
-    return name if name in TIMERS else _TIMER_OF.get(run.handler, name)
+    return name if name in TIMERS else TIMER_OF.get(run.handler, name)
 
 
 def timers_are_known(run: HandlerRun) -> bool:
