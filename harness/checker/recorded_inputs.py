@@ -10,7 +10,6 @@ from harness.archive.exports import ExportedBlock
 from ucp.block import BLOCK_HEADER, Block
 from ucp.events import LoggableEvent, MalformedEventsError, decode_event
 from ucp.messages import BlockResponse, CommitBlock, Datagram, MalformedDatagramError, Message, decode
-from ucp.store import StoredState
 from ucp.trace import RecordedBytes
 
 KEPT = 4096
@@ -64,9 +63,6 @@ def sealed_of(record: RecordedBytes | None) -> bytes | None:
 
 def stored_blocks(record: RecordedBytes | None) -> Iterator[Block]:
     """Yield the blocks in the stored state of an agent. Raises ValueError if the bytes are invalid."""
-    if record is not None and isinstance(record.content, StoredState):
-        yield from record.content.blocks()
-        return
     data = base64.b64decode(record.text if record else "", validate=True)
     offset = 0
     while offset < len(data):

@@ -5,16 +5,30 @@ reference agent next to the agent under test.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol
 
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
 from harness.checker.reference.state import Handler, ReferenceState, Settings, Timer
+from ucp.block import Block
 from ucp.events import LoggableEvent
 from ucp.messages import MalformedDatagramError, Message, decode, encode
-from ucp.store import StoredState
 from ucp.trace import HandlerRun, SentMessage, StateSummary
 from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger, OperatorTrigger, TimerTrigger, Trigger
+
+
+class StoredBlocks(Protocol):
+    """The blocks that an agent stored on disk, and the hashes of the blocks that it completed."""
+
+    @property
+    def completed(self) -> Sequence[bytes]: ...
+    @property
+    def chain(self) -> Sequence[Block]: ...
+    @property
+    def deque(self) -> Sequence[Block]: ...
+    @property
+    def stack(self) -> Sequence[Block]: ...
 
 
 class ReferenceAgent:
@@ -74,7 +88,7 @@ class ReferenceAgent:
         timer.stop()
         self._handle(now, TimerTrigger(timer.name), ON_TIMER[timer.name])
 
-    def boot(self, stored: StoredState, now: float) -> None:
+    def boot(self, stored: StoredBlocks, now: float) -> None:
         """Start the agent with the state that it stored on disk before the power failure."""
         self.state.now = now
         self.state.restore(stored.completed, stored.chain, stored.deque, stored.stack)

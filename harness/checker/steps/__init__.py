@@ -7,6 +7,7 @@ continues from the agent's own state, so one mistake gives one finding.
 """
 
 from collections import Counter
+from dataclasses import replace
 from itertools import islice
 
 from harness.archive.traces import Trace
@@ -17,6 +18,7 @@ from harness.checker.recorded_inputs import BlockIndex, decoded
 from harness.checker.records import cross_examine
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
+from harness.checker.steps import _shared_code
 from harness.checker.steps._late_timers import JudgedTimers
 from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.end_of_record import crashes, failure
@@ -31,9 +33,22 @@ NAME = "every step"
 def check(evidence: Evidence) -> Judgement:
     """Return the verdict on all steps. The verdict is `deviates` after any difference from the reference, `not
     applicable` if a step could not be judged, and `as specified` otherwise.
+
+    The verdict is also `deviates` if the judge cannot be trusted, because an edit broke code that it shares with the
+    agents.
     """
-    if evidence.steps is not None:
-        return evidence.steps
+    judgement = _compare(evidence) if evidence.steps is None else evidence.steps
+    if (defect := _shared_code.defect()) is not None:
+        also = f"; {judgement.reason}" if judgement.verdict == "deviates" else ""
+        return replace(judgement, verdict="deviates", reason=f"{defect}{also}")
+    if (files := " and ".join(_shared_code.edited())) and judgement.verdict == "as specified":
+        remark = f"the judge uses {files} too, which was edited and follows the test vectors"
+        return replace(judgement, reason=f"{judgement.reason}; {remark}")
+    return judgement
+
+
+def _compare(evidence: Evidence) -> Judgement:
+    """Return the verdict on all steps, if the shared code is intact."""
     blocks = BlockIndex(block for export in evidence.exports.values() for block in export.blocks())
     deviations: list[StepDeviation] = []
     timers = JudgedTimers()

@@ -5,6 +5,8 @@ behaviour matters: for a debugger, which stops in the handlers of `ucp`, and for
 commits.
 """
 
+from dataclasses import asdict
+
 from harness.checker.steps._adopting_core import AdoptingCore
 from harness.checker.steps.implementation import CoreImplementation
 from harness.checker.steps.trace_header import CheckedHeader
@@ -12,6 +14,7 @@ from ucp.agent import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
 from ucp.block import Block
 from ucp.core import Core
 from ucp.messages import Message
+from ucp.settings import Settings
 
 
 class _CoreInUse(AdoptingCore, Core):  # type: ignore[misc]  # a core has the attributes of the reference's state
@@ -34,8 +37,13 @@ class _CoreInUse(AdoptingCore, Core):  # type: ignore[misc]  # a core has the at
         self.changed(operation, block)
 
 
+def settings_in_use(header: CheckedHeader) -> Settings:
+    """Return the settings of a trace as settings of the installed core."""
+    return Settings(**asdict(header.settings))
+
+
 def _core(header: CheckedHeader) -> AdoptingCore:
-    return _CoreInUse(header.agent_id, header.initial_data, header.settings)
+    return _CoreInUse(header.agent_id, header.initial_data, settings_in_use(header))
 
 
 IN_USE = CoreImplementation(_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)

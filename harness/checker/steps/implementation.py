@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER, tally_of
-from harness.checker.reference.state import ReferenceState, Settings
+from harness.checker.reference.state import ReferenceState
 from harness.checker.steps._adopting_core import AdoptingCore
 from harness.checker.steps.trace_header import CheckedHeader
 
@@ -25,7 +25,7 @@ class CoreImplementation(NamedTuple):
 
 
 def _reference_core(header: CheckedHeader) -> AdoptingCore:
-    return ReferenceCore(header.agent_id, header.initial_data, Settings.of(header.settings))
+    return ReferenceCore(header.agent_id, header.initial_data, header.settings)
 
 
 REFERENCE = CoreImplementation(_reference_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)

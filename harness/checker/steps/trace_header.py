@@ -3,21 +3,21 @@
 import base64
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from harness.archive.traces import TraceHeader
 from harness.checker._waiting import SLACK_WALL_S
-from harness.checker.reference.state import Settings as ReferenceSettings
-from ucp.block import MAX_AGENT_ID
-from ucp.settings import Settings
+from harness.checker.reference.state import Settings
+from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
 
 EARLY_WALL_S = 0.001
 """Seconds of wall time by which a timer may expire early, because an agent reads its clock more than once."""
 ROUNDING_S = 2e-3
 """Rounding error in seconds of times in a trace, which may be rounded to milliseconds."""
 
-_SETTINGS = {setting.name for setting in fields(Settings)}
+MAX_TIMER_S = 1e9
+"""Maximum duration of a timer in seconds."""
 
 
 class ImpossibleHeaderError(Exception):
@@ -59,12 +59,9 @@ def checked(header: TraceHeader) -> CheckedHeader:
     """
     try:
         initial_data = base64.b64decode(header.initial_data or "", validate=True)
-        given = {**asdict(ReferenceSettings()), **header.settings}  # the defaults of an edited core may be wrong
-        settings = Settings(**{name: value for name, value in given.items() if name in _SETTINGS})
-    except (ValueError, TypeError) as error:
-        raise ImpossibleHeaderError(f"the header of its trace has invalid settings: {str(error)[:200]}") from None
-    if unknown := _unknown_to_reference(settings):
-        raise UnknownSettingError(f"the settings include {', '.join(unknown)}, which the reference lacks")
+    except ValueError as error:
+        raise ImpossibleHeaderError(f"the header of its trace has invalid data: {str(error)[:200]}") from None
+    settings = _settings(header)
     if not 1 <= header.agent_id <= MAX_AGENT_ID:
         raise ImpossibleHeaderError(f"the header of its trace has an invalid agent ID: {str(header.agent_id)[:20]}")
     speedup, drift = _clock(header, "speedup", 1.0), _clock(header, "drift", 0.0)
@@ -83,11 +80,36 @@ def checked(header: TraceHeader) -> CheckedHeader:
     )
 
 
-def _unknown_to_reference(settings: Settings) -> list[str]:
-    """Return the settings that the reference does not implement and that differ from their default values."""
-    lacking = _SETTINGS - {setting.name for setting in fields(ReferenceSettings)}
-    usual = Settings()
-    return sorted(name for name in lacking if getattr(settings, name) != getattr(usual, name))
+def _settings(header: TraceHeader) -> Settings:
+    """Return the settings in the header. A missing setting has the default of the reference, because the defaults of an
+    edited core may be wrong.
+    """
+    known = {setting.name: setting.default for setting in fields(Settings)}
+    if unknown := sorted(str(name)[:40] for name in header.settings.keys() - known.keys()):
+        raise UnknownSettingError(f"the settings include {', '.join(unknown[:3])}, which the reference lacks")
+    for name, value in header.settings.items():
+        allowed = (int, float) if isinstance(known[name], float) else (type(known[name]),)
+        if type(value) not in allowed:
+            raise _invalid(name, value)
+    settings = Settings(**header.settings)
+    timeouts = ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s")
+    shortest = min(getattr(settings, name) for name in timeouts)
+    possible = {name: 0 < getattr(settings, name) <= MAX_TIMER_S for name in timeouts} | {
+        "finalize_gap_s": 0 <= settings.finalize_gap_s <= MAX_TIMER_S,
+        "max_block_bytes": 1 <= settings.max_block_bytes <= MAX_EVENT_DATA_BYTES,
+        "max_event_bytes": 1 <= settings.max_event_bytes <= settings.max_block_bytes,
+        "phase1_tie": settings.phase1_tie in ("phase2", "pop"),
+        "phase2_tie": settings.phase2_tie in ("oldest", "block"),
+        "answer_spread_s": settings.answer_spread_s == 0 or 0 < settings.answer_spread_s < shortest,
+    }
+    for name, is_possible in possible.items():
+        if not is_possible:
+            raise _invalid(name, getattr(settings, name))
+    return settings
+
+
+def _invalid(name: str, value: object) -> ImpossibleHeaderError:
+    return ImpossibleHeaderError(f"the header of its trace has invalid settings: {name} is {str(value)[:40]!r}")
 
 
 def _clock(header: TraceHeader, key: str, default: float) -> float:

@@ -26,6 +26,7 @@ from typing import Any
 
 from harness.archive.vocabulary import first_unknown, unknown_names
 from harness.checker.recorded_inputs import decoded
+from harness.checker.steps.core_in_use import settings_in_use
 from harness.errors import FieldError, HarnessError, MachineError
 from harness.field.bisection.outcome import RecordDifference
 from harness.field.replay import RecordedTrace
@@ -268,7 +269,7 @@ class _AgentProgramReplay:
         header = self._record.header
         scenario = Scenario.model_validate(
             {"name": "record", "agents": sorted(header.roster), "speedup": self._speedup, "vehicles": {"kind": "none"}}
-        ).model_copy(update={"settings": header.settings})
+        ).model_copy(update={"settings": settings_in_use(header)})
         mission = mission_file(
             self._record.agent_id,
             scenario,

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from harness.checker.steps.core_in_use import settings_in_use
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.field._vehicle_captures import AgentCapture, CapturedDatagram, seconds_of
 from harness.field.reconstruct._agent_inputs import (
@@ -395,4 +396,4 @@ def _feed(agent: Agent, now: float, cause: Cause, stored: StoredState | None) ->
 
 
 def _agent(header: CheckedHeader) -> Agent:
-    return Agent(header.agent_id, header.roster, header.initial_data, header.settings, seal=header.seal)
+    return Agent(header.agent_id, header.roster, header.initial_data, settings_in_use(header), seal=header.seal)

@@ -12,6 +12,7 @@ from functools import partial
 
 from harness.archive.traces import TraceHeader
 from harness.checker.judgement import agents
+from harness.checker.reference.state import Settings
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import FieldError
 from harness.field._vehicle_captures import AgentCapture
@@ -21,7 +22,7 @@ from harness.field.reconstruct._other_records import OtherRecords
 from ucp.block import MAX_EVENT_DATA_BYTES
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import BlockAddResponse, decode
-from ucp.settings import CHOICES, Settings
+from ucp.settings import CHOICES
 
 TRIES = 10
 """Maximum number of input orders that are tried for one agent and one combination of settings."""

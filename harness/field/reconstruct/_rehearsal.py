@@ -16,6 +16,7 @@ from itertools import zip_longest
 from random import Random
 
 from harness.checker.recorded_inputs import decoded
+from harness.checker.steps.core_in_use import settings_in_use
 from harness.checker.steps.trace_header import CheckedHeader
 from harness.field.reconstruct._agent_inputs import (
     BootedFromDisk,
@@ -165,7 +166,7 @@ class _IncarnationSimulation:
             header.agent_id,
             header.roster,
             header.initial_data,
-            header.settings,
+            settings_in_use(header),
             handlers=wrong_handlers(rehearsal.quirks, Random(0)),
             seal=header.seal,
         )

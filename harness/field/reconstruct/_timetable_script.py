@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
+from harness.checker.reference.state import Settings
 from harness.field.reconstruct._agent_inputs import DatagramReceived, EventLogged, ReconcileRequested
 from harness.field.reconstruct._known_mission import MissionConfiguration
 from harness.field.reconstruct._rehearsal import SoloSimulation
@@ -15,7 +16,6 @@ from harness.scenario.scenario_file import Document
 from harness.scenario.strict_model import format_pairs
 from ucp.messages import MalformedDatagramError, decode
 from ucp.quirks import Quirks
-from ucp.settings import Settings
 
 HALF_GAP_S = MIN_GAP_S / 2
 Sealed = Mapping[int, Mapping[bytes, bytes]]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from harness.archive.archive import RunArchive
 from harness.archive.traces import Trace, read_trace, why_not_a_trace
+from harness.checker.steps.core_in_use import settings_in_use
 from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, checked
 from harness.errors import INTERRUPTED, VIOLATED, WRONG_REQUEST
 from harness.proof.specification._recorded_incarnations import ChainNumbers, EncodedIncarnation, lives, module
@@ -197,7 +198,7 @@ def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
         header = checked(trace.header)
     except ImpossibleHeaderError as error:
         raise _OutsideError(str(error)) from None
-    settings = header.settings
+    settings = settings_in_use(header)
     if (name := unspecified(settings)) is not None:
         raise _OutsideError(f"the specification does not have its setting {name}")
     return header, (

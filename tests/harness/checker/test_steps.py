@@ -14,8 +14,6 @@ from hypothesis import strategies as st
 from harness.archive.traces import HANDLER_RUN, Trace, TraceHeader
 from harness.checker import Evidence, steps
 from harness.checker.judgement import Judgement
-from harness.checker.reference.state import Settings
-from harness.checker.steps import trace_header
 from harness.run.simulate import simulate
 from tests.harness.virtual import scenario
 from ucp.agent import HANDLERS, ON_LOCAL_EVENT, Agent
@@ -261,13 +259,34 @@ def test_trace_of_version_1_is_not_judged(honest: Evidence) -> None:
     assert judgement.reason == "of agent 2 the trace has the version ucp-trace/1, which lacks received messages"
 
 
-def test_agent_with_a_setting_that_the_reference_lacks_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    known = [(name, object, value) for name, value in vars(Settings()).items() if name != "phase1_tie"]
-    monkeypatch.setattr(trace_header, "ReferenceSettings", dataclasses.make_dataclass("Settings", known))
-    assert judged(settings={"phase1_tie": "phase2"}).verdict == "as specified"
-    judgement = judged(settings={"phase1_tie": "pop"})
+def test_agent_with_a_setting_that_the_reference_lacks_is_not_judged(honest: Evidence) -> None:
+    trace = honest.traces[1]
+    header = trace.header.model_copy(update={"settings": {**trace.header.settings, "votes_twice": True}})
+    judgement = steps.check(with_traces(honest, {**honest.traces, 1: dataclasses.replace(trace, header=header)}))
     assert judgement.verdict == "not applicable"
-    assert "the settings include phase1_tie, which the reference lacks" in judgement.reason
+    assert judgement.reason == "of agent 1 the settings include votes_twice, which the reference lacks"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("vote_timeout_s", True),
+        ("phase3_timeout_s", 2e9),
+        ("finalize_gap_s", -0.1),
+        ("max_block_bytes", 600.0),
+        ("max_event_bytes", 1025),
+        ("phase1_tie", "push"),
+        ("vote_names_chain", 1),
+        ("answer_spread_s", 5.0),
+        ("answer_spread_s", math.nan),
+    ],
+)
+def test_impossible_setting_is_a_deviation(honest: Evidence, name: str, value: object) -> None:
+    trace = honest.traces[1]
+    header = trace.header.model_copy(update={"settings": {**trace.header.settings, name: value}})
+    judgement = steps.check(with_traces(honest, {**honest.traces, 1: dataclasses.replace(trace, header=header)}))
+    assert judgement.verdict == "deviates"
+    assert f"the header of its trace has invalid settings: {name} is " in judgement.evidence[0].detail
 
 
 def test_missing_trace_makes_steps_not_applicable(honest: Evidence) -> None:

@@ -1,4 +1,5 @@
-"""Test that the checker detects an error in an edited agent and names the handler.
+"""Test that the checker detects an error in an edited agent and names the handler, or the edited file if the judge uses
+it too.
 
 Each test edits a copy of `ucp`, as an engineer edits a clone, and plays a scenario with the copy.
 """
@@ -9,7 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import yaml
@@ -26,51 +27,56 @@ SCENARIO = {
 
 
 class Edit(NamedTuple):
-    """An edit of a file of `ucp`, and the handler that it breaks."""
+    """An edit of a file of `ucp`, and the handler that it breaks, if it breaks one."""
 
     about: str
-    handler: str
     file: str
     old: str
     new: str
+    handler: str = ""
 
 
-EDITS = [Edit(**edit) for edit in yaml.safe_load(Path(__file__).with_name("edits_of_the_core.yaml").read_text("utf-8"))]
+def edits(name: str) -> list[Edit]:
+    return [Edit(**edit) for edit in yaml.safe_load(Path(__file__).with_name(name).read_text("utf-8"))]
 
 
-@pytest.mark.parametrize("edit", EDITS, ids=lambda edit: f"{edit.handler}: {edit.about}")
-def test_edit_of_the_core_is_found_and_its_handler_named(edit: Edit, tmp_path: Path) -> None:
-    shutil.copytree(Path(ucp.__file__).parent, tmp_path / "ucp", ignore=shutil.ignore_patterns("__pycache__"))
-    file = tmp_path / "ucp" / edit.file
+def verdict_after(edit: Edit, scenario: dict[str, Any], folder: Path, status: int = 1) -> list[str]:
+    """Play the scenario with a copy of `ucp` that has this edit. Return the sentences of the verdict on all steps."""
+    shutil.copytree(Path(ucp.__file__).parent, folder / "ucp", ignore=shutil.ignore_patterns("__pycache__"))
+    file = folder / "ucp" / edit.file
     text = file.read_text("utf-8")
     assert edit.old in text, f"ucp/{edit.file} has changed: write this edit anew"
     file.write_text(text.replace(edit.old, edit.new, 1), "utf-8")
-    (tmp_path / "scenario.yaml").write_text(yaml.safe_dump(SCENARIO), "utf-8")
-    paths = os.pathsep.join([str(tmp_path), str(Path(harness.__file__).parent.parent)])
-
+    (folder / "scenario.yaml").write_text(yaml.safe_dump(scenario), "utf-8")
+    paths = os.pathsep.join([str(folder), str(Path(harness.__file__).parent.parent)])
+    command = ("run", "scenario.yaml", "--backend", "sim", "--seed", "1", "--out", "out")
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "harness.cli",
-            "run",
-            "scenario.yaml",
-            "--backend",
-            "sim",
-            "--seed",
-            "1",
-            "--out",
-            "out",
-        ],
-        cwd=tmp_path,
+        [sys.executable, "-m", "harness.cli", *command],
+        cwd=folder,
         env={**os.environ, "PYTHONPATH": paths},
         capture_output=True,
         text=True,
         check=False,
     )
-
-    assert done.returncode == 1, done.stdout + done.stderr
-    record = json.loads((tmp_path / "out" / "run.json").read_text("utf-8"))
+    assert done.returncode == status, done.stdout + done.stderr
+    record = json.loads((folder / "out" / "run.json").read_text("utf-8"))
     assert record["versions"]["core"].endswith(f"(ucp/{edit.file})")
-    found = [record["outcome_detail"] or "", (record["steps"] or {}).get("reason", "")]
+    return [record["outcome_detail"] or "", (record["steps"] or {}).get("reason", "")]
+
+
+@pytest.mark.parametrize("edit", edits("edits_of_the_core.yaml"), ids=lambda edit: f"{edit.handler}: {edit.about}")
+def test_edit_of_the_core_is_found_and_its_handler_named(edit: Edit, tmp_path: Path) -> None:
+    found = verdict_after(edit, SCENARIO, tmp_path)
     assert any(edit.handler in sentence for sentence in found), found
+
+
+@pytest.mark.parametrize("edit", edits("edits_of_shared_code.yaml"), ids=lambda edit: f"{edit.file}: {edit.about}")
+def test_edit_of_shared_code_is_found_and_its_file_named(edit: Edit, tmp_path: Path) -> None:
+    found = verdict_after(edit, {"name": "edited code", "duration_s": 100}, tmp_path)
+    assert f"ucp/{edit.file} was edited and contradicts the agent contract" in found[1]
+
+
+def test_harmless_edit_of_shared_code_is_mentioned(tmp_path: Path) -> None:
+    edit = Edit("a comment", "trace.py", "import base64\n", "import base64  # as RFC 4648\n")
+    _, reason = verdict_after(edit, {"name": "edited code", "duration_s": 100}, tmp_path, status=0)
+    assert reason.endswith("the judge uses ucp/trace.py too, which was edited and follows the test vectors")
