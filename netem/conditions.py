@@ -65,6 +65,10 @@ class NetworkConditions:
         """Return the network conditions for packets from `sender` to `receiver`, without considering the partition."""
         return self.links.get((sender, receiver)) or self.receivers.get(receiver, self.default)
 
+    def all_links(self) -> tuple[LinkConditions, ...]:
+        """Return the conditions of all links, with the default first. Links may have equal conditions."""
+        return self.default, *self.receivers.values(), *self.links.values()
+
     def is_cut(self, sender: int, receiver: int) -> bool:
         """Return true if a partition separates the two vehicles."""
         return self._group(sender) != self._group(receiver)
@@ -72,7 +76,7 @@ class NetworkConditions:
     @property
     def fully_connected(self) -> bool:
         """True if there is no partition and no link loses packets. Packets may still be late or duplicated."""
-        links = (self.default, *self.receivers.values(), *self.links.values())
+        links = self.all_links()
         return not self.partition and all(link.lossless for link in links)
 
     def needs(self) -> tuple[str, ...]:

@@ -273,6 +273,11 @@ def read_connectivity(path: Path | None, vehicles: Collection[int]) -> Connectiv
 
 
 def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
+    """Yield the loss rates of links in the file at `path`, as `link_losses` does."""
+    return link_losses(JsonLines(path, NetworkLine), vehicles)
+
+
+def link_losses(lines: Iterable[NetworkLine], vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
     """Yield mission seconds with the loss rates (0 to 1) of links. The first entry contains all links, and each later
     entry the links whose loss rate changed.
 
@@ -282,7 +287,7 @@ def read_link_losses(path: Path | None, vehicles: Collection[int]) -> Iterator[t
     network = NetworkReplay(vehicles)
     before: dict[Link, float] = {}
     now_s = 0.0
-    for line in JsonLines(path, NetworkLine):
+    for line in lines:
         if not before and line.asked is None:
             continue
         try:

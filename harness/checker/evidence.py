@@ -165,6 +165,8 @@ class Evidence:
     """The loss rates (0 to 1) of links over time: mission seconds, each with the links whose loss changes then. The
     first entry contains all links.
     """
+    delivers_all: bool = False
+    """True if virtual time delivered every message. Otherwise it omitted messages that the released core ignores."""
     from_field: bool = False
     """True for files without the run record run.json. Then no counter shows how many lines their traces should have, so
     lines may be missing.
@@ -399,18 +401,22 @@ class Evidence:
         """All network conditions (loss, delay and others) that the scenario requested for links. None if no record
         contains them.
         """
+        if self.requested_conditions is None:
+            return None
+        return set[LinkConditions]().union(*(asked.all_links() for _, asked in self.requested_conditions))
+
+    @cached_property
+    def requested_conditions(self) -> list[tuple[float, NetworkConditions]] | None:
+        """The network conditions that the scenario requested, each with the mission second from which they applied.
+        None if no record contains them.
+        """
         if self.conditions is None:
             return None
-        links: set[LinkConditions] = set()
-        for condition in self.conditions:
-            if condition.asked is None:
-                continue
-            try:
-                asked = NetworkConditions.from_json(condition.asked)
-            except (ValueError, TypeError, AttributeError, KeyError):
-                return None
-            links |= {asked.default, *asked.receivers.values(), *asked.links.values()}
-        return links
+        asked = [(condition.at_s, condition.asked) for condition in self.conditions if condition.asked is not None]
+        try:
+            return [(at_s, NetworkConditions.from_json(conditions)) for at_s, conditions in asked]
+        except (ValueError, TypeError, AttributeError, KeyError):
+            return None
 
     @property
     def has_fates(self) -> bool:
@@ -469,6 +475,7 @@ def gather(archive: RunArchive) -> Evidence:
         TrustedKeys(archive.public_keys, archive.anchor) if archive.public_keys else None,
         scenario=archive.record.scenario,
         link_losses=_link_losses(archive),
+        delivers_all=_delivers_all(archive),
         stores=archive.stores,
         channel=archive.channel(),
         report_progress=archive.report_progress,
@@ -497,6 +504,11 @@ def _link_losses(archive: RunArchive) -> list[tuple[float, dict[Link, float]]]:
     if changes * len(archive.roster) ** 2 > MAX_LINK_CHANGES:
         return []
     return [*archive.link_losses(archive.roster)]
+
+
+def _delivers_all(archive: RunArchive) -> bool:
+    versions = archive.record.versions if archive.recorded else {}
+    return str(versions.get("core")).startswith("edited") or versions.get("variant") is not None
 
 
 def _captures(archive: RunArchive) -> Captures | None:

@@ -11,22 +11,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from harness import checker
+from harness.archive.connectivity import NetworkLine, link_losses
 from harness.archive.directory import default_path
 from harness.archive.exports import Export, ExportMaker
 from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import Trace, TraceHeader
 from harness.checker import Evidence, Result
-from harness.checker.evidence import InjectedDatagram, RogueTraffic
+from harness.checker.evidence import InjectedDatagram, NetworkLogEntry, RogueTraffic
 from harness.checker.judgement import Finding, Judgement
 from harness.checker.signatures import TrustedKeys
 from harness.errors import AgentFailedError, MachineError, RunDirectoryError
 from harness.gc_pause import gc_paused
 from harness.play import mission
+from harness.play.core_version import edited_files
 from harness.play.mission import RunOutcome
 from harness.play.simulation.incarnations import SimulatedIncarnation
 from harness.play.simulation.run_files import header
 from harness.play.simulation.simulation import Simulation
 from harness.play.simulation.virtual_time import SimulationBackend
+from harness.play.variant import variant_in_use
 from harness.scenario import Scenario
 from harness.scenario.verdict_names import CHARACTERISTICS, ENDED, RUN_CHECKS
 from netem.radio import Place
@@ -131,6 +134,8 @@ class MemoryRecorder:
         self._maker = ExportMaker()
         self._kept: dict[int, Export] = {}
         self._injected = RogueTraffic()
+        self._network: list[dict[str, Any]] = []
+        """The changes of the network and the faults, as `network.jsonl` contains them."""
 
     def begin(self, incarnation: SimulatedIncarnation) -> None:
         if not self.tracing:
@@ -148,7 +153,8 @@ class MemoryRecorder:
         self._traces[agent_id].extend(entries)
 
     def changed(self, record: dict[str, Any]) -> None:
-        """Do nothing, because the record of the run contains the change."""
+        if self.tracing:
+            self._network.append(record)
 
     def injected(self, record: dict[str, Any]) -> None:
         self._injected.add([InjectedDatagram.model_validate(record)])
@@ -191,6 +197,9 @@ class MemoryRecorder:
             [],
             self._kept,
             self._injected,
+            conditions=[NetworkLogEntry.model_validate(change) for change in self._network] or None,
+            link_losses=[*link_losses(map(NetworkLine.model_validate, self._network), simulation.roster)],
+            delivers_all=bool(edited_files()) or variant_in_use() is not None,
             keys=TrustedKeys(simulation.public_keys, "the run") if simulation.public_keys else None,
             verified=simulation.verified,
         )

@@ -12,7 +12,12 @@ Only messages count that a correct agent handles if they arrive:
   stopped or a socket was full. Handled messages therefore contradict the loss rate only if their number is too high. If
   the engine counts packets, its counts can also be too low.
 - In virtual time: messages of three types, if the agent runs and does not reconcile. Virtual time does not deliver
-  other messages without effect.
+  other messages without effect. It delivers all messages if the core was edited. Then all messages count while the
+  agent runs.
+
+If the network duplicates messages, a message counts as handled if one of its copies was. A message without a second
+copy is lost with the loss rate. A message that is both lost and duplicated arrives once. The probability that no copy
+arrives is therefore the loss rate times the probability that there is no second copy.
 
 A dropped datagram arrived. In a secured mission, for example, a restarted agent drops messages of agents that it has
 not yet confirmed. If an agent handled too few messages, its dropped datagrams therefore count as handled.
@@ -25,13 +30,14 @@ from dataclasses import dataclass
 from math import exp, inf, log
 
 from harness.archive.connectivity import Link
-from harness.checker._sent_times import sent_at, spread_of
+from harness.archive.vocabulary import MESSAGES
 from harness.checker.evidence import Evidence
 from harness.checker.records._captures_vs_traces import COUNTS_DATAGRAMS
 from harness.checker.records._handled_vs_faults import stopped
 from harness.checker.records.contradiction import Contradiction, in_virtual_time, of_agent, slack_s
 from harness.scenario.changes import RANGE
 from harness.scenario.faults.fault import SAME_TIME_S
+from netem.conditions import NetworkConditions
 from netem.link import GilbertElliott, LinkConditions
 from netem.medium import LATENCY
 from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
@@ -76,9 +82,14 @@ class _ExpectedDeliveries:
 
 
 class _LossHistory:
-    """The loss rate of each link over time."""
+    """The probability over time that no copy of a message passes a link."""
 
-    def __init__(self, link_losses: list[tuple[float, dict[Link, float]]], slack_s: float) -> None:
+    def __init__(
+        self,
+        link_losses: list[tuple[float, dict[Link, float]]],
+        requested: list[tuple[float, NetworkConditions]],
+        slack_s: float,
+    ) -> None:
         self._slack_s = slack_s
         self._times: dict[Link, list[float]] = defaultdict(list)
         self._losses: dict[Link, list[float]] = defaultdict(list)
@@ -86,15 +97,26 @@ class _LossHistory:
             for link, loss in losses.items():
                 self._times[link].append(at_s)
                 self._losses[link].append(loss)
+        self._changed_at = [at_s for at_s, _ in requested]
+        single = [[1 - link.duplicate for link in conditions.all_links()] for _, conditions in requested]
+        self._fewest = [min(shares) for shares in single]
+        self._most = [max(shares) for shares in single]
+        # The smallest and largest probability that a link sends no second copy, from each of `_changed_at` on.
 
     def range_at(self, link: Link, sent_s: float) -> tuple[float, float]:
-        """Return the minimum and maximum loss rate of the link around this time."""
-        times, losses = self._times[link], self._losses[link]
-        if len(losses) == 1:
-            return losses[0], losses[0]
+        """Return the minimum and maximum probability that the link loses all copies around this time."""
+        losses = self._around(self._times[link], self._losses[link], sent_s)
+        least, most = min(losses), max(losses)
+        fewest = min(self._around(self._changed_at, self._fewest, sent_s))
+        # No copy passes a partition, but a second copy passes a link that loses every first copy.
+        return least * fewest, most if most == 1.0 else most * max(self._around(self._changed_at, self._most, sent_s))
+
+    def _around(self, times: list[float], values: list[float], sent_s: float) -> list[float]:
+        """Return the values that apply around this time. Each value applies from its time on."""
+        if len(values) == 1:
+            return values
         first = max(0, bisect_right(times, sent_s - self._slack_s) - 1)
-        last = max(first + 1, bisect_right(times, sent_s + self._slack_s))
-        return min(losses[first:last]), max(losses[first:last])
+        return values[first : max(first + 1, bisect_right(times, sent_s + self._slack_s))]
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
@@ -106,8 +128,8 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         return
     if any(isinstance(link.loss, GilbertElliott) for link in links):
         return  # draws in a burst are not independent
-    if any(link.delay or link.rate or link.corrupt or link.duplicate for link in links):
-        return  # messages are late, lost for another reason, or pass as a second copy although the first is lost
+    if any(link.delay or link.rate or link.corrupt for link in links):
+        return  # messages are late, or lost for another reason
     if set(evidence.record.roster if evidence.record else ()) - set(evidence.traces):
         return  # messages of an agent without a trace are not on record
     if any(trace.problem or trace.cut_off for trace in evidence.traces.values()):
@@ -120,8 +142,8 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         found = [each for each in group if _is_impossible_at(each[2], sides)]
         for receiver, subject, seen in found:
             detail = (
-                f"{subject} handled {seen.handled} of {seen.messages} messages, but the recorded loss is "
-                f"{100 * seen.least / seen.messages:.3g} %"
+                f"{subject} handled {seen.handled} of {seen.messages} messages, but by the recorded loss "
+                f"{100 * seen.least / seen.messages:.3g} % of them are lost"
             )
             yield of_agent(receiver, detail, "1")
         if found:
@@ -154,7 +176,8 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
     If `over_cuts` is given, it contains the minimum and maximum loss probability for messages over cut links.
     """
     slack = max([SAME_TIME_S, *(slack_s(evidence, trace) for trace in evidence.traces.values())])
-    history = _LossHistory(evidence.link_losses, slack)
+    history = _LossHistory(evidence.link_losses, evidence.requested_conditions or [], slack)
+    duplicates = any(link.duplicate > 0 for link in evidence.requested_links or ())
     known = {link for _, losses in evidence.link_losses for link in losses}
     expected: dict[int, _ExpectedDeliveries] = {}
     for receiver, trace in evidence.traces.items():
@@ -162,30 +185,35 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
         triggers = [run.trigger for run in trace.runs if isinstance(run.trigger, MessageTrigger)]
         handled = Counter((trigger.sender, trigger.message, trigger.sequence) for trigger in triggers)
         ready = _ReadyTimes(evidence, receiver) if in_virtual_time(trace) else None
-        for sender, of_sender in evidence.traces.items():
+        for sender, by_type in evidence.sendings.items():
             if (sender, receiver) not in known:
                 continue
-            spread_s = spread_of(of_sender)
-            for run in of_sender.runs:
-                for message in run.sent:
-                    if ready is not None and not ready.handles(message.message, run.t):
-                        continue
-                    range_at = history.range_at((sender, receiver), sent_at(run, message, spread_s))
-                    seen.add(over_cuts if over_cuts is not None and range_at[1] == 1.0 else range_at)
-                    key = sender, message.message, message.seq
-                    if handled[key] > 0:
-                        handled[key] -= 1
-                        seen.handled += 1
+            for message, by_sequence in by_type.items():
+                if ready is not None and message not in ready.counted:
+                    continue
+                for sequence, sent in by_sequence.items():
+                    if len(sent) > 1 and duplicates:
+                        continue  # two incarnations sent it, and the copies of which one were handled is unknown
+                    for sent_s, _ in sent:
+                        if ready is not None and not ready.handles(sent_s):
+                            continue
+                        range_at = history.range_at((sender, receiver), sent_s)
+                        seen.add(over_cuts if over_cuts is not None and range_at[1] == 1.0 else range_at)
+                        key = sender, message, sequence
+                        if handled[key] > 0:
+                            handled[key] -= 1
+                            seen.handled += 1
     return expected
 
 
 class _ReadyTimes:
-    """The times at which an agent in virtual time can handle a message of certain types."""
+    """The times at which an agent in virtual time handles every message of the types `counted`."""
 
     def __init__(self, evidence: Evidence, agent_id: int) -> None:
+        self.counted = MESSAGES if evidence.delivers_all else NEVER_WITHHELD
         self._latest_s = LATENCY.mean_s + LATENCY.jitter_s
         busy: list[tuple[float, float]] = [(from_s, until_s) for from_s, until_s, _ in stopped(evidence, agent_id, 0.0)]
-        for incarnation in evidence.incarnations[agent_id]:
+        for incarnation in () if evidence.delivers_all else evidence.incarnations[agent_id]:
             since: float | None = None
             for run in incarnation.runs:
                 if run.state.reconciling and since is None:
@@ -199,10 +227,10 @@ class _ReadyTimes:
         self._starts = [from_s for from_s, _ in self._busy]
         self._end_s = evidence.end_of(agent_id) or 0.0
 
-    def handles(self, message: str, sent_s: float) -> bool:
+    def handles(self, sent_s: float) -> bool:
         """Return true if the agent would handle the message at every possible time of its arrival."""
         arrives_s = sent_s + self._latest_s
-        if message not in NEVER_WITHHELD or arrives_s >= self._end_s:
+        if arrives_s >= self._end_s:
             return False
         number = bisect_right(self._starts, arrives_s + SAME_TIME_S)
         return all(until_s < sent_s - SAME_TIME_S for _, until_s in self._busy[max(0, number - 2) : number])

@@ -152,9 +152,9 @@ def test_unaltered_run_agrees(unaltered: Path) -> None:
         (with_message_at(3, 230.0), "although its kill at 200 s had stopped the agent"),
         (with_message_at(2, 75.0), "although its reboot at 60 s had stopped the agent"),
         (with_message_at(4, 290.0), "although its pause at 260 s had stopped the agent"),
-        (with_loss(0.6), "but the recorded loss is"),
-        (with_loss(0.05), "but the recorded loss is"),
-        (with_loss(0.0), "but the recorded loss is"),
+        (with_loss(0.6), "of them are lost"),
+        (with_loss(0.05), "of them are lost"),
+        (with_loss(0.0), "of them are lost"),
     ],
 )
 def test_altered_record_contradicts_others(directory: Path, altered: Edit, expected: str) -> None:
