@@ -16,6 +16,7 @@ pytestmark = pytest.mark.any_user
 REPOSITORY = Path(__file__).parents[2]
 ROOMS_WITH_READERS = ("scenario", "archive", "checker", "report", "run", "field", "sweep", "commands", "pytest_plugin")
 OWN_FILES = {
+    "checker/steps/_shared_code.py": "test vectors of the package",
     "field/bisection/_live_replay.py": "outputs of programs that it started",
     "field/bisection/_scripted_peers.py": "a script that its parent wrote",
     "pytest_plugin/_yaml_files.py": "small regular files of a project, which may have a package `ucp` of its own",
