@@ -46,11 +46,12 @@ def _event_lines(block: RecordedBlock) -> str:
 
     The model is too slow for a million events.
     """
-    number, agent_id, data = block.line.number, block.line.agent_id, block.event_data
+    data, beginning = block.event_data, f'{{"line":"event","block":{block.line.number},"index":'
+    middle = f',"agent_id":{block.line.agent_id},"timestamp_us":'
     return "".join(
         [
-            f'{{"line":"event","block":{number},"index":{index},"agent_id":{agent_id},"timestamp_us":{timestamp_us},'
-            f'"event_id":{event_id},"data":"{b2a_base64(data[begin:end], newline=False).decode("ascii")}"}}\n'
+            f'{beginning}{index}{middle}{timestamp_us},"event_id":{event_id},"data":"'
+            f'{b2a_base64(data[begin:end], newline=False).decode("ascii")}"}}\n'
             for index, (timestamp_us, event_id, begin, end) in enumerate(events_in(data))
         ]
     )
