@@ -18,8 +18,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from harness.present.text import row
-
 ROOT = Path(__file__).parents[1]
 MATRIX = {
     "name": "Nightly",
@@ -156,7 +154,7 @@ def reported(record: dict[str, Any], planted: str | None) -> list[str]:
 
 
 def print_row(fields: list[str]) -> None:
-    sys.stdout.write(row(fields) + "\n")
+    sys.stdout.write(f"| {' | '.join(fields)} |\n")
     sys.stdout.flush()
 
 

@@ -19,7 +19,6 @@ from tempfile import TemporaryDirectory
 from benchmarks.judging import scenario
 from harness.archive.directory import RunDirectory
 from harness.field.replay import RecordedTrace, RecordPlayer, open_record
-from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.simulation.run_files import DiskRecorder
 from harness.play.simulation.simulation import Simulation
@@ -29,7 +28,6 @@ DURATION_S = 7200.0
 BACKS = 200
 
 
-@gc_paused()
 def fly(directory: Path) -> None:
     """Play two hours and deliver all messages, so that each trace contains all inputs of its agent."""
     asked = scenario(AGENTS).model_copy(update={"duration_s": DURATION_S})

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import yaml
 
+from docs.generate.json_schemas import texts
 from harness.cli import COMMANDS, load_command
-from harness.json_schemas import texts
 from harness.scenario.load import parse
 from tests.harness.report.browser import open_browser
 from tests.pages import play

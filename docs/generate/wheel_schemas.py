@@ -31,7 +31,7 @@ class WheelSchemas(BuildHookInterface):  # type: ignore[type-arg]
         if version == "editable":
             return
         folder = Path(self._folder.name)
-        subprocess.run([sys.executable, "-m", "harness.json_schemas", str(folder)], cwd=self.root, check=True)
+        subprocess.run([sys.executable, "-m", "docs.generate.json_schemas", str(folder)], cwd=self.root, check=True)
         for path in sorted(folder.rglob("*.schema.json")):  # the order of files in the wheel
             build_data["force_include"][str(path)] = path.relative_to(folder).as_posix()
         if COMPILES:

@@ -16,7 +16,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from harness.json_schemas import texts
+from docs.generate.json_schemas import texts
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

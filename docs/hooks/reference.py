@@ -13,7 +13,7 @@ from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 from pydantic import BaseModel
 
-from harness.json_schemas import generate
+from docs.generate.json_schemas import generate
 from harness.scenario import Scenario
 from ucp.quirks import QUIRKS
 from ucp.settings import DECLARED, NumberSetting

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
+from docs.generate.json_schemas import texts
 from harness.cli import COMMANDS
 from harness.errors import CANNOT_HERE
-from harness.json_schemas import texts
 from harness.scenario import load_scenario
 from sitl.streams import release
 from tests.harness import forks

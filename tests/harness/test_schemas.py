@@ -5,7 +5,7 @@ from pathlib import Path
 
 from jsonschema import Draft202012Validator
 
-from harness import json_schemas
+from docs.generate import json_schemas
 
 DIGESTS = Path(__file__).with_name("schemas.sha256")
 """Lines as `sha256sum` writes them: a digest, two spaces, a path."""
@@ -13,8 +13,8 @@ DIGESTS = Path(__file__).with_name("schemas.sha256")
 WHAT_TO_DO = """A JSON Schema has changed. To see the change, run from the top of the repository:
 
     git worktree add /tmp/before "$(git log -1 --format=%H -- tests/harness/schemas.sha256)"
-    (cd /tmp/before && "$OLDPWD/.venv/bin/python" -m harness.json_schemas /tmp/schemas-before)
-    .venv/bin/python -m harness.json_schemas /tmp/schemas-now
+    (cd /tmp/before && "$OLDPWD/.venv/bin/python" -m docs.generate.json_schemas /tmp/schemas-before)
+    .venv/bin/python -m docs.generate.json_schemas /tmp/schemas-now
     diff -ru /tmp/schemas-before /tmp/schemas-now
     git worktree remove /tmp/before
 

@@ -322,4 +322,4 @@ def test_channel_has_the_fitted_range(flown: tuple[Path, CalibrationResult, Deli
     assert model_of(LogDistance(*figures)).range_m == pytest.approx(flown[1].fit.model.range_m, rel=1e-3)
     refused = harness("calibrate", flown[0], "-o", tmp_path / "other.yaml", "--channel", "wifi")
     assert refused.returncode == 2
-    assert "--channel: 'wifi' is no preset; use one of wifi_1" in refused.stderr
+    assert "'wifi' is not one of 'wifi_1'" in refused.stderr

@@ -4,7 +4,7 @@ Pydantic generates the schemas of the harness from its models. `ucp.contract.sch
 contract. Git has neither, because both follow from the code. `tests/harness/schemas.sha256` has their digests. The
 wheel and the site contain the schemas as files. To write them into a folder:
 
-    python -m harness.json_schemas FOLDER
+    python -m docs.generate.json_schemas FOLDER
 """
 
 import json
@@ -59,5 +59,5 @@ def write_all(folder: Path) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
-        sys.exit("usage: python -m harness.json_schemas FOLDER")
+        sys.exit("usage: python -m docs.generate.json_schemas FOLDER")
     write_all(Path(sys.argv[1]))
