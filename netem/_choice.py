@@ -26,7 +26,7 @@ def choose(preference: str | None, fabric: VirtualSwitch, needs: Sequence[str] =
         if preference not in (None, name):
             continue
         if needs and not kind.has_queues:
-            refused.append(f"{name}: knows loss and partitions only")
+            refused.append(f"{name}: supports only loss and partitions")
             continue
         try:
             engine = kind(fabric)

@@ -61,7 +61,7 @@ class LabConnection:
         try:
             data = encode({"id": number, "request": what, **arguments})
         except WireError as error:
-            raise LabError(f"The lab cannot be asked to {what}: {error}") from error
+            raise LabError(f"The lab cannot get the request {what!r}: {error}") from error
         self._requests[number] = _LabRequest(what, answer)
         try:
             async with self._writing:

@@ -66,7 +66,7 @@ def preload(folder: Path) -> dict[str, str]:
         word = (done.stderr.strip().splitlines() or [f"it ended with status {done.returncode}"])[-1]
         raise UmlError(
             f"User Mode Linux needs a library to keep this processor's registers, which cc could not compile ({word}); "
-            "mend the compiler (Debian, Ubuntu: apt install --reinstall gcc)"
+            "repair the compiler (Debian, Ubuntu: apt install --reinstall gcc)"
         )
     # A relative path, because the folder's may contain spaces and colons, which separate the entries of this list.
     return {"LD_PRELOAD": ":".join(filter(None, [f"./{library.name}", os.environ.get("LD_PRELOAD")]))}

@@ -106,7 +106,7 @@ class LiveCapture:
 
     def _last_line(self) -> str:
         lines = _log(self._folder).read_text(errors="replace").splitlines()
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "it printed nothing"
 
 
 def _log(folder: Path) -> Path:

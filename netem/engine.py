@@ -137,8 +137,8 @@ class Engine(ABC):
         conditions.validate(self._vehicles)
         if not self.has_queues and (needs := conditions.needs()):
             raise EngineError(
-                f"Engine {self.name} knows loss and partitions, not {', '.join(needs)}; "
-                "engine netem does, and the simulation (--backend sim)"
+                f"Engine {self.name} supports only loss and partitions, not {', '.join(needs)}; "
+                "use engine netem or the simulation (--backend sim)"
             )
         try:
             applied = self._apply(conditions)
@@ -149,10 +149,13 @@ class Engine(ABC):
             except EngineError as second:
                 held = _in_brief(self.read().to_json()["receivers"])
                 raise EngineError(
-                    f"{error}. Asked: {asked}. The conditions before could not be put back ({second}); in force: {held}"
+                    f"{error}. Requested: {asked}. The previous conditions could not be restored ({second}); in "
+                    f"effect: {held}"
                 ) from error
             before = _in_brief(self._in_force.to_json())
-            raise EngineError(f"{error}. Asked: {asked}; in force again: {before}") from error
+            raise EngineError(
+                f"{error}. Requested: {asked}; the previous conditions are in effect again: {before}"
+            ) from error
         self._in_force = conditions
         return applied
 
@@ -163,16 +166,17 @@ class Engine(ABC):
             cut_from = {sender for sender in self._vehicles if conditions.is_cut(sender, receiver)}
             if cut_from != set(figures.cut_from):
                 raise EngineError(
-                    f"The kernel does not cut off vehicle {receiver} as asked: asked from {sorted(cut_from)}, "
-                    f"in force from {sorted(figures.cut_from)}"
+                    f"The kernel does not cut off vehicle {receiver} as requested: requested from {sorted(cut_from)}, "
+                    f"in effect from {sorted(figures.cut_from)}"
                 )
             for sender in self._vehicles:
                 if sender != receiver:
                     asked, held = conditions.link(sender, receiver), figures.from_sender(sender)
                     if differing := _differing(asked, held):
                         raise EngineError(
-                            f"The kernel does not hold the {' and '.join(differing)} asked from vehicle {sender} to "
-                            f"{receiver}: asked {asked.to_json()}, in force {held.to_json()}"
+                            f"The kernel does not apply the requested {' and '.join(differing)} from vehicle "
+                            f"{sender} to "
+                            f"{receiver}: requested {asked.to_json()}, in effect {held.to_json()}"
                         )
         return applied
 

@@ -40,9 +40,7 @@ def first_process(argv: Sequence[str]) -> list[str]:
     """
     possible, message = _namespaces.probe()
     if not possible:
-        raise LabUnavailable(
-            f"This machine does not let us make a private network ({message})", _namespaces.way_out(message)
-        )
+        raise LabUnavailable(f"This machine does not allow private networks ({message})", _namespaces.way_out(message))
     try:
         os.close(os.open(_DEVICE, os.O_RDWR | os.O_CLOEXEC))
     except OSError as error:

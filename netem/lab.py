@@ -152,7 +152,7 @@ class Lab:
             reason = f"{_namespaces.user()} cannot execute {program} ({why})"
             raise LabUnavailable(f"The lab's first process cannot be started: {reason}", _namespaces.way_out(message))
         raise LabUnavailable(
-            f"This machine does not let us make a private network ({message})",
+            f"This machine does not allow private networks ({message})",
             f"{_namespaces.way_out(message)} Or run it inside User Mode Linux: --kernel uml.",
         )
 
@@ -341,7 +341,7 @@ def in_words(returncode: int) -> str:
 
 def _last_line(log: Path) -> str:
     lines = log.read_text(errors="replace").strip().splitlines()
-    return lines[-1] if lines else "it said nothing"
+    return lines[-1] if lines else "it printed nothing"
 
 
 __all__ = ["EngineName", "Lab", "LabError", "LabProcess", "LabUnavailable", "UdpCounters", "in_words"]

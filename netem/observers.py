@@ -79,7 +79,7 @@ def in_lab(engine: EngineName) -> Observer:
         try:
             return asyncio.run(asyncio.wait_for(_observe(engine, study, packets, pause_s), _DEADLINE_S))
         except TimeoutError:
-            raise LabError(f"A stream of {packets} packets came to no end; {_TRY_AGAIN}") from None
+            raise LabError(f"A stream of {packets} packets did not end in time; {_TRY_AGAIN}") from None
 
     return observe
 
@@ -121,7 +121,9 @@ async def _observe(
         reference = sorted(received_packets[sender, REFERENCE])
         sent_s, way_s = [packet.sent_s for packet in reference], [packet.at_s - packet.sent_s for packet in reference]
         if missing := packets - len(reference):
-            raise DisturbedError(f"{missing} of {packets} packets were lost where nothing is asked; {_TRY_AGAIN}")
+            raise DisturbedError(
+                f"{missing} of {packets} packets were lost without a loss in the conditions; {_TRY_AGAIN}"
+            )
         for receiver in study.receivers:
             if receiver != sender:
                 arrivals = [(packet.number, packet.at_s) for packet in received_packets[sender, receiver]]
@@ -202,5 +204,5 @@ class _ProbeProgram:
         status = await self._process.wait()
         last = (self._output.read_text().splitlines() or [""])[-1]
         if status != 0:
-            raise LabError(f"A program that measures ended with status {status}: {last}")
+            raise LabError(f"A measuring program ended with status {status}: {last}")
         return json.loads(last)

@@ -190,7 +190,7 @@ def main() -> None:
         relay.open()
         relay.close()
     except (OSError, NetlinkError) as error:
-        sys.exit(f"the kernel does not hand over broadcasts: {error}")
+        sys.exit(f"the kernel does not pass broadcasts to the shared channel: {error}")
 
 
 if __name__ == "__main__":

@@ -253,7 +253,7 @@ class _RunningKernel:
                 elif ended:
                     raise self._failed("it ended" if self.up else "it did not boot")
                 elif time.monotonic() > last_output_s + SILENCE_LIMIT_S:
-                    raise self._failed(f"nothing came from it for {SILENCE_LIMIT_S:g} s")
+                    raise self._failed(f"it printed nothing for {SILENCE_LIMIT_S:g} s")
                 else:
                     time.sleep(POLL_S)
 
@@ -261,7 +261,7 @@ class _RunningKernel:
         lines = (self._folder / "kernel").read_text(errors="replace").splitlines()
         printed = [line.strip() for line in lines if line.strip()] or ["nothing"]
         last = next((line for line in printed if "LD_PRELOAD" in line or "panic" in line), printed[-1])
-        return UmlError(f"User Mode Linux failed: {problem}; it last said: {last}")
+        return UmlError(f"User Mode Linux failed: {problem}; its last output is: {last}")
 
     def end(self) -> None:
         """Kill the virtual machine of User Mode Linux, if it still runs."""

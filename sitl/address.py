@@ -27,7 +27,7 @@ class ListenAddress:
         if not host or odd or bracketed != _is_ipv6(host) or not (port.isascii() and port.isdigit()):
             raise VehicleError(f"a ground station is HOST:PORT, for example 127.0.0.1:14550, not {text!r:.80}")
         if len(host) > 253 or any(not letter.isprintable() or letter.isspace() for letter in host):
-            raise VehicleError(f"{host!r:.80} is no host: name one, for example 127.0.0.1:14550")
+            raise VehicleError(f"{host!r:.80} is not a host: name a host, for example 127.0.0.1:14550")
         if not 1 <= int(port[:6]) <= 65535:
             raise VehicleError(f"a ground station's port is 1 to 65535, usually 14550, not {port:.20}")
         return cls(host, int(port))
@@ -58,7 +58,7 @@ def connected(address: ListenAddress) -> socket.socket:
 
 def _no_way_to(address: ListenAddress, error: OSError | UnicodeError) -> VehicleError:
     """Return the error for an unreachable address."""
-    reason = "it is no name" if isinstance(error, UnicodeError) else error.strerror or str(error)
+    reason = "it is not a valid name" if isinstance(error, UnicodeError) else error.strerror or str(error)
     return VehicleError(
         f"datagrams to the ground station at {address} cannot be sent ({reason}): name an address that this machine "
         "can reach, for example 127.0.0.1:14550"

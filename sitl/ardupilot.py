@@ -122,7 +122,7 @@ class ArduPilot:
             directory = Path(named)
             if not directory.is_dir():
                 raise UnusableBinaryError(
-                    f"{ENVIRONMENT} is {named}, which is no directory: set it to the directory that holds {program}"
+                    f"{ENVIRONMENT} is {named}, which is not a directory: set it to the directory that holds {program}"
                 )
             present = [name for name in BINARIES.values() if (directory / name).exists()]
             if (directory / program).exists() or not present:  # a directory with nothing in it is a mistake

@@ -109,7 +109,7 @@ async def bring_about(link: PilotLink, circumstance: SimulatedFailure) -> Mappin
     if link.closed.is_set():
         raise NotSimulatedError(f"ended its connection before it could simulate {circumstance.what}")
     if chosen is None and link.heard_at < asked_at:
-        raise NotSimulatedError(f"was silent when it was to simulate {circumstance.what}")
+        raise NotSimulatedError(f"did not answer the request to simulate {circumstance.what}")
     if chosen is None:
         names = " and no ".join(" with ".join(way) for way in ways)
         raise NotSimulatedError(f"cannot simulate {circumstance.what}: it has no {names}")
@@ -125,7 +125,7 @@ async def bring_about(link: PilotLink, circumstance: SimulatedFailure) -> Mappin
 
     if await _heard(link, came_about, set_all, limit_s) is None:
         said = ", ".join(f"{name} {link.parameters[name]:g}" for name in values)
-        raise NotSimulatedError(f"did not take {circumstance.what}: after {limit_s:g} s it says {said}")
+        raise NotSimulatedError(f"did not simulate {circumstance.what}: after {limit_s:g} s it reports {said}")
     return values
 
 

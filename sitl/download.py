@@ -71,7 +71,9 @@ def download(url: str, target: Path, limit: int, progress: Progress, stall_s: fl
         else:
             answer.close()
             if origin is None:
-                raise DownloadError(f"{url} was answered with status {answer.status}, which is no file: try again")
+                raise DownloadError(
+                    f"the server answered {url} with status {answer.status} instead of a file: try again"
+                )
             part.unlink(missing_ok=True)
             download(url, target, limit, progress, stall_s)
             return
@@ -144,7 +146,7 @@ def _chunks(url: str, answer: Any, stall_s: float) -> Iterator[bytes]:
             chunk = answer.read1(CHUNK if left is None else min(CHUNK, left))
         except TimeoutError:
             raise DownloadError(
-                f"{urlsplit(url).netloc} sent nothing for {stall_s:g} s: run the same command again to go on"
+                f"{urlsplit(url).netloc} sent nothing for {stall_s:g} s: run the same command again to continue"
             ) from None
         except (OSError, http.client.HTTPException):
             raise _broken_off(url) from None
@@ -157,7 +159,7 @@ def _chunks(url: str, answer: Any, stall_s: float) -> Iterator[bytes]:
 
 
 def _broken_off(url: str) -> DownloadError:
-    return DownloadError(f"{url} broke off before its end: run the same command again to go on")
+    return DownloadError(f"{url} ended too early: run the same command again to continue")
 
 
 def _endless(url: str) -> DownloadError:

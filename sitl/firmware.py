@@ -131,7 +131,7 @@ def install(
     the cache cannot be written, and VehicleError if this machine cannot run the binary.
     """
     if not re.fullmatch(r"[a-z0-9][\w.-]*", version, re.ASCII):
-        raise RequestError(f"{version!r} is no version: give stable, beta, latest or a number such as 4.6.3")
+        raise RequestError(f"{version!r} is not a version: give stable, beta, latest or a number such as 4.6.3")
     board = _BOARDS.get(platform.machine()) if sys.platform == "linux" else None
     if board is None:
         raise VehicleError(
@@ -199,7 +199,7 @@ class _ReleaseServer:
         if not self._board.header.match(head):
             path.unlink()
             raise DownloadError(
-                f"{url} is no program for Linux on {self._board.processor}, it begins with {head[:12]!r}: "
+                f"{url} is not a program for Linux on {self._board.processor}, but begins with {head[:12]!r}: "
                 "does a proxy answer for it?"
             )
         path.chmod(0o755)
@@ -274,7 +274,9 @@ def _checked(base: str) -> str:
             return base.rstrip("/")
     except ValueError:
         pass
-    raise RequestError(f"{base!r} is no address of a mirror: give http(s)://HOST[:PORT][/PATH], without a password")
+    raise RequestError(
+        f"{base!r} is not the address of a mirror: give http(s)://HOST[:PORT][/PATH], without a password"
+    )
 
 
 def _intact(vehicle: VehicleType, directory: Path) -> bool:
@@ -321,7 +323,7 @@ def _ways_out(home: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise CacheError(
-                f"the disk of {home} is full: make room and run the same command again, it goes on where it stopped"
+                f"the disk of {home} is full: free some space, and run the same command again to continue"
             ) from None
         raise CacheError(
             f"{error.filename or home} cannot be written ({error.strerror}): make it writable, or set XDG_CACHE_HOME "

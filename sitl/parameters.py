@@ -46,7 +46,7 @@ def read(path: Path) -> dict[str, float]:
         name, value = words[0], _number(words[1]) if len(words) > 1 else None
         if value is None or not _NAME.fullmatch(name):
             shown = line.strip()[:MAX_LINE_SHOWN]
-            raise ParameterError(f"{path}, line {number}: {shown!r} is no parameter: write NAME VALUE")
+            raise ParameterError(f"{path}, line {number}: {shown!r} is not a parameter: write NAME VALUE")
         values[name] = value
         if len(values) > MAX_PARAMETERS:
             raise ParameterError(f"{path} has more than {MAX_PARAMETERS} parameters")
@@ -59,7 +59,9 @@ def check(values: Mapping[str, float]) -> None:
         raise ParameterError(f"there are more than {MAX_PARAMETERS} parameters")
     for name, value in values.items():
         if not _NAME.fullmatch(name):
-            raise ParameterError(f"{name[:MAX_LINE_SHOWN]!r} is no parameter: names are like WPNAV_SPEED")
+            raise ParameterError(
+                f"{name[:MAX_LINE_SHOWN]!r} is not the name of a parameter: use a name such as WPNAV_SPEED"
+            )
         if name in OURS:
             raise ParameterError(f"{name} is the system ID, which the harness gives every vehicle: leave it out")
         if not math.isfinite(value) or abs(value) > LARGEST:

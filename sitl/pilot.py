@@ -138,7 +138,7 @@ class Pilot:
         if self.state.has_moved or self._terminated or self._handed_over or self._befallen:
             return None
         awaited = self._awaited.name if self._awaited else "its end"
-        return str(self._failed(flight, awaited, "it has not left its home when the mission ends"))
+        return str(self._failed(flight, awaited, "it has not left its home at the end of the mission"))
 
     def hand_over(self) -> None:
         """Let another pilot fly the vehicle. The current procedure ends without an error."""
@@ -200,7 +200,7 @@ class Pilot:
 
     def _failed(self, procedure: PilotProcedure, awaited: str, reason: str) -> FlightError:
         state = self.state
-        words = f"its last words: {state.texts[-1]!r}" if state.texts else "it never said why"
+        words = f"its last text is {state.texts[-1]!r}" if state.texts else "it sent no text"
         return FlightError(
             f"vehicle {self.vehicle_id} did not {procedure.purpose}: waiting for {awaited}, {reason}; {words} (it is "
             f"{'armed' if state.armed else 'not armed'}, in mode {mode_name(self.vehicle_type, state.mode)}; "
@@ -212,7 +212,7 @@ class _ListenOnlyProcedure:
     """A procedure without steps, during which the pilot only receives messages."""
 
     purpose = "stay in touch"
-    _step = ProcedureStep("its next word", math.inf)
+    _step = ProcedureStep("its next message", math.inf)
 
     def next_step(self) -> ProcedureStep:
         return self._step
@@ -239,7 +239,7 @@ class _StepWaitingTimes:
         if self._link.closed.is_set():
             return "it ended the connection"
         if self._link.foreign_sysid is not None:
-            return f"it says that its system ID is {self._link.foreign_sysid}"
+            return f"it sends the system ID {self._link.foreign_sysid}"
         for what, at in self._streams().items():
             if now - at >= self._silence_limit_s:
                 return f"{what} for {now - at:.1f} s"

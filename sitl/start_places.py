@@ -70,7 +70,7 @@ def swarm(path: Path) -> dict[int, HomeOffset]:
     for number, key, values in _lines(path):
         where = f"{path}, line {number}"
         if not (key.isascii() and key.isdecimal() and int(key[:9]) <= MAX_INSTANCE):
-            raise PlaceError(f"{where}: {key[:MAX_SHOWN]!r} is no instance: write INSTANCE=EAST,NORTH,UP,HEADING")
+            raise PlaceError(f"{where}: {key[:MAX_SHOWN]!r} is not an instance: write INSTANCE=EAST,NORTH,UP,HEADING")
         numbers = _numbers(values)
         if numbers is None or len(numbers) not in (3, 4):
             raise PlaceError(f"{where}: {values[:MAX_SHOWN]!r} is not EAST,NORTH,UP,HEADING in metres and degrees")

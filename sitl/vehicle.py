@@ -68,7 +68,7 @@ class Home:
         if not -180 <= self.lon_deg <= 180:
             raise VehicleError(f"home longitude {self.lon_deg} is not on Earth: give -180 to 180 degrees")
         if not 0 <= self.heading_deg < 360:
-            raise VehicleError(f"home heading {self.heading_deg} is no heading: give 0 to 359 degrees")
+            raise VehicleError(f"home heading {self.heading_deg} is not valid: give 0 to 359 degrees")
 
     def __str__(self) -> str:
         """Return the place in the format of ArduPilot's option `--home`: LAT,LON,ALT,HDG."""

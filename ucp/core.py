@@ -48,7 +48,7 @@ class Core(AgentState):
         self.announced: list[SentMessage] = []
         self.started: dict[str, float] = {}
         if seal is not None and settings.max_block_bytes + SEAL_BYTES > MAX_EVENT_DATA_BYTES:
-            raise ValueError(f"sealed event data leaves {MAX_EVENT_DATA_BYTES - SEAL_BYTES} for max_block_bytes")
+            raise ValueError(f"with sealed event data, max_block_bytes is at most {MAX_EVENT_DATA_BYTES - SEAL_BYTES}")
         self.sealed: bytes | None = None
         self._seal = seal
         self._tracing = tracing

@@ -128,9 +128,9 @@ def parse_mission(document: Any) -> Mission:
     security = _security(document.get("security"))
     if sealed_to(initial_data) is not None:
         if security is None:
-            raise MissionError("`initial_data` ends in a depot's key, and sealing to it needs `security`")
+            raise MissionError("`initial_data` ends in a depot's key, so `security` is needed to seal event data")
         if settings.max_block_bytes > (most := MAX_EVENT_DATA_BYTES - SEAL_BYTES):
-            raise MissionError(f"`settings.max_block_bytes` is at most {most} where event data is sealed")
+            raise MissionError(f"`settings.max_block_bytes` must be at most {most} with sealed event data")
     return Mission(
         agent_id=agent_id,
         roster=tuple(dict.fromkeys(roster)),

@@ -103,7 +103,7 @@ class StoredState:
         """Raise ValueError if no agent can have this state."""
         held = [block.block_hash for block in self.blocks()]
         if len({*held}) < len(held) or not {*self.completed} <= {*held}:
-            raise ValueError("a block is in two places, or one that it completed in none")
+            raise ValueError("a block is stored twice, or a completed block is missing")
 
     def _change(self, operation: str, block: Block) -> None:
         """Apply one change, an operation with a block."""
@@ -165,18 +165,16 @@ class Store:
         if not self._path.parent.is_dir():
             raise StoreError(f"{self._path} cannot be written: the directory {self._path.parent} does not exist")
         if self._path.exists() and not self._path.is_file():
-            raise StoreError(f"{self._path} is no file: name another as `store`")
+            raise StoreError(f"{self._path} is not a file: set `store` to the path of another file")
         header, stored = read_store(self._path)
         if not isinstance(header, dict):
             if self._path.exists() and self._path.stat().st_size:
-                raise StoreError(
-                    f"{self._path} does not begin as a store: move it away or name another file as `store`"
-                )
+                raise StoreError(f"{self._path} is not a store: move the file away, or set `store` to another path")
             return None
         if header != self._header:
             raise StoreError(
                 f"{self._path} is the store of agent {shown(header.get('agent_id'))} in another mission, or of "
-                "another version: name another file as `store`"
+                "another version: set `store` to another path"
             )
         return stored
 
@@ -250,8 +248,7 @@ def read_store(path: Path) -> tuple[Any, StoredState]:
         stored.check()
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
         raise StoreError(
-            f"{path} has an entry whose checksum is right and that no agent wrote: move it away or name another file "
-            "as `store`"
+            f"{path} has an impossible entry with a valid checksum: move the file away, or set `store` to another path"
         ) from None
     return header, stored
 

@@ -53,7 +53,7 @@ def serve(lines: BinaryIO, answers: BinaryIO) -> None:
                 agent = None
                 agent = VirtualAgent(given)
             elif agent is None:
-                raise InputError("the first line has to have a mission")
+                raise InputError("the first line must contain a mission")
             else:
                 agent.give(given)
             answer = agent.answer()

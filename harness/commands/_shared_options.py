@@ -35,7 +35,7 @@ def seconds_of(option: str, text: str) -> float:
     duration = _DURATION.fullmatch(text.strip())
     seconds = float(duration[1]) * _UNITS[duration[2]] if duration else 0.0
     if not 0 < seconds <= MAX_TIME_S:
-        raise typer.BadParameter(f"{option} {text!r} is no time: 90s, 30m or 8h are, up to 31 days")
+        raise typer.BadParameter(f"{option} {text!r} is not a time: give a time such as 90s, 30m or 8h, up to 31 days")
     return seconds
 
 

@@ -30,7 +30,9 @@ def explore_command(
     seeds: Annotated[
         int | None, typer.Option(min=1, help=f"Maximum number of seeds; {explore.SEEDS} if not given.")
     ] = None,
-    first_seed: Annotated[int | None, typer.Option(min=0, help="First seed; that of RUN or 0 if not given.")] = None,
+    first_seed: Annotated[
+        int | None, typer.Option(min=0, help="First seed; the seed of RUN or 0 if not given.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="File for the smallest run with a violation; must be new.")] = None,
     secured: Annotated[
         bool, typer.Option("--secured", help="Secure the mission with fresh keys if it has none.")

@@ -36,8 +36,8 @@ def join_command(
     """Let an agent on this computer take part in a run elsewhere.
 
     The scenario names the agent in `remote`. The agent runs here, in a private network with the addresses of its
-    vehicle. It starts, pauses, dies and reboots as the scenario says. If the connection is lost, the agent goes on for
-    up to 60 s while the command connects again.
+    vehicle. The scenario defines when the agent starts, pauses, dies and reboots. If the connection is lost, the agent
+    continues for up to 60 s while the command connects again.
     """
     if new_secret is not None:
         create_secret(new_secret)

@@ -31,7 +31,7 @@ def matrix_command(
     ],
     backend: Annotated[BackendName | None, typer.Option(help="Backend of all runs, instead of the file's.")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Directory of results: new, empty, or that of a matrix to continue.")
+        Path | None, typer.Option(help="Directory of results: new, empty, or of a matrix to continue.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print matrix.json instead of the table.")] = False,
     jobs: Annotated[
@@ -71,16 +71,17 @@ def matrix_command(
         ),
     ] = None,
     budget: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Begin no run after 6h; the most uncertain cells come first.")
+        str | None,
+        typer.Option(metavar="TIME", help="Start no run after this time (6h); the most uncertain cells first."),
     ] = None,
 ) -> None:
     """Play a scenario over loss rates, swarm sizes and many seeds.
 
     Mission lengths and backends can vary, too. The report has figures with 95 % intervals, and each violation. With
-    three or more swarm sizes or mission lengths, it also has power laws of how figures grow.
+    three or more swarm sizes or mission lengths, it also has power laws for the growth of the figures.
 
     Exit status 0: no run is bad. 1: a run is bad or failed, or a figure is worse than in --against. 3: an agent does
-    not support a run. 4: no run is bad, but some needed more time. With --variant, the runs of the variant count.
+    not support a run. 4: no run is bad, but some needed more time. With --variant, only runs of the variant count.
     """
     request = matrix.load_matrix(file, backend)
     if secured:

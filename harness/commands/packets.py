@@ -26,19 +26,21 @@ def packets_command(
     follow: Annotated[
         str | None, typer.Option(metavar="BLOCK", help="Follow one block: 3.12, or the start of its hash.")
     ] = None,
-    lost: Annotated[bool, typer.Option("--lost", help="Only datagrams that a vehicle lost, with loss rates.")] = False,
+    lost: Annotated[
+        bool, typer.Option("--lost", help="Print only datagrams that a vehicle lost, and loss rates.")
+    ] = False,
     sender: Annotated[
-        int | None, typer.Option("--from", metavar="ID", help="Only datagrams that this vehicle sent.")
+        int | None, typer.Option("--from", metavar="ID", help="Print only datagrams that this vehicle sent.")
     ] = None,
     receiver: Annotated[
-        int | None, typer.Option("--to", metavar="ID", help="Only datagrams that this vehicle received or lost.")
+        int | None, typer.Option("--to", metavar="ID", help="Print only datagrams that this vehicle received or lost.")
     ] = None,
     message: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Only messages of this name, such as Commit Block.")
+        str | None, typer.Option(metavar="NAME", help="Print only messages of this name, such as Commit Block.")
     ] = None,
     between: Annotated[
         tuple[float, float] | None,
-        typer.Option(metavar="S1 S2", help="Only datagrams sent between these mission seconds."),
+        typer.Option(metavar="S1 S2", help="Print only datagrams sent between these mission seconds."),
     ] = None,
     bundle: BundleOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the datagrams as JSON.")] = False,

@@ -38,7 +38,7 @@ def prove_command(
     ] = None,
     clocks: Annotated[
         str,
-        typer.Option(rich_help_panel=RARE, help="Which of two blocks is older: agreed by all agents, or any."),
+        typer.Option(rich_help_panel=RARE, help="Age order of blocks: equal for all agents (agreed), or any."),
     ] = "agreed",
     losses: Annotated[
         int | None,

@@ -47,7 +47,9 @@ def run_command(
             autocompletion=complete_scenario,
         ),
     ],
-    seed: Annotated[int | None, typer.Option(min=0, help="Random seed; that of RUN or a new one if not given.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Random seed; the seed of RUN or a new one if not given.")
+    ] = None,
     speedup: Annotated[float | None, typer.Option(help="Mission seconds per second of wall time.")] = None,
     agents: Annotated[
         list[str] | None,
@@ -69,7 +71,9 @@ def run_command(
     ] = None,
     listen: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS:PORT", rich_help_panel=RARE, help="Wait there for agents on other computers."),
+        typer.Option(
+            metavar="ADDRESS:PORT", rich_help_panel=RARE, help="Address at which to wait for agents on other computers."
+        ),
     ] = None,
     capture: Annotated[
         bool, typer.Option("--capture", help="Record each vehicle's frames in capture/ID.pcapng.")

@@ -45,7 +45,7 @@ def tell_command(
 ) -> None:
     """Cause an event in an active run, or control virtual time.
 
-    Virtual time can pause, step and go on. Without SENTENCE the command prints the state of the run.
+    Virtual time can pause, step and continue. Without SENTENCE the command prints the state of the run.
     """
     try:
         if not sentence:
@@ -101,7 +101,7 @@ def shell_command(
 ) -> None:
     """Open a shell in the network of a vehicle of an active run.
 
-    Use ping, tcpdump or ip there. Without RUN the command lists the active runs.
+    For example, run ping, tcpdump or ip in this shell. Without RUN the command lists the active runs.
     """
     runs, inside = running(), runs_inside()
     if run is None:

@@ -45,7 +45,7 @@ _TIMESPEC = struct.Struct("@qq")
 ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
 
 
-SILENT = "it said nothing"
+SILENT = "it printed nothing"
 
 
 class NoAgentError(HarnessError):

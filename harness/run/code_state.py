@@ -35,7 +35,7 @@ class ProcessResult:
     def last_error_line(self) -> str:
         """The last line that the process wrote to standard error, without the name of the program."""
         lines = [line.strip() for line in self.stderr.splitlines() if line.strip()]
-        return lines[-1].removeprefix("ucp-harness: ")[:300] if lines else "it said nothing"
+        return lines[-1].removeprefix("ucp-harness: ")[:300] if lines else "it printed nothing"
 
     def raised_in(self, directory: Path) -> str | None:
         """Return the exception that ended the process, with the innermost line of its traceback in `directory`.

@@ -131,7 +131,7 @@ class ChannelModel(StrictModel):
         allowed = {field.name for field in fields(radio)}
         for key in self._figures():
             if key not in allowed:
-                raise ValueError(f"`{key}` is no key of a radio such as {self.preset}: leave it out")
+                raise ValueError(f"`{key}` is not a key of the radio preset {self.preset}: leave it out")
         return replace(radio, **self._figures())
 
     def to_json(self) -> dict[str, Any]:

@@ -214,7 +214,7 @@ class ScriptedEvent(StrictModel):
     @model_validator(mode="after")
     def _sealed_data_has_a_timestamp(self) -> "ScriptedEvent":
         if self.sealed is not None and self.timestamp_us is None:
-            raise ValueError("`sealed` is of an event of a flight, and that has a `timestamp_us`")
+            raise ValueError("`sealed` needs a `timestamp_us`: only recorded events have sealed data")
         return self
 
 

@@ -139,7 +139,7 @@ class Forgery(StrictModel):
     @model_validator(mode="after")
     def _check_values(self) -> "Forgery":
         if (self.for_s is None) != (self.message == "Commit Block"):
-            raise ValueError(f"`for_s` is needed by forged answers ({', '.join(self.ANSWERS)}), and by nothing else")
+            raise ValueError(f"forged answers ({', '.join(self.ANSWERS)}) need `for_s`; no other message has it")
         if self.approve is not None and self.message not in self.ANSWERS[:2]:
             raise ValueError(f"`approve` belongs to {' and '.join(self.ANSWERS[:2])}; a {self.message} has no vote")
         return self

@@ -83,7 +83,7 @@ class _TimelineEntryBase(NetworkDisturbance):
     def _an_injection(cls, value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, int | float):
             of_the_network = f"`network: {{{info.field_name}: {value}}}`"
-            raise ValueError(f"it is an action of a rogue node; {of_the_network} belongs to the network")
+            raise ValueError(f"it is an action of a rogue node; {of_the_network} changes the network")
         return value
 
     @property

@@ -211,7 +211,10 @@ class _Forgetful(Engine):
 def test_refused_change_is_undone_and_reported() -> None:
     engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
     engine.apply(NetworkConditions(LinkConditions(0.1)))
-    with pytest.raises(EngineError, match=r"^The kernel said no\. Asked: .*0\.9.*; in force again: .*0\.1"):
+    with pytest.raises(
+        EngineError,
+        match=r"^The kernel said no\. Requested: .*0\.9.*; the previous conditions are in effect again: .*0\.1",
+    ):
         engine.apply(NetworkConditions(LinkConditions(0.9)))
     assert engine.read().receivers[1].loss == 0.1
 
@@ -220,7 +223,10 @@ def test_failed_undo_is_reported_with_the_conditions_in_force() -> None:
     engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
     engine.apply(NetworkConditions(LinkConditions(0.1)))
     engine.stuck = True
-    word = r"said no\. Asked: .*0\.9.* could not be put back \(.*asked .*0\.1.*in force .*0\.5.*\); in force: .*0\.5"
+    word = (
+        r"said no\. Requested: .*0\.9.* could not be restored "
+        r"\(.*requested .*0\.1.*in effect .*0\.5.*\); in effect: .*0\.5"
+    )
     with pytest.raises(EngineError, match=word):
         engine.apply(NetworkConditions(LinkConditions(0.9)))
 
@@ -248,7 +254,7 @@ def test_state_of_the_kernel_is_compared_within_the_resolution(
     if differing is None:
         engine.apply(NetworkConditions(asked))
     else:
-        with pytest.raises(EngineError, match=f"does not hold the {differing}"):
+        with pytest.raises(EngineError, match=f"does not apply the requested {differing}"):
             engine.apply(NetworkConditions(asked))
 
 

@@ -234,10 +234,10 @@ def test_refused_change_leaves_the_previous_conditions_in_force(netem: str, tmp_
     async def story(air: Air) -> None:
         before = await air.lab.apply(good)
         with pytest.raises(
-            EngineError, match=r"does not hold the delay\.jitter_s asked .* 5\.0.* in force again: "
+            EngineError, match=r"does not apply the requested delay\.jitter_s .* 5\.0.* in effect again: "
         ) as caught:
             await air.lab.apply(far)
-        assert "Asked: {'default': {'loss': 0.5}" in str(caught.value)
+        assert "Requested: {'default': {'loss': 0.5}" in str(caught.value)
         assert await air.lab.read() == before
 
     in_lab([1, 2, 3], netem, tmp_path, story)
@@ -252,7 +252,7 @@ def test_kernel_without_mixed_duplicates_refuses_and_changes_nothing(netem: str,
             await air.lab.apply(NetworkConditions(twice, links={(1, 2): LinkConditions(0.5, duplicate=0.5)}))
         except EngineError as error:
             assert "duplicat" in str(error)
-            assert "in force again" in str(error)
+            assert "in effect again" in str(error)
             assert await air.lab.read() == before
         # With equal conditions for all senders they work on all kernels, before and after other conditions.
         await air.lab.apply(NetworkConditions(twice))
@@ -303,7 +303,7 @@ def test_preflight_refuses_unsupported_conditions_with_the_remedy(tmp_path: Path
         with pytest.raises(LabUnavailable, match="Nothing does delay, receivers 2 corrupt here") as caught:
             await Lab.open([1, 2], engine="nftables", needs=needs, log=tmp_path / "lab.log")
         assert caught.value.stage == "engine"
-        assert "nftables: knows loss and partitions only" in caught.value.reason
+        assert "nftables: supports only loss and partitions" in caught.value.reason
         assert "--backend sim" in caught.value.way_out
 
     play(story())

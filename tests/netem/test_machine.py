@@ -108,7 +108,7 @@ def test_forbidden_user_namespaces_are_reported_with_the_remedy() -> None:
     lines = done.stdout.splitlines()
     assert lines[0] == "namespaces", done.stderr
     assert "sudo sysctl user.max_user_namespaces=15000, or run as root" in lines[1]
-    assert lines[2].startswith("This machine does not let us make a private network (unshare:")
+    assert lines[2].startswith("This machine does not allow private networks (unshare:")
     assert lines[3].startswith("namespaces False User namespaces are switched off")
 
 

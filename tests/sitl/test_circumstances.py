@@ -158,7 +158,7 @@ def test_parameter_name_of_an_earlier_version_is_used(tmp_path: Path) -> None:
     [
         (COMPASS_LOST, "copter", "loss of its compasses: it has no SIM_MAG1_FAIL with .* and no SIM_MAG1_FAIL$"),
         (MOTOR_STOPPED, "plane", "failure of a motor: it has no SIM_ENGINE_MUL with SIM_ENGINE_FAIL$"),
-        (battery(float("nan")), "copter", "did not take a battery of nan V: .* it says SIM_BATT_VOLTAGE 16.8"),
+        (battery(float("nan")), "copter", "did not simulate a battery of nan V: .* it reports SIM_BATT_VOLTAGE 16.8"),
     ],
 )
 def test_unsupported_circumstance_gives_one_sentence(
@@ -190,7 +190,9 @@ def test_silent_vehicle_is_not_reported_as_unsupported(
             await asyncio.sleep(0.1)  # messages under way arrive in this time
             if leaves:
                 puppet.leave()
-            with pytest.raises(NotSimulatedError, match="ended its connection before" if leaves else "was silent when"):
+            with pytest.raises(
+                NotSimulatedError, match="ended its connection before" if leaves else "did not answer the request"
+            ):
                 await pilot.befall(GPS_LOST)
 
     asyncio.run(ask())
@@ -338,7 +340,7 @@ def test_vehicle_that_never_left_its_home_is_reported(tmp_path: Path) -> None:
                 await asyncio.sleep(0.01)
             sentence = pilot.shortfall(flight)
             assert sentence is not None
-            assert "vehicle 3 did not fly its plan: waiting for arming, it has not left its home when" in sentence
+            assert "vehicle 3 did not fly its plan: waiting for arming, it has not left its home at the end" in sentence
             del puppet.vehicle.arm
             while not pilot.state.has_moved:
                 await asyncio.sleep(0.01)

@@ -171,7 +171,7 @@ def test_plane_parameters_are_found_in_the_old_place(server: FirmwareServer, env
 
 def test_interrupted_download_is_resumed(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, cut_after=HALF)
-    with pytest.raises(DownloadError, match="broke off before its end: run the same command again"):
+    with pytest.raises(DownloadError, match="ended too early: run the same command again"):
         install_copter(server, environ)
     assert current("copter", environ) is None
     server.change(BINARY_PATH, cut_after=None)
@@ -234,7 +234,7 @@ def test_incomplete_range_does_not_end_the_download(server: FirmwareServer, envi
     with pytest.raises(DownloadError):
         install_copter(server, environ)
     server.change(BINARY_PATH, cut_after=None, announced=1000)
-    with pytest.raises(DownloadError, match="broke off"):
+    with pytest.raises(DownloadError, match="ended too early"):
         install_copter(server, environ)
     server.change(BINARY_PATH, announced=None)
     install_copter(server, environ)
@@ -281,7 +281,7 @@ def test_unknown_version_lists_the_existing_ones(server: FirmwareServer, environ
 
 @pytest.mark.parametrize("version", ["", "..", "../..", "a/b", "4.6.3?", "ä", "-4"])
 def test_invalid_version_sends_no_request(version: str, server: FirmwareServer, environ: dict[str, str]) -> None:
-    with pytest.raises(RequestError, match="is no version"):
+    with pytest.raises(RequestError, match="is not a version"):
         install_copter(server, environ, version)
     assert server.asked == []
 
@@ -290,7 +290,7 @@ def test_invalid_version_sends_no_request(version: str, server: FirmwareServer, 
     "base", ["ftp://x", "x", "http://", "http://u:secret@x", "http://x:0", "http://x:y", "http://ä x"]
 )
 def test_invalid_mirror_is_refused(base: str, environ: dict[str, str]) -> None:
-    with pytest.raises(RequestError, match="is no address of a mirror"):
+    with pytest.raises(RequestError, match="is not the address of a mirror"):
         install("copter", "stable", environ, Onlooker(), base)
 
 
@@ -325,7 +325,7 @@ def test_redirect_to_an_unencrypted_address_is_refused() -> None:
 
 def test_web_page_is_not_accepted_as_a_binary(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, content=b"<!DOCTYPE html><html>Please log in</html>")
-    with pytest.raises(DownloadError, match="is no program for Linux on x86_64, it begins with b'<!DOCTYPE"):
+    with pytest.raises(DownloadError, match="is not a program for Linux on x86_64, but begins with b'<!DOCTYPE"):
         install_copter(server, environ)
     server.change(BINARY_PATH, content=BINARY)
     install_copter(server, environ)
@@ -334,7 +334,7 @@ def test_web_page_is_not_accepted_as_a_binary(server: FirmwareServer, environ: d
 
 def test_program_for_another_processor_is_refused(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(BINARY_PATH, content=BINARY[:18] + b"\xb7" + BINARY[19:])
-    with pytest.raises(DownloadError, match="is no program for Linux on x86_64"):
+    with pytest.raises(DownloadError, match="is not a program for Linux on x86_64"):
         install_copter(server, environ)
 
 
@@ -347,7 +347,7 @@ def test_web_page_is_not_accepted_as_a_text(path: str, server: FirmwareServer, e
 
 def test_truncated_parameters_are_an_error(server: FirmwareServer, environ: dict[str, str]) -> None:
     server.change(PARAMETERS_PATH, cut_after=30)
-    with pytest.raises(DownloadError, match="broke off"):
+    with pytest.raises(DownloadError, match="ended too early"):
         install_copter(server, environ)
     assert current("copter", environ) is None
 
@@ -384,7 +384,7 @@ def test_text_may_be_chunked_but_needs_an_end(server: FirmwareServer) -> None:
     server.files["/text"] = Resource(PARAMETERS, chunked=True)
     assert fetch_text(f"{server.url}/text", 1000).encode() == PARAMETERS
     server.change("/text", cut_after=20)
-    with pytest.raises(DownloadError, match="broke off"):
+    with pytest.raises(DownloadError, match="ended too early"):
         fetch_text(f"{server.url}/text", 1000)
     server.files["/text"] = Resource(PARAMETERS, sized=False)
     with pytest.raises(DownloadError, match="does not say how large"):
@@ -433,7 +433,7 @@ def test_full_disk_is_reported(server: FirmwareServer, environ: dict[str, str]) 
     part = cache(environ) / "copter" / ".4.6.3.part"
     part.mkdir(parents=True)
     (part / "copter.parm").symlink_to("/dev/full")
-    with pytest.raises(CacheError, match="is full: make room and run the same command again"):
+    with pytest.raises(CacheError, match="is full: free some space, and run the same command again"):
         install_copter(server, environ)
     (part / "copter.parm").unlink()
     install_copter(server, environ)
@@ -539,7 +539,7 @@ def test_32_bit_arm_gets_its_own_binary(
     with pytest.raises(RequestError, match="SITL_arm_linux_gnueabihf"):
         install_copter(server, environ)
     serve_arm(server, BINARY)
-    with pytest.raises(DownloadError, match="is no program for Linux on 32-bit ARM"):
+    with pytest.raises(DownloadError, match="is not a program for Linux on 32-bit ARM"):
         install_copter(server, environ)
     serve_arm(server, ARM_BINARY)
     install_copter(server, environ)

@@ -161,7 +161,7 @@ def test_silent_vehicle_ends_the_flight_with_an_error(
 ) -> None:
     message = failure(tmp_path, without(monkeypatch, *lost), by=by)
     assert message.startswith("vehicle 3 did not fly its plan: waiting for ")
-    assert said in message and "its last words: '" in message
+    assert said in message and "its last text is '" in message
 
 
 def test_disconnected_vehicle_ends_the_flight_at_once(tmp_path: Path) -> None:
@@ -247,7 +247,7 @@ def test_refused_mission_ends_the_flight_with_the_reason(tmp_path: Path, monkeyp
 def test_vehicle_that_never_becomes_ready_ends_the_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sitl._autopilot, "READY_S", math.inf)
     monkeypatch.setattr(sitl.pilot, "LEAST_WAIT_S", 0.1)
-    with pytest.raises(FlightError, match="ready to arm, 180 simulated seconds were not enough; it never said why"):
+    with pytest.raises(FlightError, match="ready to arm, 180 simulated seconds were not enough; it sent no text"):
         puppet_flown(tmp_path, lambda puppet: None)
 
 
@@ -277,7 +277,7 @@ def test_vehicle_is_monitored_after_its_flight(tmp_path: Path, monkeypatch: pyte
                 await pilot.stay_in_touch()
             return str(error.value)
 
-    assert "vehicle 3 did not stay in touch: waiting for its next word, it has been silent" in asyncio.run(listen())
+    assert "vehicle 3 did not stay in touch: waiting for its next message, it has been silent" in asyncio.run(listen())
 
 
 @pytest.mark.parametrize("vehicle_type", TYPES)

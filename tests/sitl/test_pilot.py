@@ -91,14 +91,14 @@ def test_missed_deadline_names_vehicle_step_and_last_message(tmp_path: Path, mon
     with embedded(speedup=SPEEDUP) as vehicle:
         message = asyncio.run(failure(vehicle.pilot_port, tmp_path / "3.tlog"))
     assert message.startswith("vehicle 3 did not take off: waiting for the climb, 70 simulated seconds were not enough")
-    assert "its last words: 'Arming motors' (it is armed, in mode GUIDED; all it sent is in" in message
+    assert "its last text is 'Arming motors' (it is armed, in mode GUIDED; all it sent is in" in message
     assert "3.tlog" in message
 
 
 def test_vehicle_with_another_system_id_is_refused(tmp_path: Path) -> None:
     with embedded(sysid=9) as vehicle:
         message = asyncio.run(failure(vehicle.pilot_port, tmp_path / "3.tlog", sysid=3))
-    assert "vehicle 3" in message and "system ID is 9" in message
+    assert "vehicle 3" in message and "it sends the system ID 9" in message
 
 
 def test_silent_vehicle_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

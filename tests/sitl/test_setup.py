@@ -43,10 +43,10 @@ def test_parameters_of_ground_stations_are_read_without_system_id(tmp_path: Path
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("WPNAV_SPEED\n", "line 1: 'WPNAV_SPEED' is no parameter: write NAME VALUE"),
-        ("A 1\nwpnav 2\n", "line 2: 'wpnav 2' is no parameter"),
-        ("A nan\n", "is no parameter"),
-        ("A 1e39\n", "is no parameter"),
+        ("WPNAV_SPEED\n", "line 1: 'WPNAV_SPEED' is not a parameter: write NAME VALUE"),
+        ("A 1\nwpnav 2\n", "line 2: 'wpnav 2' is not a parameter"),
+        ("A nan\n", "is not a parameter"),
+        ("A 1e39\n", "is not a parameter"),
         ("".join(f"P{number} 1\n" for number in range(5001)), "more than 5000"),
         ("A" * 1_000_001, "larger than"),
     ],
@@ -120,7 +120,11 @@ def test_swarm_offsets_are_assigned_by_instance(tmp_path: Path) -> None:
     home = offsets[1].of(HOME)
     assert HOME.metres_to(home.lat_deg, home.lon_deg, home.alt_m) == pytest.approx((30, 20, 4))
     assert home.heading_deg == 90 and offsets[2].of(HOME).heading_deg == HOME.heading_deg
-    for text, problem in (("x=1,2,3\n", "is no instance"), ("1=1,2\n", "is not EAST,NORTH"), ("#\n", "has no offsets")):
+    for text, problem in (
+        ("x=1,2,3\n", "is not an instance"),
+        ("1=1,2\n", "is not EAST,NORTH"),
+        ("#\n", "has no offsets"),
+    ):
         with pytest.raises(VehicleError, match=problem):
             start_places.swarm(written(tmp_path / "swarm.txt", text))
 

@@ -620,7 +620,7 @@ def test_file_that_is_no_store_ends_with_one_sentence_and_status_2(tmp_path: Pat
     assert agent.process.wait(DEADLINE_S) == 2
     assert agent.process.stderr is not None
     said = agent.process.stderr.read()
-    assert "7.store does not begin as a store: move it away" in said
+    assert "7.store is not a store: move the file away" in said
     assert said.count("\n") == 1
 
 

@@ -161,14 +161,14 @@ def test_store_of_another_agent_or_mission_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "store"
     a_store(path)
     for other in (Agent(2, [1, 2], INITIAL_DATA), Agent(1, [1, 2], b"another mission")):
-        with pytest.raises(StoreError, match=r"is the store of agent 1 in another mission.*name another file"):
+        with pytest.raises(StoreError, match=r"is the store of agent 1 in another mission.*to another path"):
             Store(path, other.state)
 
 
 def test_file_that_is_no_store_is_not_changed(tmp_path: Path) -> None:
     path = tmp_path / "precious"
     path.write_text("data\n")
-    with pytest.raises(StoreError, match=r"precious does not begin as a store: move it away"):
+    with pytest.raises(StoreError, match=r"precious is not a store: move the file away"):
         found(path)
     assert path.read_text() == "data\n"
     path.write_text("")

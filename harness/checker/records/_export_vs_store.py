@@ -25,7 +25,9 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
         if incarnations is None or not any(run.changes for run in incarnations[-1].runs):
             continue  # its last incarnation wrote no store
         if not path.is_file() or path.stat().st_size > MAX_STORE_BYTES:
-            yield of_agent(agent_id, f"its store {path.name} is no file, or larger than {MAX_STORE_BYTES} bytes", "2")
+            yield of_agent(
+                agent_id, f"its store {path.name} is not a file, or is larger than {MAX_STORE_BYTES} bytes", "2"
+            )
             continue
         try:
             header, stored = read_store(path)

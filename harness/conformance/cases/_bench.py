@@ -145,7 +145,7 @@ class BenchAgent:
         try:
             return await asyncio.wait_for(self.process.program.process.wait(), PATIENCE_S * 2)
         except TimeoutError:
-            raise WrongBehaviourError("the agent ends", "it runs on") from None
+            raise WrongBehaviourError("the agent ends", "it still runs") from None
 
 
 class CaseBench:

@@ -33,7 +33,7 @@ async def _full(bench: CaseBench) -> None:
         try:
             await agent.process.ready()
         except AgentEndedError as error:
-            raise CannotJudgeError(f"it does not take /dev/full, which stands for a full disk: {error}") from None
+            raise CannotJudgeError(f"the agent cannot use /dev/full, which simulates a full disk: {error}") from None
         await agent.begin()
         await agent.require_single_answer(INCEPTION, "its trace could not be written")
         await agent.log(b"event")

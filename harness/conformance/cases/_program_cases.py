@@ -50,7 +50,7 @@ async def _refused(agent: BenchAgent, command: str, why: str, **arguments: Any) 
         await agent.process.ask(command, **arguments)
     except AgentRefusedError:
         return
-    raise WrongBehaviourError(f"`ok` false to {command} {why}", "it said `ok` true")
+    raise WrongBehaviourError(f"`ok` false to {command} {why}", "the agent answered `ok` true")
 
 
 @case(

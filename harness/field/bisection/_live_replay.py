@@ -343,7 +343,7 @@ async def _ask(agent: ControlledProgram, command: str, **arguments: Any) -> None
 
 
 def _end_text(agent: ControlledProgram, error: ProgramEndedError) -> str:
-    return f"the agent {error}: {agent.last_line or 'it said nothing'}"
+    return f"the agent {error}: {agent.last_line or 'it printed nothing'}"
 
 
 def _received(path: Path, agent_id: int) -> list[tuple[float, Message]]:

@@ -68,7 +68,8 @@ def read_flight_log(path: Path) -> FlightLog:
             kind = flight_log_kind(path, file.peek(_BEGINNING_BYTES)[:_BEGINNING_BYTES])
             if kind is None:
                 raise FieldError(
-                    f"{path}: is no flight log: it has no messages of DataFlash or MAVLink; give a .bin or .tlog file"
+                    f"{path}: not a flight log, because it has no messages of DataFlash or MAVLink; give a .bin "
+                    "or .tlog file"
                 )
             log = _dataflash(path, file) if kind == "DataFlash" else _telemetry(path, file)
             if file.problem:

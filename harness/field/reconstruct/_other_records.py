@@ -109,8 +109,8 @@ class OtherRecords:
             try:
                 events += decode_events(event_data)
             except MalformedEventsError:
-                reason = f"cannot be told apart{self._reason_unreadable}"
-                self.problems.append(f"agent {agent_id}: the events of a block {reason}")
+                reason = f"cannot be decoded{self._reason_unreadable}"
+                self.problems.append(f"agent {agent_id}: the event data of a block {reason}")
         return events
 
     def _open(self, block: Block) -> bytes:

@@ -85,7 +85,7 @@ class ReplayPrompt(cmd.Cmd):
         names = {command.removeprefix("do_").replace("_", "-") for command in self.get_names() if command[:3] == "do_"}
         matching = [command for command in sorted(names) if command.startswith(name)]
         if name not in names and len(matching) != 1:
-            self._print_message(f"no command {line.strip()[:60]!r}; help lists the commands")
+            self._print_message(f"{line.strip()[:60]!r} is not a command; help lists the commands")
             return False
         self.lastcmd = line
         run: Callable[[str], bool | None] = getattr(
@@ -167,7 +167,7 @@ class ReplayPrompt(cmd.Cmd):
         """debug (d): play this step again in the debugger, pdb or that of the IDE; `step` then enters its handler"""
         player = self._player
         if not player.position:
-            raise FieldError("nothing is played yet: enter next, then debug")
+            raise FieldError("no step is played yet: enter next, then debug")
         in_use = RecordPlayer(player.record, implementation=IN_USE)
         in_use.to(player.position - 1)
         with suppress(BdbQuit):
@@ -227,7 +227,7 @@ class ReplayPrompt(cmd.Cmd):
         else:
             position = next_stop(player, parse_breakpoint(arg, self._names), backward)
             if position is None:
-                self._print_message(f"there is no {arg[:60]} {'before' if backward else 'after'} this")
+                self._print_message(f"there is no {arg[:60]} {'before' if backward else 'after'} this step")
                 return
             player.to(position)
         self._show()

@@ -156,7 +156,7 @@ class ChannelNode:
             self._relay = Relay(roster, request["others"])
             self._relay.open()
         except (OSError, NetemError) as error:
-            raise CommandError(f"the kernel does not hand over broadcasts: {error}") from None
+            raise CommandError(f"the kernel does not pass broadcasts to the shared channel: {error}") from None
         self._loop.watch(self._relay.input, readable=self._turn)
         return {}
 

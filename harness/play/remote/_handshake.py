@@ -85,7 +85,7 @@ async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, A
     async with asyncio.timeout(HANDSHAKE_LIMIT_S):
         challenge = await _exactly(connection, len(_CHALLENGE) + _NONCE_BYTES)
         if not challenge.startswith(_CHALLENGE):
-            raise HandshakeError("is no harness of this version")
+            raise HandshakeError("is not a harness of this version")
         own, words = secrets.token_bytes(_NONCE_BYTES), json.dumps(hello).encode()
         nonces = challenge[len(_CHALLENGE) :] + own
         tag = _mac(secret, b"UCP hello", nonces, words)
@@ -116,7 +116,7 @@ def _parsed(data: bytes) -> dict[str, Any]:
     except ValueError:
         value = None
     if not isinstance(value, dict):
-        raise HandshakeError("sent no JSON object")
+        raise HandshakeError("did not send a JSON object")
     return value
 
 

@@ -67,7 +67,7 @@ class Message:
         except ValueError:
             value = None
         if not isinstance(value, dict):
-            raise WireError(f"a message {self.kind.name} is no JSON object")
+            raise WireError(f"a message {self.kind.name} is not a JSON object")
         return value
 
 

@@ -173,7 +173,7 @@ class FarWorker:
             case Kind.IDLE:
                 pass
             case _:
-                raise WireError(f"a message {message.kind.name} at the wrong time")
+                raise WireError(f"a message {message.kind.name} arrived at the wrong time")
 
     def _resume(self, state: dict[str, Any]) -> None:
         self._in_step = True

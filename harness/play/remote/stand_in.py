@@ -198,7 +198,7 @@ class StandIn:
             case Kind.EXIT:
                 self._exit(message.document())
             case _:
-                raise WireError(f"a message {message.kind.name} at the wrong time")
+                raise WireError(f"a message {message.kind.name} arrived at the wrong time")
 
     def _pong(self, payload: bytes) -> None:
         sent = self._clock.receive(payload)

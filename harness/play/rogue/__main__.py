@@ -118,7 +118,7 @@ class RogueNode:
         try:
             injection = MODELS[request["what"]].model_validate(request["injection"])
         except (KeyError, ValidationError) as error:
-            raise CommandError(f"no injection: {error}") from None
+            raise CommandError(f"the injection is not valid: {error}") from None
         if isinstance(injection, Lie):
             raise CommandError("a `lie` needs virtual time: use --backend sim")
         self._rogue.begin(request["number"], injection, self._clock.now())

@@ -328,9 +328,9 @@ class LocalStates(KnownStates):
                 end_at_once(agent)
             if self._results(agent) != results or take(agent, after).items() != after.items():
                 raise UncoveredError(
-                    "a step of an agent depends on the mission time, on the order of a dictionary, or on how often it "
-                    f"has done something before ({', '.join(COUNTED)}); a state of the proof has none of them, so keep "
-                    "what the step needs in an attribute of its own"
+                    "a step of an agent depends on the mission time, on the order of a dictionary, or on a counter "
+                    f"({', '.join(COUNTED)}), but the states of the proof do not have these values: keep the input of "
+                    "the step in another attribute of the agent"
                 )
 
     def message(self, message: Message) -> int:

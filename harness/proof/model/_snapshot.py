@@ -213,7 +213,9 @@ def _copied(value: Any) -> Any:
     if copy is None:
         copy = next((copier for kind, copier in _COPIED.items() if isinstance(value, kind)), None)
     if copy is None:
-        raise TypeError(f"an agent's state has a {type(value).__name__}, and nobody has said how it is copied")
+        raise TypeError(
+            f"an agent's state has a {type(value).__name__}, which the prover cannot copy: add its type to _COPIED"
+        )
     return copy(value)
 
 

@@ -255,5 +255,5 @@ def _rejected(constants: Constants, batch: _EncodedStepBatch) -> dict[int, tuple
         step, what = rejected.get(number, (len(life.steps), (AT_END,)))
         positions += step + (AT_END in what)
     if positions != said.distinct:
-        raise CheckerError(f"TLC has looked at {said.distinct} positions of {positions}")
+        raise CheckerError(f"TLC checked {said.distinct} positions of {positions}")
     return rejected

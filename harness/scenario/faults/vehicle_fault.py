@@ -52,7 +52,9 @@ class VehicleFault(Fault):
             raise ValueError("needs vehicles, but `vehicles.kind` is none")
         for vehicle in self.agents:
             if (kind := vehicles.type_of(vehicle)) not in self.vehicle_types:
-                raise ValueError(f"befalls a {' or a '.join(self.vehicle_types)}, and vehicle {vehicle} is a {kind}")
+                raise ValueError(
+                    f"applies only to a {' or a '.join(self.vehicle_types)}, but vehicle {vehicle} is a {kind}"
+                )
 
     async def apply(self, operations: AgentOperations, agent_id: int) -> None:
         await operations.set_circumstance(agent_id, self.what, self.circumstance, by_hand=self.by_hand)

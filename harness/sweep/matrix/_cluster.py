@@ -91,7 +91,9 @@ def _refuse_other_versions(versions: dict[str, dict[str, str | None]], address: 
         for package, version in packages.items():
             if version != here[package]:
                 has = f"{package} {version}" if version else f"no {package}"
-                raise MachineError(f"{node} has {has}, and here is {here[package]}: install the same version on both")
+                raise MachineError(
+                    f"{node} has {has}, but this machine has {here[package]}: install the same version on both"
+                )
 
 
 def _outcomes(
@@ -119,7 +121,7 @@ def _outcomes(
         except (Exception, asyncio.CancelledError, concurrent.futures.CancelledError) as error:
             if future.status != "error":
                 raise MachineError(
-                    f"the scheduler at {address} was lost: the same command with the same --out goes on"
+                    f"the scheduler at {address} was lost: repeat the command with the same --out to continue"
                 ) from None
             outcome = FailedTask(f"{type(error).__name__}: {error}")
         del future  # the reference would keep its outcome in memory

@@ -155,8 +155,9 @@ class Matrix(StrictModel):
                 first = values[0] if isinstance(values, list) else values
                 if scenario.get(axis, first) != first:
                     raise ValueError(
-                        f"`scenario` sets {axis} to {shown(scenario[axis])}, which the matrix's `{axis}` is for: "
-                        "remove it there"
+                        f"`scenario` sets {axis} to {shown(scenario[axis])}, but the key `{axis}` of the matrix "
+                        "sets it: "
+                        "remove it from `scenario`"
                     )
                 scenario = {**scenario, axis: first}
         return {**document, "scenario": scenario}
@@ -170,7 +171,7 @@ class Matrix(StrictModel):
                 Scenario.model_validate({**document, **dict(zip(axes, size, strict=True))})
             except ValidationError as error:
                 which = " and ".join(f"`{axis}` has {value:g}" for axis, value in zip(axes, size, strict=True))
-                raise ValueError(f"{which}, for which `scenario` is wrong: {explain(error, Scenario)}") from None
+                raise ValueError(f"`scenario` is wrong if {which}: {explain(error, Scenario)}") from None
         return self
 
     @field_validator("scenario")
@@ -178,7 +179,8 @@ class Matrix(StrictModel):
     def _loss_is_the_axis(cls, scenario: Scenario) -> Scenario:
         if scenario.network.loss:
             raise ValueError(
-                f"sets network.loss to {scenario.network.loss}, which the matrix's `loss` is for: remove it there"
+                f"sets network.loss to {scenario.network.loss}, but the key `loss` of the matrix sets it: remove "
+                "network.loss"
             )
         return scenario
 

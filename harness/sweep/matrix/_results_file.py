@@ -39,8 +39,8 @@ class MatrixResults:
                 raise OSError(None, "No space left on device")
         except OSError as error:
             raise MachineError(
-                f"{self.directory / FILE} cannot be written: {error.strerror}; what had ended is there, and the same "
-                f"command with --out {self.directory} goes on"
+                f"{self.directory / FILE} cannot be written: {error.strerror}; it has all finished runs: free some "
+                f"space, and repeat the command with --out {self.directory} to continue"
             ) from None
         self.runs[run.task] = run
 

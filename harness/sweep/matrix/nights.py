@@ -45,7 +45,7 @@ def load_baseline(path: Path, matrix: Matrix) -> BaselineNight:
     seed.
     """
     if len(matrix.seed_list) < 2:
-        raise ScenarioError("--against compares 95 % intervals, which one seed has not: give the matrix more `seeds`")
+        raise ScenarioError("--against compares 95 % intervals, which need several seeds: give the matrix more `seeds`")
     try:
         record = _load(path)
     except OtherVersionError as error:
@@ -87,7 +87,10 @@ def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
     differing = [f"`{key}`" for key in now if before[key] != now[key]]
     if differing:
         verb = "differs" if len(differing) == 1 else "differ"
-        raise ScenarioError(f"{path} is of another matrix: {', '.join(differing)} {verb}, so nothing can be compared")
+        raise ScenarioError(
+            f"{path} contains results of another matrix: {', '.join(differing)} {verb}, so the nights cannot be "
+            "compared"
+        )
     return record
 
 
@@ -104,18 +107,20 @@ def _load(path: Path) -> MatrixRecord:
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
-        raise ScenarioError(f"{path}: {json_problem(error)}; an earlier night is its matrix.json") from None
+        raise ScenarioError(f"{path}: {json_problem(error)}; name the matrix.json of an earlier night") from None
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema != SCHEMA:
         claim = f"has schema {shown(schema)}" if schema is not None else "names no schema"
-        raise ScenarioError(f"{path} {claim}: an earlier night is its matrix.json, whose schema is {SCHEMA}")
+        raise ScenarioError(f"{path} {claim}: name the matrix.json of an earlier night, whose schema is {SCHEMA}")
     try:
         record = MatrixRecord.model_validate(document)
     except ValidationError as error:
         place = ".".join(map(str, error.errors()[0]["loc"]))
         raise OtherVersionError(f"{path}: this version of the harness cannot read its `{place}`") from None
     if record.outcome != "completed":
-        raise ScenarioError(f"{path} is of a matrix that was {record.outcome}: finish it, or take another night's")
+        raise ScenarioError(
+            f"{path} contains results of a matrix that was {record.outcome}: finish the matrix, or name another night"
+        )
     return record
 
 

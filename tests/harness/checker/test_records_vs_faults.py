@@ -239,4 +239,4 @@ def test_store_with_other_blocks_than_the_export_is_reported(directory: Path) ->
 
 def test_store_that_is_a_fifo_is_not_read(directory: Path) -> None:
     os.mkfifo(directory / "agents" / "1.store")
-    assert "its store 1.store is no file" in found(directory)
+    assert "its store 1.store is not a file" in found(directory)

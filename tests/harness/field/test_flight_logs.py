@@ -187,7 +187,7 @@ def test_damaged_log_raises_nothing_but_its_own_error(tmp_path: Path, name: str)
         try:
             log = read(tmp_path, name, bytes(damaged[start:]))
         except FieldError as error:
-            assert "is no flight log" in str(error)
+            assert "not a flight log" in str(error)
         else:
             assert all("\n" not in problem for problem in log.problems)
 
@@ -255,7 +255,7 @@ def test_packed_log_is_read(tmp_path: Path, name: str) -> None:
 
 def test_other_files_are_no_flight_logs(tmp_path: Path) -> None:
     for name, data in (("1.bin", b"\x7fELF" + bytes(3000)), ("1.txt", b"\xa3\x95"), ("1.tlog", b"")):
-        with pytest.raises(FieldError, match=f"{name}: is no flight log"):
+        with pytest.raises(FieldError, match=f"{name}: not a flight log"):
             read(tmp_path, name, data)
     with pytest.raises(FieldError, match="cannot be read"):
         read_flight_log(tmp_path)

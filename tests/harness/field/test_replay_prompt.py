@@ -128,7 +128,7 @@ def test_contradictory_options_are_rejected(options: tuple[str, ...], wrong_run:
 def test_impossible_command_is_reported(wrong_run: Path) -> None:
     said = output_of(wrong_run, "b", "fly", "goto x", "n nobody", "clear 7", "quit")
     assert said["b"] == ["start of the record"]
-    assert said["fly"][0].startswith("no command 'fly'")
+    assert said["fly"][0].startswith("'fly' is not a command")
     assert said["goto x"][0].startswith("goto needs a line")
     assert "is not a breakpoint: use a line number" in said["n nobody"][0]
     assert said["clear 7"] == ["no breakpoint at '7'"]

@@ -42,8 +42,8 @@ def test_key_replaces_a_figure_of_the_preset() -> None:
         (", antenna_m: -0.5", "channel.antenna_m: -0.5 is out of range; allowed is 0 to 10000"),
         (", queue_frames: 0", "channel.queue_frames: 0 is out of range; allowed is 1 to 100000"),
         (", eifs_s: 0.00001", "channel.eifs_s: 1e-05 is below difs_s, 5e-05; allowed is difs_s or more"),
-        (", spreading_factor: 7", "`spreading_factor` is no key of a radio such as wifi_1: leave it out"),
-        (", duty: 0.01", "`duty` is no key of a radio such as wifi_1: leave it out"),
+        (", spreading_factor: 7", "`spreading_factor` is not a key of the radio preset wifi_1: leave it out"),
+        (", duty: 0.01", "`duty` is not a key of the radio preset wifi_1: leave it out"),
         (", processing_s: -1", "network.channel.processing_s"),
     ],
 )

@@ -163,6 +163,6 @@ def test_vehicle_with_a_wrong_system_id_is_named_and_killed(tmp_path: Path) -> N
     done = harness("run", scenario, "--out", out)
     record = json.loads((out / "run.json").read_text())
     assert record["outcome"] == "failed" and done.returncode != 0
-    assert re.match(r"vehicle [123] did not introduce itself: .* its system ID is 9", record["outcome_detail"])
+    assert re.match(r"vehicle [123] did not introduce itself: .* it sends the system ID 9", record["outcome_detail"])
     assert f"without default parameters: put ArduPilot's copter.parm beside {binary}" in record["outcome_detail"]
     assert not processes(out)

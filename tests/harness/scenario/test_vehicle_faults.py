@@ -56,7 +56,11 @@ def test_every_vehicle_fault_is_a_timeline_key_with_a_record() -> None:
     ("entry", "vehicles", "sentence"),
     [
         ({"lose_gps": [1]}, {"kind": "none"}, "timeline.0.lose_gps needs vehicles, but `vehicles.kind` is none"),
-        ({"stop_motor": [2]}, {"type": "plane"}, "timeline.0.stop_motor befalls a copter, and vehicle 2 is a plane"),
+        (
+            {"stop_motor": [2]},
+            {"type": "plane"},
+            "timeline.0.stop_motor applies only to a copter, but vehicle 2 is a plane",
+        ),
         ({"battery": [1]}, {}, "a battery needs `volts`, for example 10.4"),
         ({"wind": [1], "wind_ms": 5, "from_deg": 400}, {}, "timeline.0.from_deg"),
         ({"lose_gps": [7]}, {}, "names vehicle 7, which is not on the roster"),

@@ -160,7 +160,7 @@ class ForeignAgent:
 
     def handle_timer(self, now: float) -> None:
         if self._timers_ended.add(1, now) > MAX_TIMERS_PER_S:
-            raise self._failure("hung", f"has a timer that expires again and again {self._at(now)}")
+            raise self._failure("hung", f"has a timer that expires repeatedly without end {self._at(now)}")
         self._give_input(f'{{"t":{self._time_text(now)},"timer":true}}', "the expiry of its timer", now)
 
     def begin_reconcile(self, now: float) -> None:
@@ -202,7 +202,7 @@ class ForeignAgent:
                 self._status = AgentStatus.model_validate(command_answer)
             except ValidationError as error:
                 raise self._failure(
-                    "crashed", f"answered to the command status without a proper {_where(error)}"
+                    "crashed", f"its answer to the command status lacks a valid {_where(error)}"
                 ) from None
         return self._status
 
@@ -226,17 +226,17 @@ class ForeignAgent:
         try:
             read = Export.model_validate(export)
         except ValidationError as error:
-            raise self._failure("crashed", f"answered to the command export without a proper {_where(error)}") from None
+            raise self._failure("crashed", f"its answer to the command export lacks a valid {_where(error)}") from None
         if read.agent_id != self.agent_id:
-            raise self._failure("crashed", f"answered to the command export with that of agent {read.agent_id}")
+            raise self._failure("crashed", f"answered the command export with the export of agent {read.agent_id}")
         if read.inception.block_data != in_base64(self.initial_data):
-            raise self._failure("crashed", "answered to the command export with the chain of another mission")
+            raise self._failure("crashed", "answered the command export with the chain of another mission")
         return export
 
     def stored(self, now: float) -> DiskContents:
         command_answer = self._ask("store", now)
         if "store" not in command_answer:
-            raise self._failure("crashed", "answered to the command store without `store`")
+            raise self._failure("crashed", "answered the command store without the key `store`")
         return (command_answer["store"],)
 
     def end(self, now: float) -> None:
@@ -261,7 +261,7 @@ class ForeignAgent:
         timer = self._timer
         answer = self._exchange(f'{{"t":{self._time_text(now)},"command":"{command}"}}', f"the command {command}", now)
         if answer.sent or answer.timer != timer or any(isinstance(entry, HandlerRun) for entry in answer.trace):
-            raise self._failure("crashed", f"did not only answer the command {command}")
+            raise self._failure("crashed", f"sent messages, set a timer or ran a handler for the command {command}")
         return self._checked_answer(command, answer.command_answer)
 
     def _checked_answer(self, command: str, command_answer: Any) -> dict[str, Any]:
@@ -304,7 +304,7 @@ class ForeignAgent:
         except ProgramFailedError as error:
             if error.status in NO_VIRTUAL_TIME and not self.record.exchanges:
                 raise self._start_error(error.status) from None
-            raise self._failure(error.outcome, f"{error} when it was given {what} {self._at(now)}") from None
+            raise self._failure(error.outcome, f"{error} after it received {what} {self._at(now)}") from None
         except AnswerError as error:
             raise self._failure("crashed", f"answered {what} {self._at(now)} {error}") from None
         except LacksError as error:
@@ -323,7 +323,7 @@ class ForeignAgent:
         try:
             return [bytes.fromhex(block) for operation, block in _changes(entries) if operation == "complete"]
         except ValueError:
-            raise self._failure("crashed", "completed a block whose hash in its trace is none") from None
+            raise self._failure("crashed", "recorded a completed block whose hash is not hexadecimal") from None
 
     def _failure(self, outcome: Outcome, detail: str) -> AgentFailedError:
         self.failed = AgentFailedError(self.agent_id, outcome, f"{detail}{self._program.log_phrase()}")

@@ -138,7 +138,7 @@ class Corpus:
         document = None if name is None else self._document(path)
         if name is None or document is None:
             if name is None:
-                self.left_out.append(f"{path} is no run that was kept here")
+                self.left_out.append(f"{path} is not a run of this corpus")
             return None
         return CandidateRun(without_liveness_phase(document), int(name[1]))
 
@@ -159,7 +159,7 @@ class Corpus:
         try:
             return _FindingsFile.model_validate_json(self._read(path)).findings
         except (ValidationError, ValueError, RecursionError, ScenarioError):
-            self.left_out.append(f"{path} is no list of findings: what was found before is not known")
+            self.left_out.append(f"{path} is not a list of findings: earlier findings are unknown")
             return []
 
     def scenario_of(self, finding: Finding) -> Document | None:
@@ -192,7 +192,7 @@ class Corpus:
                 if type(night["local_states"]) is not int or not 0 <= night["local_states"] < MOST_STATES:
                     raise ValueError
             except (ValueError, KeyError, TypeError, OSError):
-                self.left_out.append(f"{path} is no night of this corpus")
+                self.left_out.append(f"{path} is not a night of this corpus")
                 continue
             yield night
 
@@ -234,7 +234,7 @@ def opened(directory: Path, scenario: Scenario, limits: MutationLimits) -> Corpu
     try:
         for part in ("runs", "findings", "nights"):
             if not path.exists() and directory.exists() and any(directory.iterdir()) and part == "runs":
-                raise RunDirectoryError(f"{directory} is not empty, and no corpus: choose another --corpus")
+                raise RunDirectoryError(f"{directory} is not empty and is not a corpus: choose another --corpus")
             (directory / part).mkdir(parents=True, exist_ok=True)
         if not path.exists():
             write_json_atomically(path, {"schema": SCHEMA, "scenario": base})
@@ -249,7 +249,7 @@ def opened(directory: Path, scenario: Scenario, limits: MutationLimits) -> Corpu
     except BlockingIOError:
         raise RunDirectoryError(f"another command works on the corpus in {directory}: wait for its end") from None
     except ValueError:
-        raise RunDirectoryError(f"{path} is no corpus of this version ({SCHEMA}): choose another --corpus") from None
+        raise RunDirectoryError(f"{path} is not a corpus of this version ({SCHEMA}): choose another --corpus") from None
     if header.get("scenario") != json.loads(json.dumps(base)):
         raise RunDirectoryError(f"{directory} is the corpus of another scenario: choose another --corpus")
     return Corpus(directory, base, limits, _lock=lock)
@@ -258,19 +258,19 @@ def opened(directory: Path, scenario: Scenario, limits: MutationLimits) -> Corpu
 def check_fits(document: Any, base: Document, limits: MutationLimits) -> Document:
     """Return the document if changes of the base scenario can produce it. Otherwise raise ScenarioError."""
     if not isinstance(document, dict):
-        raise ScenarioError("it is no scenario")
+        raise ScenarioError("it is not a scenario")
     document = {"agents": base["agents"], **document}
     for key in document.keys() | base.keys():
         if key not in CHANGED and not _is_part(document.get(key), base.get(key)):
-            raise ScenarioError(f"its {str(key)[:40]} is not that of the corpus's scenario")
+            raise ScenarioError(f"its `{str(key)[:40]}` differs from the scenario of the corpus")
     scenario = parse(document)
     if not set(scenario.roster) <= set(limits.roster):
-        raise ScenarioError("it has agents that the corpus's scenario has not")
+        raise ScenarioError("it has agents that the scenario of the corpus does not have")
     if scenario.duration_s > max(LONGEST_S, limits.last_s) or len(scenario.events.script) > MOST_KEPT:
-        raise ScenarioError("it is longer than any that were kept")
+        raise ScenarioError("it is longer than all scenarios of the corpus")
     settles_s = (base.get("settle") or {}).get("limit_s", Scenario.model_fields["settle"].default.limit_s)
     if scenario.settle.limit_s > max(settles_s, LONGEST_S):
-        raise ScenarioError("it settles for longer than any that were kept")
+        raise ScenarioError("its `settle.limit_s` is greater than in all scenarios of the corpus")
     return {**document, "agents": list(scenario.roster)}
 
 

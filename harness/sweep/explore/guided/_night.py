@@ -231,7 +231,7 @@ class _NightRun:
         kept = set(map(id, self._kept_runs(hunt.begin([*initial, *before], self._jobs))))
         if not hunt.kept:
             reason = hunt.failed[0][1] if hunt.failed else "no run of the scenario can be changed and played"
-            raise HarnessError(f"there is nothing to begin with: {reason}")
+            raise HarnessError(f"the hunt has no run to start from: {reason}")
         for candidate in () if self._over else before:
             if id(candidate) not in kept:
                 self._corpus.drop(candidate)

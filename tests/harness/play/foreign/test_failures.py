@@ -40,12 +40,12 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
 @pytest.mark.parametrize(
     ("code", "outcome", "sentence"),
     [
-        (EVENT + "sys.exit(3)", "crashed", "ended by itself with status 3 when it was given an event at 12.5 s"),
-        (EVENT + "os.kill(os.getpid(), 9)", "crashed", "was ended by SIGKILL when it was given an event at 12.5 s"),
+        (EVENT + "sys.exit(3)", "crashed", "ended by itself with status 3 after it received an event at 12.5 s"),
+        (EVENT + "os.kill(os.getpid(), 9)", "crashed", "was ended by SIGKILL after it received an event at 12.5 s"),
         (
             EVENT + "time.sleep(9)",
             "hung",
-            "did not answer within 1 s (with a whole line, flushed) when it was given an event",
+            "did not answer within 1 s (with a whole line, flushed) after it received an event",
         ),
         (EVENT + "print('ready')", "crashed", "answered an event at 12.5 s with a line that is not JSON"),
         (EVENT + "said = [1]", "crashed", "answered an event at 12.5 s with a line that is not a JSON object: '[1]'"),
@@ -58,9 +58,9 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
         (
             "said['timer'] = given['t'] + 1e-9 * ('timer' in given or not number)",
             "hung",
-            "a timer that expires again and",
+            "a timer that expires repeatedly",
         ),
-        ("said['timer'] = 1", "hung", "has a timer that expires again and again at 1 s"),
+        ("said['timer'] = 1", "hung", "has a timer that expires repeatedly without end at 1 s"),
         (EVENT + "said['sent'] = ['?']", "crashed", "with a datagram that is not base64: '?'"),
         (EVENT + "said['sent'] = ['AA=='] * 2000", "crashed", "with 2000 datagrams at once"),
         (EVENT + "said['sent'] = ['A' * 100000]", "crashed", "with a datagram of 75000 bytes, more than UDP carries"),
@@ -73,7 +73,7 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
         ),
         (EVENT + "print(json.dumps(said))", "crashed", "wrote an unexpected line"),
         (EVENT + "said = {'error': 'no, not I'}", "crashed", "refused an event at 12.5 s: no, not I"),
-        ("if given.get('command') == 'status': said['answer'] = {'ok': True}", "crashed", "without a proper `started`"),
+        ("if given.get('command') == 'status': said['answer'] = {'ok': True}", "crashed", "lacks a valid `started`"),
         (
             "if given.get('command') == 'export': said['answer'] = 3",
             "crashed",
@@ -82,19 +82,23 @@ def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
         (
             EXPORT + "if given.get('command') == 'export': said['answer']['chain'] = [1]",
             "crashed",
-            "answered to the command export without a proper `chain.0`",
+            "its answer to the command export lacks a valid `chain.0`",
         ),
         (
             EXPORT + "if given.get('command') == 'export': said['answer']['agent_id'] = 7",
             "crashed",
-            "answered to the command export with that of agent 7",
+            "answered the command export with the export of agent 7",
         ),
         (
             EXPORT + "if given.get('command') == 'export': said['answer']['inception']['block_data'] = 'AA=='",
             "crashed",
-            "answered to the command export with the chain of another mission",
+            "answered the command export with the chain of another mission",
         ),
-        ("if given.get('command') == 'export': said['sent'] = ['AA==']", "crashed", "did not only answer the command"),
+        (
+            "if given.get('command') == 'export': said['sent'] = ['AA==']",
+            "crashed",
+            "sent messages, set a timer or ran a handler",
+        ),
         (EVENT + "said = {'error': 'no such event', 'unsupported': True}", "not supported", "no such event"),
     ],
 )
@@ -141,7 +145,7 @@ def test_dead_program_does_not_end_the_run_for_others(tmp_path: Path) -> None:
     record = finished.record
     assert record.mission_s is not None and record.mission_s >= 30
     assert [(failure.at_s, failure.incarnation) for failure in record.agents["2"].failures] == [(12.5, 1)]
-    sentence = "ended by itself with status 3 when it was given an event at 12.5 s"
+    sentence = "ended by itself with status 3 after it received an event at 12.5 s"
     assert sentence in str(record.outcome_detail) and sentence in (tmp_path / "run/report.html").read_text()
     for agent in ("1", "3"):
         last = json.loads((tmp_path / f"run/agents/{agent}.trace.jsonl").read_text().splitlines()[-1])

@@ -47,7 +47,7 @@ def test_explore_finds_and_shrinks_a_crash(tmp_path: Path) -> None:
     path = write_scenario(tmp_path, agent_command=command, duration_s=20, events=events)
     done = harness("explore", path, "--seeds", 1, "--jobs", 2, "--out", tmp_path / "shrunk.yaml", deadline_s=240)
     assert done.returncode == 1
-    assert "agent 2: crashed: it ended by itself with status 1 when it was given an event at " in done.stdout
+    assert "agent 2: crashed: it ended by itself with status 1 after it received an event at " in done.stdout
     assert "its last output: the third event was too much" in done.stdout
     shrunk = yaml.safe_load((tmp_path / "shrunk.yaml").read_text())
     assert shrunk["agent_command"] == command and len(shrunk["events"]["script"]) == 3

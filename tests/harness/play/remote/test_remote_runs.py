@@ -204,4 +204,4 @@ def test_far_computer_without_namespaces_is_refused(tmp_path: Path) -> None:
     done = harness(*words, env={**os.environ, "PATH": "/nonexistent"})
     assert done.returncode == 3
     (sentence,) = sentences(done.stderr)
-    assert sentence.startswith("This machine does not let us make a private network (unshare is not installed)")
+    assert sentence.startswith("This machine does not allow private networks (unshare is not installed)")

@@ -153,7 +153,7 @@ def test_livelocks_differ_by_their_cycles_of_timers() -> None:
         return identity.shape
 
     assert shape("v12", "12v") == "2 agents going round every 20 s (voting, phase one, phase two)"
-    assert shape("2v12v1", "vf12") == shape("v12", "12v"), "twice round, entered elsewhere, with what is no timer"
+    assert shape("2v12v1", "vf12") == shape("v12", "12v"), "twice round, entered elsewhere, with what is not a timer"
     assert shape("v12", "v1") == shape("1v", "2v1") != shape("v12", "v12")
     assert shape("v12", "v12", "1").startswith("3 agents")
 
@@ -327,7 +327,7 @@ def test_ctrl_c_keeps_findings(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--for", "soon"], "is no time"),
+        (["--for", "soon"], "is not a time"),
         (["--runs", "3", "--seeds", "5"], "--seeds and --out do not apply to a hunt"),
         (["--corpus", "there"], "--corpus and --json need a hunt"),
     ],

@@ -66,4 +66,4 @@ def test_run_that_did_not_begin_is_no_interruption(tmp_path: Path) -> None:
 def test_wrong_budget_is_refused() -> None:
     refused = harness("matrix", "growth_matrix", "--budget", "soon")
     assert refused.returncode == 2
-    assert "is no time" in refused.stderr
+    assert "is not a time" in refused.stderr

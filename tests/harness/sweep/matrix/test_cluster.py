@@ -106,7 +106,7 @@ def test_lost_scheduler_is_one_sentence_and_the_matrix_can_continue(tmp_path: Pa
         _, said = process.communicate(timeout=DEADLINE_S)
     *progress, sentence = sentences(said)
     assert all(line.endswith(" runs") for line in progress)
-    assert sentence == f"the scheduler at {address} was lost: the same command with the same --out goes on"
+    assert sentence == f"the scheduler at {address} was lost: repeat the command with the same --out to continue"
     assert process.returncode == 3
     ended = (out / "results.jsonl").read_bytes()
     assert harness("matrix", asked, "--out", out).returncode == 0
@@ -136,7 +136,9 @@ def test_a_scheduler_of_another_version_is_one_sentence(tmp_path: Path, dask: Cl
     address = dask.start_scheduler(PYTHONPATH=str(tmp_path))
     dask.start_worker(address, "one")
     sentence = refused(address)
-    assert sentence.startswith(f"the scheduler at {address} has {package.replace('_', '-')} 0.0.1, and here is ")
+    assert sentence.startswith(
+        f"the scheduler at {address} has {package.replace('_', '-')} 0.0.1, but this machine has "
+    )
     assert sentence.endswith(": install the same version on both")
 
 

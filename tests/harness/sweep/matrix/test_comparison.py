@@ -217,9 +217,9 @@ def test_kept_nights_have_no_single_runs(tmp_path: Path) -> None:
     ("content", "sentence"),
     [
         (None, "cannot be read: No such file or directory"),
-        ("", "not JSON at line 1; an earlier night is its matrix.json"),
-        ("[]", "names no schema: an earlier night is its matrix.json, whose schema is ucp-matrix/1"),
-        ('{"schema": "ucp-run/1"}', "has schema 'ucp-run/1': an earlier night is its matrix.json"),
+        ("", "not JSON at line 1; name the matrix.json of an earlier night"),
+        ("[]", "names no schema: name the matrix.json of an earlier night, whose schema is ucp-matrix/1"),
+        ('{"schema": "ucp-run/1"}', "has schema 'ucp-run/1': name the matrix.json of an earlier night"),
     ],
 )
 def test_invalid_baseline_is_refused(tmp_path: Path, content: str | None, sentence: str) -> None:
@@ -236,10 +236,10 @@ def test_invalid_baseline_is_refused(tmp_path: Path, content: str | None, senten
 def test_an_interrupted_night_is_no_baseline(tmp_path: Path) -> None:
     path = night(tmp_path / "before")
     path.write_text(json.dumps({**json.loads(path.read_text()), "outcome": "interrupted"}))
-    with pytest.raises(ScenarioError, match="is of a matrix that was interrupted"):
+    with pytest.raises(ScenarioError, match="contains results of a matrix that was interrupted"):
         tonight(path)
 
 
 def test_one_seed_has_no_intervals_to_compare(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match="which one seed has not: give the matrix more `seeds`"):
+    with pytest.raises(ScenarioError, match="which need several seeds: give the matrix more `seeds`"):
         load_baseline(night(tmp_path / "before", seeds=1), matrix(seeds=1))

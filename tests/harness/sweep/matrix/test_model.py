@@ -139,13 +139,16 @@ def test_matrix_in_matrix_json_can_be_loaded_again(tmp_path: Path) -> None:
         ),
         ({"scenario": {"agents": 0}}, "`scenario.agents` is 0: use a number of agents 1..1000"),
         ({"scenario": {"agent": 5}}, "`scenario.agent` is unknown: use one of name, about, agents,"),
-        ({"scenario": {"network": {"loss": 0.2}}}, "sets network.loss to 0.2, which the matrix's `loss` is for"),
-        ({"agents": [5]}, "`scenario` sets agents to 3, which the matrix's `agents` is for: remove it there"),
+        (
+            {"scenario": {"network": {"loss": 0.2}}},
+            "sets network.loss to 0.2, but the key `loss` of the matrix sets it",
+        ),
+        ({"agents": [5]}, "`scenario` sets agents to 3, but the key `agents` of the matrix sets it"),
         ({"agents": [5, 0], "scenario": {}}, "`agents.1` is 0: it should be greater than or equal to 1"),
         ({"agents": [5, 5], "scenario": {}}, "`agents` is [5, 5]: names 5 twice"),
         (
             {"agents": [5, 3], "scenario": {"clocks": {4: {"drift": 0.1}}}},
-            "`agents` has 3, for which `scenario` is wrong: clocks names vehicle 4",
+            "`scenario` is wrong if `agents` has 3: clocks names vehicle 4",
         ),
         ({"duration_s": [60, 0]}, "`duration_s.1` is 0: it should be greater than 0"),
         ({"duration_s": [60, -1]}, "`duration_s.1` is -1: it should be greater than 0"),
@@ -157,15 +160,15 @@ def test_matrix_in_matrix_json_can_be_loaded_again(tmp_path: Path) -> None:
         ({"duration_s": [60, "long"]}, "`duration_s.1` is 'long': it should be a valid number"),
         (
             {"duration_s": [60], "scenario": {"duration_s": 90}},
-            "`scenario` sets duration_s to 90, which the matrix's `duration_s` is for: remove it there",
+            "`scenario` sets duration_s to 90, but the key `duration_s` of the matrix sets it",
         ),
         (
             {"duration_s": [600, 60], "scenario": {"timeline": [{"at_s": 100, "kill": [1]}]}},
-            "`duration_s` has 60, for which `scenario` is wrong: ",
+            "`scenario` is wrong if `duration_s` has 60: ",
         ),
         (
             {"agents": [5, 3], "duration_s": [60], "scenario": {"clocks": {4: {"drift": 0.1}}}},
-            "`agents` has 3 and `duration_s` has 60, for which `scenario` is wrong: clocks names vehicle 4",
+            "`scenario` is wrong if `agents` has 3 and `duration_s` has 60: clocks names vehicle 4",
         ),
         ({"traces": 2}, "`traces` is 2: "),
         ({"backend": "kernel"}, "`backend.0` is 'kernel': it should be 'process', 'docker' or 'sim'"),

@@ -46,7 +46,7 @@ def test_files_that_are_no_night_of_this_matrix_are_named(tmp_path: Path) -> Non
     found = nights.read(tmp_path, matrix())
     assert [one.started_at for one in found.records] == ["2026-01-01T00:00:00Z"]
     said = " | ".join(found.left_out)
-    assert "is of another matrix: `loss` differs" in said
+    assert "contains results of another matrix: `loss` differs" in said
     assert f"{tmp_path / 'a.json'}: not JSON at line 1" in said
     assert f"{tmp_path / 'b.json'} has schema 'ucp-matrix/2'" in said
     assert f"{tmp_path / 'c.json'}: cannot be read: is a directory" in said

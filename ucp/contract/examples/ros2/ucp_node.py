@@ -115,7 +115,7 @@ class RosAgent(Node):
         if event and 1 <= event[0] <= 254:
             self.log_event(event[0], event[1:])
         else:
-            self._ros.get_logger().warning("an event begins with its ID, 1 to 254: not logged")
+            self._ros.get_logger().warning("the event is not logged: its first byte must be an ID from 1 to 254")
 
     def _feed(self, feed: Callable[[float], None]) -> None:
         super()._feed(feed)
