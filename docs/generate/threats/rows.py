@@ -98,27 +98,28 @@ _ALL_IN_STEP: dict[str, Any] = {
 
 ROWS = (
     Row("outsider", "forges a commit and votes, and floods", (_commit(2), _answers(2, "Block Add Response"), _FLOOD)),
-    Row("outsider", "replays datagrams at once, later, and with flipped bits", _AGAIN),
+    Row("outsider", "replays datagrams: at once, later, or with flipped bits", _AGAIN),
     Row("captured vehicle 3", "commits a block in the name of vehicle 2", (_commit(2),), captured=True),
     Row("captured vehicle 3", "commits a block in the name of vehicle 3", (_commit(CAPTURED),), captured=True),
-    Row("captured vehicle 3", "answers all requests falsely", _LIES, captured=True),
-    Row("captured vehicle 3", "floods, in any name", (_FLOOD,), captured=True),
+    Row("captured vehicle 3", "gives false answers to all requests", _LIES, captured=True),
+    Row("captured vehicle 3", "floods the network with datagrams in the name of any vehicle", (_FLOOD,), captured=True),
     Row(
         "captured vehicle 3, revoked later",
-        "commits a different block to each agent, and makes all reconcile during their votes; no final reconcile",
+        "commits a different block to each agent, and makes all agents reconcile during their votes; "
+        "the mission has no final reconcile",
         captured=True,
         own=_ALL_IN_STEP,
     ),
     Row(
         "captured vehicle 3, revoked",
-        "commits in both names, answers falsely, and floods",
+        "commits blocks in both names, gives false answers, and floods",
         (_commit(2), _commit(CAPTURED), *_LIES, _FLOOD),
         captured=True,
         revoked=True,
     ),
     Row("dishonest vehicle 3", "disapproves of every block", quirks=("disapprove_everything",)),
     Row("dishonest vehicle 3", "hides its commits", quirks=("hide_commits",)),
-    Row("dishonest vehicle 3", "commits blocks of others twice", quirks=("commit_others_twice",)),
-    Row("dishonest vehicle 3", "claims to contain every chain", quirks=("contain_everything",)),
+    Row("dishonest vehicle 3", "commits each block of other vehicles twice", quirks=("commit_others_twice",)),
+    Row("dishonest vehicle 3", "claims that it has every chain", quirks=("contain_everything",)),
     Row("dishonest vehicle 3, revoked", "disapproves of every block", revoked=True, quirks=("disapprove_everything",)),
 )
