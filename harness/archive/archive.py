@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
 
 LARGE_BYTES = 16 * 1024 * 1024
-"""Size of all traces of a run together, in bytes. Above it, handler runs that only received a message are not read, if
-the caller allows this.
+"""Size of all traces of a run together, in bytes. In larger runs, handler runs that only received a message are not
+read if the caller allows this.
 """
 _AGENT_ID = re.compile("[1-9][0-9]{0,4}")
 
@@ -59,10 +59,8 @@ ReportProgress = Callable[[str], None]
 
 
 class RecordedRun(NamedTuple):
-    """A handler run in a trace, together with its agent and its line.
-
-    `agent_id` is the agent. `life` is its incarnation, which is 1 until the first restart. `line` is the line number in
-    the trace, counted from 1.
+    """A handler run in a trace. `agent_id` is the agent. `life` is the incarnation of the agent, which is 1 until the
+    first restart. `line` is the line number in the trace, counted from 1.
     """
 
     agent_id: int
@@ -144,8 +142,8 @@ class RunArchive:
 
     @cached_property
     def origin(self) -> RunRecord:
-        """The content of the run.json that belongs to the exports. It is found even if the user named only single files
-        of the run directory.
+        """The content of the run.json that belongs to the exports, even if the user named only single files of the run
+        directory.
         """
         if self.directory is not None:
             return self.record
@@ -306,8 +304,8 @@ class RunArchive:
 
     @property
     def anchor(self) -> str | None:
-        """The source that confirms the public keys: `--keys` for keys that the user gave, or run.json if it contains
-        their fingerprint. None without such a source.
+        """The source that confirms the public keys: `--keys` if the user gave keys, or run.json if it contains the
+        fingerprint of the keys. None without such a source.
         """
         if self._trusted_keys is not None:
             return "--keys"
@@ -336,8 +334,8 @@ class RunArchive:
         return read_connectivity(self._in_directory(NETWORK_FILE), vehicles)
 
     def link_losses(self, vehicles: Collection[int]) -> Iterator[tuple[float, dict[Link, float]]]:
-        """Yield mission seconds with the loss rates (0 to 1) of links. The first entry contains all links, and each
-        later entry the links whose loss rate changed.
+        """Yield mission seconds with the loss rates (0 to 1) of links. The first entry contains all links. Each later
+        entry contains the links whose loss rate changed.
         """
         return read_link_losses(self._in_directory(NETWORK_FILE), vehicles)
 

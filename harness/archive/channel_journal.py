@@ -12,8 +12,8 @@ Reason = Annotated[str, Field(max_length=20)]
 
 
 class ChannelLine(BaseModel):
-    """A line about one message: its receivers and losses. `sequence` is its sequence number, or None for a datagram
-    that is not a message of the vehicle's agent.
+    """One message on the shared channel: its receivers and losses. `sequence` is the sequence number of the message, or
+    None for a datagram that is not a message of the vehicle's agent.
     """
 
     model_config = ConfigDict(strict=True)

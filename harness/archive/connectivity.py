@@ -88,14 +88,14 @@ class Connectivity:
     """Mission second and agent ID of each stop of an agent whose vehicle continued its flight."""
     problems: list[str]
     pair_losses: dict[Pair, list[tuple[float, float]]]
-    """Pair -> the mission seconds at which its loss rate changed, with the new loss rate, which is the mean of both
-    directions. Changes below SAME_LOSS are omitted, unless the grade changes. A loss rate of 1.0 means that the pair
-    has no link or that a vehicle is lost.
+    """Pair of vehicles -> the mission seconds at which the loss rate of the pair changed, with the new loss rate. The
+    loss rate is the mean of both directions. Changes below SAME_LOSS are omitted, unless the grade changes. A loss rate
+    of 1.0 means that the pair has no link or that a vehicle is lost.
     """
     _cut: dict[Pair, list[float]]
-    """Pair -> the times at which it lost its link, got it back, lost it again, and so on."""
+    """Pair of vehicles -> the times at which the pair lost its link, got it back, lost it again, and so on."""
     _lost: dict[int, list[float]]
-    """Vehicle -> the times at which it was lost, replaced, lost again, and so on."""
+    """Vehicle -> the times at which the vehicle was lost, replaced, lost again, and so on."""
 
     def links(self, at_s: float) -> list[Pair]:
         """Return the links between living vehicles at mission second `at_s`."""
@@ -141,8 +141,8 @@ class NetworkReplay:
         self._out_of_range: set[Pair] = set()
         self._cut_off: set[Pair] = set()
         self._scripted: dict[Pair, tuple[float, float]] = {}
-        """The losses that the scenario requests for each pair: from the lower to the higher ID, and back. The losses by
-        the radio model are added to these losses.
+        """Pair of vehicles -> the losses that the scenario requests for both directions: first from the lower to the
+        higher ID. The losses by the radio model are added to these losses.
         """
         self._radio_losses: dict[Pair, float] = {}
 

@@ -58,8 +58,9 @@ class RunDirectory:
         self.rogue_log = self.path / "rogue.log"
         self.lag = self.path / LAG_FILE
         self.keys: Mapping[int, Path] = {}
-        """The directory with the keys of each vehicle during the run. It lies outside the run directory, which holds
-        no secrets."""
+        """The directory with the keys of each vehicle during the run. The directory lies outside of the run directory,
+        because a run directory holds no secrets.
+        """
         self.keys_fingerprint: str | None = None
         """Fingerprint of the public keys in the run directory. None without keys."""
         claim(path, self.agents, self.vehicles)
@@ -73,7 +74,7 @@ class RunDirectory:
         return path
 
     def agent(self, agent_id: int, incarnation: int = 1) -> Path:
-        """Create the directory of an agent and return it. Each restart of the agent has its own directory."""
+        """Create a directory for one incarnation of an agent, and return the directory."""
         path = self.agents if incarnation == 1 else self.agents / f"{agent_id}-{incarnation}"
         path.mkdir(exist_ok=True)
         return path

@@ -75,7 +75,7 @@ class ExportedBlock(BaseModel):
 
 
 class ExportedInception(BaseModel):
-    """The inception block, the same for all agents of a mission. Its data is in base64."""
+    """The inception block, which is the same for all agents of a mission. Its data is in base64."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -113,7 +113,7 @@ class ExportedHead(BaseModel):
     held: Hash
     """Digest of deque, reconcile stack, current block and flags."""
     revoked: Annotated[list[AgentId], Field(max_length=MAX_AGENT_ID)]
-    """The agents whose revocation this agent knew, in ascending order."""
+    """The agents that were revoked according to the revocations that this agent knew, in ascending order."""
     signature: Annotated[Base64, Field(max_length=MAX_SIGNATURE)]
 
 
@@ -178,8 +178,8 @@ class ExportMaker:
         signatures: Mapping[bytes, bytes] | None = None,
         head: Mapping[str, Any] | None = None,
     ) -> Export:
-        """Return the export of an agent. It equals the export that `read_export` would read from a file. `head` is the
-        signed head of a secured agent.
+        """Return the export of an agent as an object. The object equals the result of `read_export` on the file of the
+        export. `head` is the signed head of a secured agent.
         """
         inception, signed = state.chain.inception, signatures or {}
         return Export.model_construct(

@@ -37,7 +37,7 @@ COMMITTED_BY = {
     "receive_response_block_for_hash": "fetched",
     "reconcile_finalize": "put back",
 }
-"""Handler -> the origin of the block that it commits, as reports show it."""
+"""Handler -> the origin of the block that the handler commits, as reports show it."""
 REASONS = {
     "vote_timer_expiration": "vote not approved",
     "receive_request_next_in_sequence": "chain diverged",

@@ -21,11 +21,11 @@ from ucp.short_value import shown
 
 Model = TypeVar("Model", bound=BaseModel)
 Place = tuple[dict[Any, Any] | list[Any], Any]
-"""A part of a document: the object or list that contains it, and its key or index there."""
+"""A part of a document: the object or list that contains the part, and the key or index of the part there."""
 
 MAX_ROUNDS = 100
 """Maximum number of validations. Each validation removes the invalid parts that it finds, and the depth of a document
-limits their number.
+limits the number of such parts.
 """
 MAX_NAME = 80
 UNKNOWN_KEY = "extra_forbidden"
@@ -144,8 +144,8 @@ class RecordFile:
 
     record: RunRecord = field(default_factory=RunRecord)
     judged: JudgedRecord | None = None
-    """The part that the checker needs. It is None if one of its keys is invalid, because verdicts on incomplete data
-    would be wrong.
+    """The part of run.json that the checker needs. None if a key of this part is invalid, because verdicts on
+    incomplete data would be wrong.
     """
     problems: list[str] = field(default_factory=list)
     error: RunDirectoryError | None = None

@@ -83,8 +83,8 @@ class _LivingChains:
             self._paths.setdefault(agent, [])
 
     def apply_run(self, agent: int, incarnation: int, run: HandlerRun) -> None:
-        """Apply the changes of a handler run to the agent's chain. The first handler run after a restart empties this
-        chain.
+        """Apply the changes of a handler run to the agent's chain. The first handler run after a restart begins with an
+        empty chain.
         """
         if incarnation > self._incarnation[agent]:
             self._incarnation[agent] = incarnation

@@ -23,13 +23,13 @@ SCHEMA = "ucp-run/1"
 ENOUGH_ANSWERS = 20
 """Minimum number of answers from which statements about their times are made."""
 TOLERATED_LATENESS_S = 0.05
-"""Mission seconds by which deliveries on a shared channel may be late. Without a channel, virtual time delivers
-messages after 2 to 50 ms.
+"""Maximum lateness of deliveries on a shared channel, in mission seconds, that a run tolerates. Without a channel,
+virtual time delivers messages after 2 to 50 ms.
 """
 
 
 UNKNOWN_DRIFT = 1e-4
-"""Relative error of a clock whose rate could not be measured. Quartz clocks are better than this."""
+"""Assumed relative error of a clock whose rate could not be measured. Quartz clocks are more exact."""
 
 AgentKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,4}$")]
 """The ID of an agent, or of its vehicle, as a JSON key."""
@@ -107,7 +107,7 @@ class FaultRecord(_RecordModel):
 
     @property
     def loses_data(self) -> bool:
-        """True if the agents lost all their data in this fault."""
+        """True if this fault made the agents lose all their data."""
         return self.kind.loses_data(self.disk)
 
 
@@ -155,8 +155,8 @@ class Cycle(_RecordModel):
     periods: int | None = None
     proven: bool = False
     agents: Annotated[list[int], Field(min_length=1)]
-    """The agents in the cycle. Some of them may be idle for a time. In a standstill, these are the agents that are not
-    idle.
+    """The agents in the cycle, including agents that are idle for a time. In a standstill, these are the agents that
+    are not idle.
     """
     steps: list[CycleStep] = []
     """The handler runs of one period, in order."""
@@ -164,10 +164,8 @@ class Cycle(_RecordModel):
 
 
 class HandlerRuns(_RecordModel):
-    """The number of handler runs in one incarnation, as the agent counted them. The agent counted them at some time
-    between `from_s` and `until_s`.
-
-    `from_s` and `until_s` are equal if the agent reported its mission time together with the number.
+    """The number of handler runs in one incarnation, as the agent reported it at some time between `from_s` and
+    `until_s`. `from_s` and `until_s` are equal if the agent reported its mission time together with the number.
     """
 
     counted: int
@@ -294,15 +292,16 @@ class ChannelRecord(_RecordModel):
     frame was on the air.
     """
     lateness: ChannelLateness | None = None
-    """Lateness of deliveries. null in virtual time, where each message arrives at its exact time."""
+    """Lateness of deliveries on the shared channel. null in virtual time, where each message arrives at its exact time.
+    """
     answers: AnswerTimes | None = None
     """Times of answers. null in virtual time, where agents answer at once."""
 
     FRAMES: ClassVar[str] = "frames"
 
     def counts(self) -> Counter[tuple[str, int]]:
-        """Return all counts: the number of sent frames under the key (FRAMES, 0), and each number of losses under its
-        key (reason, vehicle).
+        """Return all counts of the channel: the number of sent frames under the key (FRAMES, 0), and each number of
+        losses under its key (reason, vehicle).
         """
         counts = Counter({(self.FRAMES, 0): self.frames})
         for reason, by_vehicle in (*self.lost.items(), *self.dropped.items()):
@@ -509,7 +508,9 @@ class JudgedRecord(_RecordModel):
     faults: list[FaultRecord] = []
     final_reconcile: FinalReconcile | None = None
     cycle: Cycle | None = None
-    """A cycle that shows that agents never finish. If it is `proven`, the run was ended when it was found."""
+    """A cycle that shows that the agents never finish. If the cycle is `proven`, the harness ended the run when it
+    found the cycle.
+    """
     mission_s: float | None = None
     stagger: Annotated[Stagger, Field(exclude=True)] = {}
     """The key `stagger` of the scenario: the differences between the timers of agents."""
@@ -579,8 +580,8 @@ class RunRecord(JudgedRecord):
     backend: BackendName | None = None
     versions: dict[str, str] = {}
     all_delivered: bool = False
-    """True if virtual time also delivered messages without effect, for example because of `--watch`. Traces then
-    contain them.
+    """True if virtual time also delivered messages without effect, for example because of `--watch`. The traces then
+    contain these messages.
     """
     started_at: str | None = None
     wall_s: float | None = None
@@ -643,10 +644,8 @@ class RunRecord(JudgedRecord):
     def unmet_expectations(
         self, chains: Mapping[int, Sequence[str]], top_chain_hashes: Mapping[int, str]
     ) -> Iterator[tuple[str, list[str]]]:
-        """Yield each kind of expectation except verdicts, with a sentence for each expectation of this kind that was
-        not met.
-
-        `chains` has the block hashes of each agent's chain, and `top_chain_hashes` its top.
+        """Yield each kind of expectation except verdicts, with a sentence for each unmet expectation of this kind.
+        `chains` has the block hashes of each agent's chain, and `top_chain_hashes` has its top chain hash.
         """
         found = [(finding.agent_id, finding.handler) for finding in (self.steps.evidence if self.steps else ())]
         figures: dict[str, float | None] = {name: self.figures.get(name) for name in self.expect.figures}

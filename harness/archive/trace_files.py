@@ -31,9 +31,7 @@ def trace_files(agents: Path) -> list[Path]:
 
 
 def trace_file(agents: Path, agent_id: int) -> Path:
-    """Return the path of an agent's trace. If the agent has no trace, return the path that an uncompressed trace would
-    have.
-    """
+    """Return the path of an agent's trace. If the agent has no trace, return the path for an uncompressed trace."""
     plain, packed = agents / f"{agent_id}{SUFFIX}", agents / f"{agent_id}{PACKED_SUFFIX}"
     return packed if packed.exists() and not plain.exists() else plain
 
@@ -43,7 +41,9 @@ def is_packed(path: Path) -> bool:
 
 
 def has_rest(path: Path) -> bool:
-    """Return true if the file at `path` has only the packed parts of a trace, whose rest is in a plain file."""
+    """Return true if the file at `path` has only the packed parts of a trace, and a plain file has the rest of the
+    trace.
+    """
     return is_packed(path) and path.with_name(path.name.removesuffix(".gz")).exists()
 
 

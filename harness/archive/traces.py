@@ -25,7 +25,7 @@ from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun
 MAX_LINE_BYTES = 2 * 1024 * 1024
 MAX_LINE_WEIGHT = 100_000
 LARGEST = 2**64
-"""Limit of integers in a header. A larger integer cannot be a setting, because it does not fit into 64 bits."""
+"""Limit of integers in a header. A larger integer does not fit into 64 bits, so it cannot be a setting."""
 PLACES = ("chain", "deque", "stack")
 _HEADER_KEYS = ("schema", "agent_id", "roster", "initial_data", "settings", "clock", "secured")
 
@@ -144,8 +144,8 @@ class Trace:
     """True if the file ends in the middle of a line. This line is not read."""
     gaps: list[TraceGap] = field(default_factory=list)
     jumps: list[int] = field(default_factory=list)
-    """Positions of handler runs before which the time decreases or increases by a large amount. The agent's clock was
-    probably set there.
+    """Positions of handler runs before which the time decreases or increases by a large amount. At these positions, the
+    agent's clock was probably set.
     """
     lines: tuple[Sequence[int], Sequence[int]] | None = None
     """The line numbers of `runs` and of `asides` in the file. None if the file has no other lines."""
@@ -259,7 +259,7 @@ class HeldBlocks:
         """Completed blocks that are not in the chain."""
         self.impossible: str | None = None
         """A description of an impossible change in the last handler run, for example the removal of a block that the
-        agent did not hold. None without one.
+        agent did not hold. None if all changes were possible.
         """
 
     def replay(self, run: HandlerRun) -> None:

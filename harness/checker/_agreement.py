@@ -37,8 +37,8 @@ MAX_REASONS = 3
 
 
 def explain_unknown(evidence: Evidence) -> str | None:
-    """Return the reason why the exported chains do not show the whole system in an idle state. Return None if they
-    do.
+    """Return the reason why the exported chains do not show the whole system in an idle state. Return None if the
+    chains show such a state.
     """
     if not evidence.exports:
         return "the run has no chain exports"
@@ -111,10 +111,9 @@ def describe_absent_agents(evidence: Evidence) -> str:
 
 
 def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]:
-    """Return those agents of `differing` that had a chance to agree: they completed a reconcile that began after the
-    network became fully connected and after the last change of any other chain.
-
-    During this reconcile all judged agents ran, none was paused, and no other agent was present.
+    """Return those of the `differing` agents that had a chance to agree. An agent had a chance if it completed a
+    reconcile that began after the network became fully connected and after the last change of any other chain. During
+    this reconcile, all judged agents ran, and no other agent was present.
     """
     since = evidence.connected_since_s
     if since is None:

@@ -128,7 +128,9 @@ def _explain_unknown_makers(evidence: Evidence, unknown: set[int]) -> str:
 
 
 def _describe_arrival(trace: Trace | None, block_hash: str) -> str:
-    """Return the time and the handler with which an agent received a block, as text for the end of a sentence."""
+    """Return a phrase with the time at which an agent received a block and the handler that handled it, for the end of
+    a sentence.
+    """
     came = ("chain+", block_hash)
     for run in trace.runs if trace else ():
         if came in map(tuple, run.changes):

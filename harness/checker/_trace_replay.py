@@ -55,10 +55,10 @@ class ReplayedIncarnation:
     unknown: bool = False
     """True if the trace contains unknown operations. After the first of them, the held blocks are unknown."""
     impossible: list[TraceObservation] = field(default_factory=list)
-    """Changes that are impossible, such as the removal of a block that the agent does not hold."""
+    """Changes in the trace that are impossible, such as the removal of a block that the agent does not hold."""
     second_copies: list[TraceObservation] = field(default_factory=list)
     idle_too_early: list[TraceObservation] = field(default_factory=list)
-    """States in which the agent reported to be idle, although it had own blocks outside of the chain, or blocks in the
+    """States in which the agent reported to be idle, although it had own blocks outside of its chain, or blocks in the
     deque or on the stack.
     """
     wrong_lengths: list[TraceObservation] = field(default_factory=list)

@@ -31,7 +31,7 @@ RECONCILE_STEPS = frozenset(
     )
 )
 NO_STEP = frozenset(("already in progress", "not in phase 3", "another block"))
-"""Branches in which the handlers of a reconcile do not continue it."""
+"""Branches in which a handler of a reconcile does not continue the reconcile."""
 
 
 def _continues_reconcile(run: HandlerRun) -> bool:

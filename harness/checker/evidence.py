@@ -48,15 +48,15 @@ if TYPE_CHECKING:
 Derived = TypeVar("Derived")
 
 Sending = tuple[tuple[float, SentMessage], ...]
-"""The messages of one agent with a certain type and sequence number, each with its mission second. Each incarnation
-sends at most one of them.
+"""The messages of one agent with a certain type and sequence number, each with its mission second. Each incarnation of
+the agent sends at most one of these messages.
 """
 Sendings = dict[Any, dict[Any, Sending]]
 """The messages that one agent sent: message type -> sequence number -> messages."""
 
 Watch = Callable[[ReferenceState, HandlerRun | None], None]
-"""A function that receives each handler run of an agent, and the state of the agent after it. The run is None at the
-start of an incarnation.
+"""A function that receives each handler run of an agent, and the agent's state after the run. At the start of an
+incarnation, the function receives None in place of a run.
 """
 
 MAX_LINK_CHANGES = 20_000_000
@@ -110,12 +110,12 @@ class RogueTraffic:
     counted: bool = False
     """True if the log contains only the number of some messages."""
     outside_senders: set[int] = field(default_factory=set)
-    """Agents in whose name the scenario delivers datagrams from another place. The records of that place are
+    """Agents in whose name the scenario delivers datagrams from outside of the swarm. The records of these senders are
     missing.
     """
 
     def add(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":
-        """Add injected datagrams to this object, and return it."""
+        """Add injected datagrams to this object, and return the object."""
         for datagram in datagrams:
             self.messages.add((datagram.sender, datagram.sequence, datagram.message))
             self.counted |= datagram.count is not None
@@ -168,11 +168,11 @@ class Evidence:
     delivers_all: bool = False
     """True if virtual time delivered every message. Otherwise it omitted messages that the released core ignores."""
     from_field: bool = False
-    """True for files without the run record run.json. Then no counter shows how many lines their traces should have, so
-    lines may be missing.
+    """True for files without the run record run.json. Without this record, no counter shows how many lines the traces
+    should have, so lines may be missing.
     """
     steps: Judgement | None = None
-    """The judgement on the steps, if it exists already. None otherwise."""
+    """The judgement on the steps, if the checker has already made it. None otherwise."""
     stores: dict[int, Path] = field(default_factory=dict)
     """The path of the store that the last incarnation of an agent wrote. Agents without a store are missing."""
     channel: list[ChannelLine] | None = None

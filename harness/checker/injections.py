@@ -135,9 +135,8 @@ def _count_line(
 
 
 def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
-    """Return the handler runs that injected messages may have triggered, grouped by message.
-
-    A replayed copy cannot be distinguished from its original, so the handler runs for the original are included.
+    """Return the handler runs that injected messages may have triggered, grouped by message. If a replayed copy cannot
+    be distinguished from its original, the handler runs for the original are included.
     """
     triggered: dict[_Key, list[HandlerRun]] = defaultdict(list)
     for run in trace.runs:

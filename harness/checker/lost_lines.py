@@ -21,15 +21,14 @@ from ucp.trace import HandlerRun, StateSummary
 from ucp.trigger import BootTrigger, LocalTrigger
 
 MAX_PLACES, MAX_SHARE = 3, 0.1
-"""Limits for each kind of contradiction: the number of places, and their share of the lines that could show it. Above
-both limits, the agent probably interprets the trace format differently.
+"""Limits for each kind of contradiction: the number of places, and the share of the lines that could show the
+contradiction. If both limits are exceeded, the agent probably interprets the trace format differently.
 """
 
 
 def lost_lines(trace: Trace) -> dict[int, str]:
     """Return the handler runs whose errors a lost line may explain, each with a reason such as "lines are missing ...".
-
-    The key is the number of handler runs before this one, as in `Trace.gaps`.
+    The key is the number of earlier handler runs, as in `Trace.gaps`.
     """
     found: dict[int, str] = {}
     kinds = _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces()

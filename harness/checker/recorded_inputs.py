@@ -87,7 +87,7 @@ class BlockIndex:
         self._blocks[block.block_hash.hex()] = block
 
     def add_from(self, message: Message) -> None:
-        """Add the block that the message carries, if it carries one."""
+        """Add the block that the message carries, if the message carries a block."""
         if isinstance(message, CommitBlock | BlockResponse):
             self.add(message.block)
 

@@ -245,7 +245,7 @@ def named(ids: Collection[int]) -> str:
 
 
 def findings(cycle: Cycle) -> list[Finding]:
-    """Return the handler runs of one period of each agent as findings. Agents with equal handler runs share one
+    """Return the handler runs of one period of each agent as findings. Agents with equal handler runs have one common
     finding.
     """
     alike: dict[str, list[int]] = defaultdict(list)

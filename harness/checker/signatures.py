@@ -26,7 +26,9 @@ MAX_U64 = 2**64 - 1
 
 @dataclass(frozen=True)
 class TrustedKeys:
-    """Public keys of a mission. `anchor` names the source that confirms the keys. It is None without such a source."""
+    """The public keys of a mission. `anchor` names the source that confirms the keys. `anchor` is None without such a
+    source.
+    """
 
     public: "PublicKeys"
     anchor: str | None
@@ -34,7 +36,7 @@ class TrustedKeys:
 
 def unanchored(exports: Iterable[Export], keys: TrustedKeys | None) -> str | None:
     """Return the reason why valid signatures do not prove that the exports of a secured mission are genuine. Return
-    None if they do.
+    None if valid signatures prove this.
     """
     if keys is None:
         return "unsigned: no public keys are known that verify the signatures; name the key directory with --keys"
@@ -99,7 +101,9 @@ class SignatureChecks:
         self._checked: dict[_Content, str | None] = {}
 
     def find_error(self, block: ExportedBlock) -> str | None:
-        """Return a phrase with the reason why the signature of a block is not valid. Return None if it is valid."""
+        """Return a phrase with the reason why the signature of a block is not valid. Return None if the signature is
+        valid.
+        """
         claim = block.agent_id, block.timestamp_us, block.event_data, block.block_hash, block.signature
         if claim not in self._checked:
             self._checked[claim] = self._verify(block)

@@ -112,8 +112,8 @@ def _losses(evidence: Evidence, lost: list[FaultRecord], at_end: Mapping[str, li
 
 
 def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) -> list[set[str]]:
-    """Return the blocks that an agent held just before each of these times. The set is empty after the agent's own
-    loss.
+    """Return the blocks that an agent held just before each of these times. The set is empty for times after the loss
+    of the agent.
     """
     waiting, blocks_held = deque(instants), []
     held, at_s = HeldBlocks(), -math.inf

@@ -1,6 +1,4 @@
-"""Check characteristic 6: all agents of a connected system have the same chain, after each of them had a chance to
-reconcile.
-"""
+"""Check characteristic 6: if all agents are connected and had a chance to reconcile, they all have the same chain."""
 
 from collections import Counter
 

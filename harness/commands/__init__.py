@@ -1,1 +1,1 @@
-"""The commands of the command line. Each module defines one, and harness/cli.py lists them."""
+"""The commands of the command line. Each module defines one command, and harness/cli.py lists all commands."""

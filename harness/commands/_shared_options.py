@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ucp.secure.sealing import Depot
 
 RARE = "Rare options"
-"""The help shows this panel of options below the others."""
+"""Title of the help panel for options that are rarely needed. The help shows this panel below the other panels."""
 
 BundleOption = Annotated[
     Path | None,
@@ -122,8 +122,8 @@ def roster_of(text: str) -> int | list[int]:
 
 
 def refuse_existing(paths: Iterable[Path]) -> None:
-    """Raise RunDirectoryError if an output file already exists. A command calls this before a long computation, because
-    its results could not be written afterwards.
+    """Raise RunDirectoryError if an output file already exists. A command calls this function before a long
+    computation, because it could not write the results afterwards.
     """
     for path in paths:
         if path.exists():

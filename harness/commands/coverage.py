@@ -21,7 +21,9 @@ from harness.scenario import load_scenario
 from ucp.settings import Settings
 
 BLOCK_SIZE_SETTINGS = {*EVENT_FILLS_BLOCK, "max_event_bytes"}
-"""Settings that affect only the size of blocks. They have no effect on `prove`, whose blocks have no size."""
+"""Settings that affect only the size of blocks. These settings have no effect on `prove`, because its blocks have no
+size.
+"""
 
 
 def coverage_command(

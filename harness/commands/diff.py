@@ -91,8 +91,8 @@ def _differences(difference: RunDifference) -> Iterator[str]:
 
 
 def _step_texts(first_difference: FirstDifference) -> tuple[str, str]:
-    """Return the first differing handler run of each of the two runs as text. Changes and messages are included only if
-    they differ.
+    """Return the first handler run that differs in the two runs, as two texts. The texts contain changes and messages
+    only if they differ.
     """
     a, b = first_difference.a, first_difference.b
     changes = a is None or b is None or a.changes != b.changes

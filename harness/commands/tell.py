@@ -25,7 +25,7 @@ _TIME_COMMANDS: list[tuple[re.Pattern[str], str, str | None]] = [
     (re.compile("step"), "step", None),
     (re.compile(r"step (\d{1,9}(?:\.\d{1,9})?)(?: s)?"), "step", "seconds"),
 ]
-"""Patterns of sentences about virtual time. Each has the command for the run, and the key of the number in the
+"""Patterns of sentences about virtual time. Each pattern has a command for the run, and the name of the number in the
 sentence.
 """
 _COMMAND_EXAMPLES = (

@@ -24,8 +24,8 @@ class AgentUnderTest(ABC):
     def __init__(self, variant: SettingsVariant) -> None:
         self.model = ReferenceModel(variant.settings)
         self.reference_follows = True
-        """True while the reference is in the state of the agent. False if the machine was late and the reference could
-        not follow.
+        """True while the state of the reference equals the state of the agent. False if the machine was late and the
+        reference could not follow.
         """
 
     async def step(self, given: AgentInput) -> TestedStep | None:

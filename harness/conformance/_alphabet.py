@@ -42,7 +42,7 @@ Tally = Literal["voting", "phase one", "phase two", "timer"]
 
 @dataclass(frozen=True)
 class AgentInput:
-    """A kind of input for the agent under test. Its name describes it."""
+    """A kind of input for the agent under test. `name` describes the input."""
 
     name: str
     make: Callable[[ReferenceModel], Action | None]
@@ -53,8 +53,8 @@ class AgentInput:
     counted_twin: str | None = None
     """Name of a similar answer that the agent must count. Only for an answer that the agent must ignore."""
     preceding: str | None = None
-    """Name of an ignored answer before a timer expiry. The expiry reveals whether the agent counted this answer. Only
-    for timer expiries.
+    """Name of an ignored answer that precedes a timer expiry. The expiry reveals whether the agent counted this answer.
+    Only timer expiries have this attribute.
     """
 
 
@@ -101,8 +101,8 @@ def _last_responder(responders: Callable[[ReferenceModel], set[int]]) -> Callabl
 
 
 def _voters(model: ReferenceModel) -> set[int]:
-    """Return the agents that have voted in the current vote. During a reconcile votes do not count, and the set is
-    empty.
+    """Return the agents that have voted in the current vote. The set is empty during a reconcile, because votes do not
+    count then.
     """
     state = model.state
     return state.voters if state.voting_timer.active and not state.reconcile_in_progress else set()

@@ -103,10 +103,10 @@ class TestedStep:
     running_timer: str | None = None
     """Name of the next timer to expire, if its expiry time is correct. Only in virtual time."""
     ended: str | None = None
-    """A phrase about the end of the agent, or about its hanging. None if it still runs."""
+    """A phrase about the end or the hanging of the agent. None if the agent still runs."""
     hidden_run: ExpectedRun | None = None
-    """A handler run that may be the true cause: it handled an answer that must not count, or should have stopped a
-    timer.
+    """A handler run that may be the true cause of the failure. This run handled an answer that must not count, or
+    should have stopped a timer.
     """
 
 

@@ -110,7 +110,7 @@ def state_of(model: ReferenceModel) -> AgentState:
 
 
 def _candidates(model: ReferenceModel) -> tuple[object, ...]:
-    """Return, for each candidate of reconcile phase 2, its kind, its age, and the number of answers that name it."""
+    """Return the kind, the age and the number of answers of each candidate of reconcile phase 2."""
     state = model.state
     stack = [block.block_hash for block in reversed(state.reconcile_stack)]
     candidates = []
@@ -248,7 +248,7 @@ def changes_nothing(outcome: ExpectedOutcome) -> bool:
 
 
 COUNTING_HANDLERS = {"receive_vote_add_block", "receive_phase_1_response", "receive_response_next_in_sequence"}
-"""Handlers that only count an answer. A wrong count becomes visible only when the timer expires."""
+"""Handlers that only count an answer. A wrong count becomes visible only at the expiry of the timer."""
 COUNTING_STATES = {
     ("voting", (2, "another's block", "one block waits", 0)),
     ("voting", (2, "another's block", "blocks wait", 0)),

@@ -41,7 +41,9 @@ STARTS_AT_ONCE = 4
 test.
 """
 RETRY_WORKERS = 3
-"""Number of agents that replay suspected failures in parallel. It is small, so that they do not delay each other."""
+"""Number of agents that replay suspected failures in parallel. The number is small, so that the agents do not delay
+each other.
+"""
 MAX_FAILURES_OF_A_KIND = 3
 """Number of suspected failures with the same branches. After this number, further vectors with these branches are not
 tested.
@@ -74,7 +76,7 @@ class ConfirmedFailure:
     needs_earlier_round: bool = False
     """True if the agent fails only after an earlier vote or reconcile, and not with the shortest sequence of inputs."""
     unexplained_end: str | None = None
-    """A phrase about the end of the agent, if no short sequence of inputs causes it. None otherwise."""
+    """A phrase about the end of the agent, if no short sequence of inputs explains this end. None otherwise."""
 
 
 @dataclass
@@ -127,7 +129,7 @@ class VectorSuite:
         ]
         self._working: Counter[int] = Counter()
         self._on_tour: Counter[int] = Counter()
-        """Variant -> number of its active tours. The other workers of the variant wait for the end of these tours."""
+        """Variant -> number of its active tours. All other workers of the variant wait for the end of these tours."""
         self._kinds: Counter[object] = Counter()
         self._failed_starts = 0
         self._max_suspicions = max_suspicions
@@ -246,8 +248,8 @@ class VectorSuite:
 
     @staticmethod
     def _suspicions_to_retry(variant_result: VariantResult) -> Iterator[SuspectedFailure]:
-        """Yield the suspected failures. Those with the fewest inputs come first. Yield at most MAX_RETRIES_OF_A_KIND
-        with the same branches.
+        """Yield the suspected failures, sorted by number of inputs. Yield at most MAX_RETRIES_OF_A_KIND failures with
+        the same branches.
         """
         kinds: Counter[object] = Counter()
         for suspicion in sorted(variant_result.suspicions, key=lambda suspicion: len(suspicion.path)):
@@ -330,7 +332,7 @@ class VectorSuite:
         self, variant: SettingsVariant, path: Sequence[str], failure: ConfirmedFailure, *, needs_earlier_round: bool
     ) -> ConfirmedFailure:
         """Find out whether the failure disappears without the answers that a certain handler must ignore. Return the
-        failure, with this cause if it was found.
+        failure. If it disappears, the returned failure names this cause.
         """
         counted = _ignored_answers(variant, path)
         for handler in dict.fromkeys(run.handler for run in counted.values()):
@@ -343,10 +345,8 @@ class VectorSuite:
         return replace(failure, needs_earlier_round=needs_earlier_round)
 
     async def _play_repeatedly(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Play these inputs several times. If the agent is right at least once, return RIGHT. Otherwise return its
-        failure.
-
-        Return TOO_LATE if the machine was late in too many replays.
+        """Play these inputs several times. If the agent is right at least once, return RIGHT. Otherwise return the
+        failure of the agent. Return TOO_LATE if the machine was late in too many replays.
         """
         failures = 0
         for _ in range(MAX_ATTEMPTS):
@@ -360,8 +360,8 @@ class VectorSuite:
         return TOO_LATE
 
     async def play(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Give these inputs to a new agent. Return its first failure. Return RIGHT if it has none, or TOO_LATE if the
-        machine was late.
+        """Give these inputs to a new agent. Return the first failure of the agent. Return RIGHT without a failure, or
+        TOO_LATE if the machine was late.
         """
         try:
             agent = await self._start(variant, True)

@@ -22,7 +22,9 @@ TIMER_COSTS = 10.0
 """Cost of a timer expiry on a path. The unit of a cost is about one mission second."""
 INPUT_COSTS = 0.3
 START_COSTS = 100.0
-"""Cost of starting a new agent. The start takes less time, but it uses processor time that the other agents need."""
+"""Cost of starting a new agent. A start takes less time than this cost, but it uses processor time that other agents
+need.
+"""
 GROWTH_COSTS = 60.0
 """Cost of adding a block to the chain. A chain never becomes shorter, and some vectors need a short chain."""
 MAX_TRIES = 6
@@ -56,7 +58,9 @@ class VectorMap:
             self._unseen[key.activity, key.holdings].add(key)
         self._edges: dict[tuple[str, tuple[str | int, ...], tuple[object, ...]], list[tuple[str, AgentState, float]]]
         self._edges = defaultdict(list)
-        """Activity, holdings and relevant counts -> the transitions from there: input, next state, and cost."""
+        """Activity, holdings and relevant counts of a state -> the transitions from this state: input, next state, and
+        cost.
+        """
         self._quiet: set[VectorKey] = set()
         self._growing: set[VectorKey] = set()
         self._tries: Counter[VectorKey] = Counter()
@@ -75,8 +79,7 @@ class VectorMap:
                 self._edges[transition.key[:3]].append((transition.key.input, transition.after, costs))
 
     def unseen_in(self, state: AgentState, ruled_out: Container[VectorKey] = ()) -> VectorKey | None:
-        """Return the next test to play in this state, except those in `ruled_out`. Return None if none remains.
-
+        """Return the next test to play in this state, except those in `ruled_out`. Return None if no test remains.
         Inputs that leave the agent unchanged come first, then other inputs, then timers, and last the inputs that make
         the chain longer.
         """

@@ -363,8 +363,7 @@ def _messages(datagrams: Iterable[bytes]) -> list[Message] | None:
 
 def _expire(model: ReferenceModel, now: float) -> list[bytes]:
     """Let the next timer of the reference expire at its deadline, or at the time `now` if the deadline has passed.
-
-    Return the datagrams that the reference sends. The result is empty if no timer runs.
+    Return the datagrams that the reference sends. Return an empty list if no timer runs.
     """
     deadline = model.agent.next_timer()
     if deadline is None:

@@ -279,9 +279,8 @@ class ProcessUnderTest:
             raise AgentEndedError(f"it {error}: {self.last_line}") from None
 
     async def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        """Send a command to the agent, and return its answer.
-
-        Raises AgentEndedError if the agent does not answer, and AgentRefusedError if it refuses the command.
+        """Send a command to the agent, and return its answer. Raises AgentEndedError if the agent does not answer, and
+        AgentRefusedError if the agent refuses the command.
         """
         try:
             return await self.program.ask(command, **arguments)

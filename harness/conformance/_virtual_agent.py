@@ -77,8 +77,8 @@ class VirtualProgram:
         return AgentExitedError(f"it {error}: {self._program.last_line() or SILENT}")
 
     async def finish(self) -> str:
-        """Close the input of the process, and return a phrase about its end. The phrase is "status 0" if the agent
-        follows the contract.
+        """Close the input of the process, and return a phrase about the end of the process. If the agent follows the
+        contract, the phrase is "status 0".
         """
         status = await asyncio.to_thread(self._program.finish, ANSWER_LIMIT_S)
         return f"it still runs after {ANSWER_LIMIT_S:g} s" if status is None else f"status {status}"

@@ -16,7 +16,7 @@ SCHEMA = "ucp-conformance/1"
 CaseVerdict = Literal["passed", "failed", "not applicable", "not tried"]
 TITLES = {handler.algorithm: handler.title for handler in HANDLERS.values()}
 FURTHER_CHECKS = 0
-"""The number that replaces that of an Algorithm for cases about the program, its datagrams and its files."""
+"""The number that stands in place of an Algorithm number in cases about the program, its datagrams and its files."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class CaseResult:
     """A sentence with the cause of the verdict."""
     settings: str = ""
     inputs: tuple[str, ...] = ()
-    """All inputs of the agent. It answered the last one wrongly."""
+    """All inputs of the agent. The agent answered the last input wrongly."""
     expected: tuple[str, ...] = ()
     received: tuple[str, ...] = ()
     wrong: tuple[str, ...] = ()
@@ -100,7 +100,7 @@ class ConformanceResults:
     started_at: str
     cases: list[CaseResult] = field(default_factory=list)
     counted: dict[int, AlgorithmCounts] = field(default_factory=dict)
-    """Algorithm -> numbers of its vectors by verdict. Vectors that failed are in `cases` instead."""
+    """Algorithm -> the numbers of its vectors by verdict. `cases` contains the vectors that failed."""
     notes: list[str] = field(default_factory=list)
     interrupted: bool = False
 

@@ -28,7 +28,7 @@ class BlockNames:
         self._top_of: dict[bytes, bytes | None] = {}
         self._mentioned: set[bytes] = set()
         self._sealed = False
-        """True if some messages are encrypted, so that their blocks are unknown."""
+        """True if some messages are encrypted, so that the blocks in these messages are unknown."""
         self._from_start: set[int] = set()
         self._proposed: dict[int, int] = {}
         for run in runs:

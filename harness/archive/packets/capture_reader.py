@@ -34,8 +34,8 @@ ListenerName = int | str
 
 
 class CaptureComment(BaseModel):
-    """The comment that the harness writes into a packet capture, as JSON in the section header. `epoch_us` is the time
-    of mission second 0.
+    """The comment that the harness writes into a packet capture, as JSON in the section header. `epoch_us` is the
+    capture time of mission second 0.
     """
 
     ucp_harness: Literal[1]
@@ -66,9 +66,8 @@ class Datagram:
 
 
 class Capture:
-    """A packet capture file. It covers the time from `began_ns` to `ended_ns`. Both are None if this time is unknown.
-
-    `sees_itself` is true if the file also contains the datagrams that its vehicle sent.
+    """A packet capture file. The file covers the time from `began_ns` to `ended_ns`. Both are None if this time is
+    unknown. `sees_itself` is true if the file also contains the datagrams that its own vehicle sent.
     """
 
     def __init__(self, number: int, path: Path) -> None:

@@ -29,7 +29,7 @@ def channel_losses(runs: Iterable[Path]) -> ChannelLosses:
 
 def loss_reasons(losses: ChannelLosses, transmission: Transmission) -> dict[str, list[ListenerName]]:
     """Return, for each reason, the vehicles that did not receive the message on the channel. If the radio of the sender
-    dropped the message, these are all vehicles.
+    dropped the message, no vehicle received it.
     """
     named = {
         reason: [name for name in transmission.lost_by if reason in DROPS or name in vehicles]

@@ -144,10 +144,8 @@ class MessageSummary(NamedTuple):
 
     @property
     def request_key(self) -> tuple[str, bytes | None] | None:
-        """The type and the subject of an answer to this request, which can be compared with `answers`. None if the
-        message is not a request.
-
-        The agent that sent the request is not included, because answers do not name it.
+        """The type and the subject of an answer to this request, for comparison with `answers`. None if the message is
+        not a request. The agent that sent the request is not included, because answers do not name this agent.
         """
         response = RESPONSES.get(self.message)
         return None if response is None or self.is_sealed else (response, self._subject)

@@ -20,9 +20,7 @@ _Asked = tuple[float, int]
 
 class RequestOutcome(NamedTuple):
     """The result of a request at the vehicle `by`. `response` is the first answer of this vehicle, or None without an
-    answer.
-
-    The outcome is "answered" unless captures show that the agent that sent the request did not receive the response.
+    answer. The outcome is "answered" unless captures show that the requesting agent did not receive the response.
     """
 
     by: int

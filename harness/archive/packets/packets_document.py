@@ -39,8 +39,8 @@ class CaptureRecord(BaseModel):
 
 
 class PairRecord(BaseModel):
-    """The datagrams from one sender to one receiver. `sent` is the number of datagrams that the receiver should have
-    received. `lost` is the number of them that it did not receive.
+    """The datagrams from one sender to one receiver. The receiver should have received `sent` datagrams, and did not
+    receive `lost` of them.
     """
 
     sender: int
@@ -59,8 +59,8 @@ class ReceptionRecord(BaseModel):
 
 
 class AnswerRecord(BaseModel):
-    """The outcome of a request at vehicle `by`: the answer of the vehicle, and the number of the datagram that contains
-    the answer. The number is null without an answer.
+    """The outcome of a request at vehicle `by`: the answer of the vehicle, and the number of the datagram with this
+    answer. The number is null without an answer.
     """
 
     by: int

@@ -125,8 +125,8 @@ def transmission_lines(
     text: TransmissionFormatter,
     answers_of: int | None,
 ) -> Iterator[str]:
-    """Yield a line for each message. Below each request, yield the outcomes at all vehicles, or only at the vehicle
-    `answers_of`.
+    """Yield a line for each message. Below each request, yield the outcomes of the request at all vehicles, or only at
+    the vehicle `answers_of`.
     """
     for transmission in transmissions:
         yield text.transmission(transmission)

@@ -34,10 +34,8 @@ class MessageFilter:
             raise CaptureError("--between {:g} {:g}: the first second is not before the last".format(*self.between_s))
 
     def filter(self, transmissions: Iterable[Transmission], captures: Captures) -> Iterator[Transmission]:
-        """Yield the messages that the filter accepts. If the filter has a receiver, the yielded messages contain only
-        this receiver.
-
-        Raises CaptureError if the receiver has no capture.
+        """Yield the messages that the filter accepts. If the filter has a receiver, each yielded message contains only
+        this receiver. Raises CaptureError if the receiver has no capture.
         """
         vehicles = sorted({capture.vehicle for capture in captures.used if capture.vehicle is not None})
         if self.receiver is not None and self.receiver not in vehicles:
@@ -82,7 +80,7 @@ def exchanges_about(
 
 
 def in_order(exchanges: Iterable[AnsweredMessage]) -> list[Transmission]:
-    """Return these messages and all answers to them in the order of sending, each message once."""
+    """Return the messages and all answers to them in the order of sending. Each message occurs once."""
     by_number = {
         transmission.number: transmission
         for exchange in exchanges

@@ -78,9 +78,8 @@ class _Listeners:
         return any(capture.listening(time_ns) for capture in self._transmissions.get(name, ()))
 
     def would_record_sending(self, sender: ListenerName, time_ns: int) -> bool:
-        """Return true if a datagram that the sender sent at this time must be in its packet captures.
-
-        This is not certain if the captures contain only received datagrams, or lack frames.
+        """Return true if the captures of the sender must contain a datagram that the sender sent at this time. This is
+        not certain if the captures contain only received datagrams, or lack frames.
         """
         captures = self._transmissions.get(sender, ())
         sound = any(capture.sees_itself for capture in captures) and not any(capture.dropped for capture in captures)

@@ -16,7 +16,7 @@ from harness.checker.records.contradiction import Contradiction, of_agent, slack
 from ucp.trigger import MessageTrigger
 
 COUNTS_DATAGRAMS = "nftables"
-"""The engine that counts each broadcast once. Other engines also count duplicated packets."""
+"""The engine that counts each broadcast once. All other engines also count duplicated packets."""
 
 Datagrams = Counter[tuple[object, object]]
 """A count of datagrams by (sender, sequence number)."""

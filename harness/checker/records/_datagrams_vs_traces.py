@@ -20,12 +20,12 @@ from harness.checker.records.contradiction import Contradiction, of_agent
 from ucp.trigger import MessageTrigger
 
 UNDER_WAY_WALL_S = 0.25
-"""Seconds of wall time before the end of an incarnation. A datagram that was read in this time may not have been
-handled.
+"""Seconds of wall time before the end of an incarnation. The agent may not have handled a datagram that it read in this
+time.
 """
 UNREAD_WALL_S = 1.0
-"""Seconds of wall time before the end of an incarnation. A datagram that was delivered in this time may not have been
-read.
+"""Seconds of wall time before the end of an incarnation. The agent may not have read a datagram that was delivered in
+this time.
 """
 
 

@@ -1,6 +1,4 @@
-"""Change the verdict on a characteristic if records contradict each other or are incomplete. This puts the
-characteristic in doubt.
-"""
+"""Change the verdict on a characteristic if records contradict each other or are incomplete."""
 
 from harness.checker.judgement import MAX_EVIDENCE, Judgement, agents, times
 from harness.checker.records import RecordComparisons, describe_incomplete

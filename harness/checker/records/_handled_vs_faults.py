@@ -35,8 +35,8 @@ agent may still run at the start and the end.
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each handler run of an agent at a time when it was stopped, and each handled message that was sent over a
-    link while the link was cut.
+    """Yield each handler run of an agent at a time at which the agent was stopped, and each handled message that was
+    sent over a link while the link was cut.
     """
     if evidence.record is None:
         return

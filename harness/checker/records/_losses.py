@@ -63,8 +63,8 @@ class _ExpectedDeliveries:
     most: float = 0.0
     handled: int = 0
     dropped: int = 0
-    """Recorded datagrams that arrived at the receiver but that it did not handle. Some of these datagrams may be among
-    `messages`.
+    """Recorded datagrams that arrived at the receiver, but that the receiver did not handle. Some of these datagrams
+    may be among `messages`.
     """
 
     def loss_range(self) -> tuple[float, float]:

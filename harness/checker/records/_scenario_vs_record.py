@@ -28,8 +28,8 @@ USUAL = Settings()
 NOT_IN_A_SCENARIO = (RANGE, NO_MORE_FATES, FINAL_RECONCILE)
 
 LATE_WALL_S = 60.0
-"""Maximum lateness of a change in seconds of wall time. It applies to runs with processes, whose records lack the
-planned time.
+"""Maximum lateness of a change in seconds of wall time. This limit applies to runs with processes, because their
+records lack the planned time of the change.
 """
 
 Made = tuple[str, str]

@@ -88,9 +88,8 @@ def _compare_events(evidence: Evidence, agent_id: int, trace: Trace) -> Iterator
 
 
 def _time_of_event(run: HandlerRun, trace: Trace) -> float | None:
-    """Return the mission second of the event's timestamp, or None if it is unknown.
-
-    A clock that shows a time before its epoch gives its events the timestamp 0.
+    """Return the mission second of the event's timestamp. Return None if this time is unknown. An event has the
+    timestamp 0 if the clock shows a time before its epoch.
     """
     try:
         timestamp_us = event_of(run.input).timestamp_us

@@ -11,10 +11,9 @@ from ucp.clock import MICROSECONDS
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """A contradiction between two records.
-
-    `touches` is the number of the characteristic that depends on these records. It is None if no characteristic depends
-    on them. `short` is true if the contradiction shows that the agent's trace lacks lines.
+    """A contradiction between two records. `touches` is the number of the characteristic that depends on the two
+    records, or None without such a characteristic. `short` is true if the contradiction shows that the agent's trace
+    lacks lines.
     """
 
     finding: Finding
@@ -37,8 +36,8 @@ def in_virtual_time(trace: Trace) -> bool:
 
 
 def slack_s(evidence: Evidence, trace: Trace) -> float:
-    """Return the tolerance, in mission seconds, for differences between clocks. A simulated run has one clock and needs
-    none. The clock of another computer has its measured error in addition.
+    """Return the tolerance for differences between clocks, in mission seconds. A simulated run has only one clock, so
+    its tolerance is 0. The tolerance for a clock of another computer includes the measured error of the clock.
     """
     speedup = trace.header.clock.get("speedup")
     if in_virtual_time(trace) or not isinstance(speedup, int | float):

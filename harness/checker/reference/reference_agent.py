@@ -101,12 +101,12 @@ class ReferenceAgent:
     # Outputs
 
     def messages_to_send(self) -> list[tuple[int, Message]]:
-        """Return the messages to broadcast with their sequence numbers. Then forget them."""
+        """Return the messages to broadcast, with their sequence numbers. Remove these messages from the output."""
         sent, self._outbox = self._outbox, []
         return sent
 
     def datagrams_to_send(self) -> list[bytes]:
-        """Return the datagrams to broadcast. Then forget them."""
+        """Return the datagrams to broadcast. Remove these datagrams from the output."""
         return [encode(self.agent_id, sequence, message) for sequence, message in self.messages_to_send()]
 
     def trace(self) -> list[HandlerRun]:
@@ -122,7 +122,7 @@ class ReferenceAgent:
         return soonest
 
     def _handle(self, now: float, trigger: Trigger, handler: Handler, *inputs: object) -> None:
-        """Run a handler, then the handlers of all local events that it triggered, in order."""
+        """Run a handler. Then run the handlers of all local events that it triggered, in order."""
         state = self.state
         state.now = now
         self._run(trigger, handler, *inputs)

@@ -34,7 +34,7 @@ class Settings:
 
     @classmethod
     def of(cls, settings: object) -> "Settings":
-        """Convert any object with the same attributes to settings of this class."""
+        """Convert an object with the same attributes to settings of this class."""
         return cls(**{setting.name: getattr(settings, setting.name) for setting in fields(cls)})
 
 
@@ -97,8 +97,8 @@ class Chain:
         return self._blocks.get(block_hash)
 
     def successor(self, chain_hash: bytes) -> Block | None:
-        """Return the block that follows `chain_hash`. Return None if the chain does not contain this chain hash, or if
-        it is the top of the chain.
+        """Return the block that follows `chain_hash` in the chain. Return None if the chain does not contain this chain
+        hash, or if this chain hash is the top.
         """
         return self._successors.get(chain_hash)
 
@@ -251,7 +251,9 @@ class ReferenceState:
         self.changed("stack+", block)
 
     def pop_stack(self, index: int = -1) -> Block:
-        """Remove the block at `index` from the reconcile stack and return it. By default this is the top block."""
+        """Remove the block at `index` from the reconcile stack, and return the block. By default, this block is the top
+        block.
+        """
         block = self.reconcile_stack.pop(index)
         self._off_chain.discard(block.block_hash)
         self.changed("stack-", block)

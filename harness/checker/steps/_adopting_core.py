@@ -40,15 +40,15 @@ else:
 
 
 class AdoptingCore(_Core):
-    """An agent core that can undo its last step (`undo`) and adopt the recorded step of another agent instead
-    (`adopt`).
+    """An agent core that can undo its last step (`undo`), and adopt the recorded step of another agent in place of its
+    own step (`adopt`).
     """
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Any) -> None:
         super().__init__(agent_id, initial_data, settings)
         self.recorded_seal: bytes | None = None
-        """The encrypted event data of this step, as the agent recorded it. The core cannot encrypt it without the
-        agent's keys.
+        """The encrypted event data of this step, as the agent recorded them. The core cannot encrypt event data without
+        the agent's keys.
         """
         self._seals = sealed_to(initial_data) is not None
         self._moved: dict[str, Block] = {}
@@ -83,8 +83,8 @@ class AdoptingCore(_Core):
         self.step_is_over()
 
     def before(self, run: HandlerRun) -> StateBeforeStep | None:
-        """Return the data that `undo` needs in addition to the recorded changes of the step. Return None if the
-        recorded changes are sufficient.
+        """Return the data that `undo` needs in addition to the recorded changes of the step. Return None if `undo`
+        needs only the recorded changes.
         """
         logs, phase_three_ends = run.handler == "build_data_block", self.phase_three_timer.deadline
         if not (logs or self.reconcile_stack or phase_three_ends is not None):
@@ -128,9 +128,8 @@ class AdoptingCore(_Core):
         return [SentMessage.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
-        """Choose the same block for phase 3 as the agent's recorded run.
-
-        This is necessary after a deviation, if the agent started phase 3 but the core did not.
+        """Select the block that the agent's recorded run selected for phase 3. This selection is necessary after a
+        deviation, if the agent started phase 3 but the core did not.
         """
         if run.handler == "reconcile_phase_3":
             hashes = [block_hash for operation, block_hash in run.changes if operation == "chain+"]
@@ -238,8 +237,8 @@ class AdoptingCore(_Core):
                 timer.start(self.now, self._duration(timer))
 
     def _asked(self, message: Message) -> Timer | None:
-        """Prepare to count the answers to `message`. Return the timer that limits the wait for these answers, or None
-        if the message needs no answer.
+        """Prepare to count the answers to `message`. Return the timer that limits the wait for these answers. Return
+        None if the message needs no answer.
         """
         match message:
             case BlockAddRequest():

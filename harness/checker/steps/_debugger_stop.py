@@ -7,7 +7,7 @@ from typing import Any
 
 
 def stop_and_run(handler: Any, core: Any, *inputs: Any) -> str:
-    """Call `breakpoint()`, then run the handler. A debugger steps from there into the handler."""
+    """Call `breakpoint()`, then run the handler. A debugger can step from the breakpoint into the handler."""
     breakpoint()
     branch: str = handler.run(core, *inputs)
     return branch

@@ -80,8 +80,8 @@ def _in_virtual_time(
 def _of_kind(
     agent_id: int, timer: str, expiries: list[tuple[RecordedTimerExpiry, float]], speedup: float
 ) -> Iterator[StepDeviation]:
-    """Yield each expiry of this timer that was too late. If only the mean lateness of all expiries is too high, yield
-    the last expiry.
+    """Yield each expiry of this timer that was too late. If no single expiry was too late, but the mean lateness is too
+    high, yield the last expiry.
     """
     late = [(expiry, lag_s) for expiry, lag_s in expiries if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
     for expiry, lag_s in late:

@@ -14,8 +14,8 @@ NameOf = Callable[[str], str]
 CHOOSES = 15
 """The number of the Algorithm that records its choice instead of counters."""
 SHOWN = 3
-"""Maximum number of changes or messages that the description of a step lists. If there are more, the description only
-gives their number.
+"""Maximum number of changes or messages that the description of a step lists. For more changes or messages, the
+description gives only their number.
 """
 
 

@@ -61,9 +61,8 @@ def failure(recorded: AgentRecord | None) -> str | None:
 
 
 def last_line(trace: Trace, incarnations: int | None = None) -> tuple[int, float]:
-    """Return the line number and the mission second of the last handler run. The header is line 1.
-
-    By default, all incarnations of the agent count. Otherwise only the first `incarnations` count.
+    """Return the line number and the mission second of the last handler run. The header is line 1. `incarnations`
+    limits the number of incarnations to consider.
     """
     line, t = 1, 0.0
     for incarnation in islice(trace.incarnations(), incarnations):

@@ -45,8 +45,8 @@ PAUSES = "receive_response_block_for_hash"
 """Name of the handler that pauses and continues the phase 3 timer. No record shows this pause."""
 
 TOUCH_A_TIMER = frozenset((PAUSES,))
-"""Message handlers that change a timer. The effects of other message handlers can be undone from their recorded
-changes.
+"""Message handlers that change a timer. For all other message handlers, the recorded changes are sufficient to undo the
+effects.
 """
 
 Delayed = Callable[[float, float], bool]
@@ -113,7 +113,7 @@ class StepComparer:
         self.expiries: list[RecordedTimerExpiry] = []
         """Each expiry of a timer of the reference that the agent handled, in order."""
         self.lost: str | None = None
-        """The reason, with a trace line, why the comparison cannot continue. None while it can."""
+        """The reason, with a trace line, why the comparison cannot continue. None while the comparison can continue."""
         self.stops_before_handler = False
         """Stop in the debugger before each handler."""
         self._header = header
@@ -140,7 +140,7 @@ class StepComparer:
         """The last recorded state, as long as the reference is still in this state."""
 
     def follow(self, line: int, run: HandlerRun) -> None:
-        """Compare this handler run with the reference. Also check that the agent omitted no handler run before it."""
+        """Compare this handler run with the reference. Also check that the agent omitted no earlier handler run."""
         if self.lost is not None:
             return
         core, trigger = self._core, run.trigger
@@ -223,8 +223,8 @@ class StepComparer:
     # Lines that may be lost
 
     def has_effect(self, sender: int, message: Message, at_s: float) -> bool:
-        """Give the reference a message that is missing in the trace. Return true if it has an effect: a change, a
-        counted answer, a message, a timer or a local event.
+        """Give the reference a message that is missing in the trace. Return true if the message has an effect: a
+        change, a counted answer, a message, a timer or a local event.
         """
         core = self._core
         core.now = self._header.local(at_s)
@@ -233,14 +233,14 @@ class StepComparer:
         return bool(core.changes or core.outbox or core.started or core.triggered) or branch in COUNTING
 
     def play_lost_message(self, sender: int, message: Message, at_s: float) -> bool:
-        """Give the reference a message that has no line in the trace. Return true if the loss of its line would be
+        """Give the reference a message that has no line in the trace. Return true if the loss of this line would be
         invisible, because the message changed no block.
         """
         return self._play_lost(self._on_message[type(message)], at_s, sender, message)
 
     def play_lost_expiry(self, timer_name: str, at_s: float) -> bool:
-        """Let a timer of the reference expire whose expiry has no line in the trace. Return true if the timer was due,
-        and if the loss of its line would be invisible.
+        """Let a timer of the reference expire although the trace has no line for the expiry. Return true if the timer
+        was due, and if the loss of this line would be invisible.
         """
         timer = self._timers[timer_name]
         if timer.deadline is None or timer.deadline > self._header.local(at_s) + self._header.early_s:
@@ -249,8 +249,8 @@ class StepComparer:
         return self._play_lost(self._implementation.on_timer[timer_name], at_s)
 
     def play_lost_local_event(self, at_s: float) -> bool:
-        """Run the handler of the next local event. Return true if such an event waited, and if the loss of its line
-        would be invisible.
+        """Run the handler of the next local event. Return true if a local event waited, and if the loss of its trace
+        line would be invisible.
         """
         if not self._core.triggered:
             return False

@@ -48,7 +48,8 @@ class OtherRecords(Protocol):
         """Return the recorded datagrams with this sender and this sequence number."""
 
     def sent_by_others(self, kind: str) -> Iterable[tuple[int, Message]]:
-        """Return the recorded messages of this type from other agents, with their senders. Equal ones occur once."""
+        """Return the recorded messages of this type from other agents, with their senders. Equal messages occur once.
+        """
 
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
         """Return false if the records of other agents prove that the agent received no message of this kind from
@@ -242,7 +243,9 @@ def _completes_unknown_block(before: StepComparer, deviation: StepDeviation, run
 
 
 def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
-    """Yield copies of the reference. Each one is in a state to which one lost trace line could have led."""
+    """Yield copies of the reference. Each copy is in a state that the agent could have if one line of the trace were
+    lost.
+    """
     yield from _with_local_events_more(before, run)
     yield from _with_an_expiry_more(before, run)
     for message in _answers(before.state, run, others):
@@ -279,8 +282,8 @@ def _with_an_expiry_more(before: StepComparer, run: HandlerRun) -> Iterator[Step
 def _with_lines_more(
     before: StepComparer, following: Sequence[HandlerRun], others: OtherRecords
 ) -> Iterator[StepComparer]:
-    """Yield copies of the reference. Each one has received answers to its last question, whose lines are lost. The line
-    of the expiry that ended the question can be lost as well.
+    """Yield copies of the reference. Each copy has received answers to its last question whose trace lines are lost.
+    The line of the expiry that ended the question can be lost as well.
     """
     for count in range(1, MAX_ANSWERS + 1):
         for trial in _with_answers_more(before, following, others, count):
@@ -292,10 +295,8 @@ def _with_lines_more(
 def _with_answers_more(
     before: StepComparer, following: Sequence[HandlerRun], others: OtherRecords, count: int
 ) -> Iterator[StepComparer]:
-    """Yield copies of the reference. Each one has received `count` answers that have no line.
-
-    An agent counts only one answer of each sender. A sender whose answer has a line is therefore not the sender of a
-    lost answer.
+    """Yield copies of the reference that have received `count` answers without a trace line. An agent counts only one
+    answer of each sender. The sender of a lost answer is therefore not the sender of a recorded answer.
     """
     run, state = following[0], before.state
     answered = state.voters if state.voting_timer.active else state.reconcile_responders
@@ -314,7 +315,8 @@ def _with_answers_more(
 
 
 def _senders(runs: Iterable[HandlerRun]) -> set[int]:
-    """Return the senders of the answers that an agent received, until it ended its question or asked another one."""
+    """Return the senders of the answers that an agent received before it ended its question or asked another question.
+    """
     senders = set()
     for run in runs:
         if not isinstance(run.trigger, MessageTrigger):

@@ -44,7 +44,7 @@ class CheckedHeader:
     late_s: float
     secured: bool = False
     seal: Callable[[bytes, int], bytes] | None = field(default=None, repr=False, compare=False)
-    """A function that returns the encrypted event data as far as the agent recorded it. None if the mission does not
+    """A function that returns the encrypted event data, if the agent recorded them. None if the mission does not
     encrypt event data.
     """
 

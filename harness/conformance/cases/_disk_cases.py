@@ -59,7 +59,7 @@ async def _no_export(bench: CaseBench) -> None:
 
 
 async def _commit(agent: BenchAgent, count: int) -> list[Block]:
-    """Make the agent commit blocks of another agent, and return these blocks."""
+    """Make the agent commit blocks of another agent, and return the committed blocks."""
     blocks, top = [], INCEPTION
     for number in range(count):
         block = Block(PEERS[0], number + 1, b"block %d" % number)

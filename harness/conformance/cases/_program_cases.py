@@ -40,8 +40,8 @@ INPUTS = 50
 SIGNAL_GAP_S = 0.05
 """Seconds of wall time between two signals. A pending signal would absorb an equal one."""
 SECONDS_WITHOUT_EVENT = 20.0
-"""Mission seconds in which an agent that draws an event each second logs at least one with a probability of almost
-1.
+"""Mission seconds of a test without an event. An agent that draws an event each second logs at least one event in this
+time with a probability of almost 1.
 """
 
 

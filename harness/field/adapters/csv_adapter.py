@@ -74,7 +74,9 @@ class _ColumnLayout:
         self._places = places
 
     def cells(self, row: str) -> dict[str, str] | None:
-        """Return the cells of a row by column name. Return None if the row has fewer cells than the first row."""
+        """Return the cells of a row by column name. Return None if the row has fewer cells than the row of column
+        names.
+        """
         last = max(self._places.values())
         try:
             cells = next(csv.reader([row], delimiter=self._separator, strict=True), [])

@@ -202,7 +202,9 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
 
 
 def _survived_trace(trace: Trace, export: Export | None) -> bool:
-    """Return true if the agent was still running after the end of its trace. A later time in its export shows this."""
+    """Return true if the agent was still running after the end of its trace. A later time in the agent's export shows
+    this.
+    """
     if export is None:
         return False
     at_s = mission_s(export.exported_at_us, trace.header)

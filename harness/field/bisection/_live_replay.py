@@ -55,7 +55,7 @@ from ucp.trace import DroppedDatagram, HandlerRun, RecordedBytes, in_base64
 from ucp.trigger import LocalTrigger, MessageTrigger, OperatorTrigger
 
 START_DELAY_S = 2.0
-"""Seconds until mission second 0. By then, the node of the peers has started."""
+"""Seconds of wall time until mission second 0. In this time, the node of the peers starts."""
 SLACK_S, SLACK_WALL_S = 1.0, 0.15
 """Tolerated difference between the time of a message and its recorded time: mission seconds, plus seconds of wall
 time.
@@ -100,8 +100,8 @@ class ScriptedDatagram:
 
 @dataclass(frozen=True)
 class PeerScript:
-    """A script for the peers: the datagrams and commands to send to the agent program at each mission second, and the
-    messages expected from it.
+    """A script for the peers of the agent program: the datagrams and commands to send to the program at each mission
+    second, and the messages expected from it.
     """
 
     datagrams: list[ScriptedDatagram]

@@ -61,7 +61,7 @@ class Outcome(_OutcomeModel):
     crashed: str | None = None
 
     def as_recorded(self) -> "Outcome":
-        """Return the outcome that an agent core has if it does not differ from the records."""
+        """Return the outcome of an agent core that does not differ from the records."""
         agents = {agent: AgentResult(differences=[]) for agent in self.agents}
         return self.model_copy(update={"agents": agents, "crashed": None})
 

@@ -146,9 +146,7 @@ def _from_traces(traces: dict[int, Trace], problems: list[str]) -> Iterator[_Sen
 
 
 class _ReceivingAgent:
-    """The messages that an agent handled, and the intervals in which its trace contains every message that it
-    handled.
-    """
+    """The messages that an agent handled, and the intervals in which its trace contains every handled message."""
 
     def __init__(self, trace: Trace) -> None:
         triggers = (run.trigger for run in trace.runs)
@@ -176,8 +174,8 @@ class _ReceivingAgent:
         return message in _NEVER_WITHHELD and not any(around)
 
     def takes(self, key: tuple[int, str, int]) -> bool:
-        """Return true if the agent handled the message. A message that was handled once gives true only for the first
-        call.
+        """Return true if the agent handled the message. For a message that was handled once, only the first call
+        returns true.
         """
         self._handled[key] -= 1
         return self._handled[key] >= 0

@@ -62,7 +62,7 @@ class TransmissionAttempt(NamedTuple):
     distance_m: float
     delivered: bool
     others: int = 0
-    """Number of messages from other vehicles on the air at about the same time."""
+    """Number of messages from other vehicles that were on the air at about the same time."""
 
     @property
     def link(self) -> frozenset[int]:
@@ -87,7 +87,7 @@ class DeliveryModel:
 
     @property
     def wide(self) -> float:
-        """Return the ratio of two distances: at the first one 10 % of the messages arrive, and at the second one 90 %.
+        """Return the distance at which 10 % of the messages arrive, divided by the distance at which 90 % arrive.
         `floor` is treated as 0.
         """
         return math.exp(2 * _NORMAL.inv_cdf(0.9) * self.spread)

@@ -27,8 +27,8 @@ from netem.channel import PRESETS
 from netem.radio import LogDistance
 
 TRAINING_SHARE = 2 / 3
-"""The beginning of the flight, as a share of its time, to which the validation fits the model. The model then predicts
-the rest.
+"""Length of the first part of the flight, as a share of the flight time. The validation fits the model to this part.
+The model then predicts the rest.
 """
 BLOCK_S = 120.0
 _BINS = 10

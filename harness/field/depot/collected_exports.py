@@ -96,8 +96,8 @@ class CollectedExports:
     wrong_signatures: list[str] = field(default_factory=list)
     """A sentence about each wrong signature in a secured mission."""
     unproven: str | None = None
-    """The reason why valid signatures do not prove that the exports are genuine. None if they do, or if the mission was
-    not secured.
+    """The reason why valid signatures do not prove that the exports are genuine. None if they prove this, or if the
+    mission was not secured.
     """
 
     @property
@@ -393,8 +393,8 @@ def _edited(path: Path, which: str, claimed: str) -> str:
 
 
 def _content(path: Path, named_by_user: bool) -> bytes:
-    """Return the content of a file. Return None if the file does not look like an export and the user did not name
-    it.
+    """Return the content of a file. Return None if the file does not look like an export and the user did not name the
+    file itself.
     """
     try:
         with BoundedFile(path, MAX_EXPORT_BYTES) as file:
@@ -448,8 +448,8 @@ def _recover(path: Path, data: bytes, problems: list[str]) -> Export:
 
 
 _TOKEN = re.compile(r'"(?:[^"\\]|\\.|\\\Z)*(?:"|\Z)|[\[\]{},]', re.DOTALL)
-"""A pattern for a JSON string or bracket. A truncated string extends to the end of the text, even if it contains
-brackets.
+"""A pattern for a JSON string or bracket. A truncated string extends to the end of the text, so brackets inside of it
+do not count.
 """
 _FLAT_OBJECT = re.compile(r"\{[^{}]*\}")
 

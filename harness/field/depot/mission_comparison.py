@@ -46,7 +46,7 @@ class UnreadableFileError(HarnessError):
 
 @dataclass(frozen=True)
 class SharedValue:
-    """A value that must be the same in all files. `key` is the name of its key in this file."""
+    """A value that must be the same in all files. `key` is the name of the value in this file."""
 
     key: str
     value: Hashable
@@ -181,8 +181,8 @@ def read(path: Path) -> ComparedFile:
 
 
 def _beginning(path: Path) -> dict[str, object]:
-    """Return the JSON object in the first line of the file. If the first line is not an object, return the object that
-    the whole file contains.
+    """Return the JSON object in the first line of the file. If the first line is not an object, return the object in
+    the whole file.
     """
     try:
         with open_trace(path) as file:

@@ -213,9 +213,8 @@ def mutual_chain(chains: Iterable[Sequence[str]]) -> Sequence[str]:
 
 
 def ordered(blocks: Mapping[str, ExportedBlock], chains: Sequence[Sequence[str]]) -> list[str]:
-    """Return the hashes of `blocks` in the order of the merged record.
-
-    `blocks` includes all blocks of the chains. `chains` has at least one chain.
+    """Return the hashes of `blocks` in the order of the merged record. `blocks` includes all blocks of the chains.
+    `chains` contains at least one chain.
     """
     mutual = mutual_chain(chains)
     first = set(mutual)

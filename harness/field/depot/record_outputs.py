@@ -210,7 +210,7 @@ def agents(ids: Sequence[int]) -> str:
 
 
 def _single_copies(record: MergedRecord) -> Iterator[str]:
-    """Yield a sentence for each vehicle that is the only holder of some blocks. The loss of this vehicle would have
+    """Yield a sentence for each vehicle that is the only holder of some blocks. The loss of such a vehicle would have
     destroyed these blocks.
     """
     if len(record.collected.latest) < 2:

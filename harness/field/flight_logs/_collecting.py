@@ -43,7 +43,7 @@ class LogClock:
         return self._last_us is not None
 
     def accepts(self, at_us: int) -> bool:
-        """Return true if a record with this time may be used. If the clock has jumped, the jump is added to `jumps`."""
+        """Return true if a record with this time may be used. If the clock has jumped, add the jump to `jumps`."""
         if not 0 <= at_us <= MAX_TIME_US:
             self.dropped += 1
             return False
@@ -84,8 +84,8 @@ class RecordCollector:
         self._last_state: dict[type[Any], Hashable] = {}
 
     def add(self, record: FlightRecord) -> bool:
-        """Store a record. Its time is converted to UTC at the end of the segment. Return false if the limit of the
-        number of records is reached.
+        """Store a record. The time of the record is converted to UTC at the end of the segment. Return false if the
+        limit of the number of records is reached.
         """
         kept = self._budget.take()
         if kept:

@@ -40,7 +40,7 @@ _COLUMN_TYPES: dict[str, tuple[str, float | None]] = {
     **{"a": ("64s", None), "g": ("e", None), "n": ("4s", None), "N": ("16s", None), "Z": ("64s", None)},
     **{"c": ("h", 100), "C": ("H", 100), "e": ("i", 100), "E": ("I", 100), "L": ("i", 1e7), "M": ("b", None)},
 }
-"""Code of a column type in an FMT message -> its code in Python's `struct`, and the divisor of its values."""
+"""Code of a column type in an FMT message -> code of the type in Python's `struct`, and divisor of the values."""
 _VEHICLE_PARAMETERS = ("MAV_SYSID", "SYSID_THISMAV")
 _EVENT_ARMED, _EVENT_DISARMED = 10, 11
 _FAILSAFES = {
@@ -120,7 +120,9 @@ class DataFlashReader:
         self.gps_positions.end_segment()
 
     def _messages(self, stream: BinaryIO) -> Iterator[tuple[_MessageDefinition, bytes, int]]:
-        """Yield the messages to decode. Each has its definition, the buffer, and the position of its first column."""
+        """Yield the messages to decode. For each message, yield its definition, the buffer, and the position of its
+        first column.
+        """
         lengths = [0] * 256
         lengths[FMT] = _FMT_BYTES
         definitions: dict[int, _MessageDefinition] = {}

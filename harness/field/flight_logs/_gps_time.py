@@ -10,8 +10,8 @@ _LEAPS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (1_230_
 Bulletin C).
 """
 _OLDEST_S, _NEWEST_S = 1_136_073_600, 4_102_444_800
-"""The years 2006 and 2100, as limits of a plausible time. Times outside come from damage, or from a receiver without a
-fix.
+"""The years 2006 and 2100, as limits of a plausible time. Times outside of these limits come from damage, or from a
+receiver without a fix.
 """
 
 

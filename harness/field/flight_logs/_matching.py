@@ -31,8 +31,8 @@ _CELL_DEG = 1e-4
 _PAUSE_US = 5_000_000
 """Microseconds between two positions near a place. After a longer time, they belong to two different visits."""
 _MAX_VISIT_US = 20_000_000
-"""Maximum duration of a visit in microseconds. A vehicle that is near a place for longer stays there, and the visit
-does not vote.
+"""Maximum duration of a visit in microseconds. If a vehicle is near a place for longer, it stays there, and the visit
+is not used to find the time difference.
 """
 _BIN_US = 1_000_000
 _MIN_VOTES = 3
@@ -90,7 +90,7 @@ def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[M
 
 
 def _other_flight(match: MatchedLog, nearest: Mapping[int, float]) -> MatchedLog:
-    """Return the match without its agent if a different log fits the clock of this agent better."""
+    """Return the match. Remove its agent if a different log fits the clock of this agent better."""
     if match.agent_id is None or match.clock_ahead_s is None:
         return match
     later_s = nearest[match.agent_id] - match.clock_ahead_s
@@ -174,8 +174,8 @@ def _vote(positions: Sequence[Position], fixes: Fixes) -> _ClockDifference | Non
 
 
 def _visits(near: list[tuple[int, Position]], fix: LoggedPosition) -> Iterator[int]:
-    """Yield the time of each short visit of the vehicle at a place. During a visit, the vehicle is within MAX_ASIDE_M
-    of the place.
+    """Yield the time of each short visit of the vehicle at a place. During a visit, the distance between vehicle and
+    place is at most MAX_ASIDE_M.
     """
     near.sort(key=lambda timed: timed[0])
     visit: list[tuple[int, Position]] = []

@@ -53,7 +53,7 @@ class BagTopics:
         self._waiting_bytes = 0
 
     def message(self, channel: Hashable, time_ns: int, data: bytes) -> Iterator[Item]:
-        """Yield the message. If the topic of its channel is still unknown, store it for later."""
+        """Yield the message. If the topic of its channel is still unknown, store the message for later."""
         if channel in self.known and channel not in self._waiting_channels:
             yield RawMessage(*self.known[channel], time_ns, data)
         elif self._waiting_bytes < MAX_CHUNK_BYTES:
@@ -80,8 +80,8 @@ _STEP_BYTES = 16 * 1024
 
 
 def decompress(compression: str, data: bytes, max_bytes: int = MAX_CHUNK_BYTES) -> tuple[bytes, str]:
-    """Decompress as much of the data as possible. Return the content, and the reason why it is incomplete. The reason
-    is "" if the content is complete.
+    """Decompress as much of the data as possible. Return the content, and the reason why the content is incomplete. The
+    reason is "" if the content is complete.
     """
     if compression in ("", "none"):
         return data, ""

@@ -21,7 +21,7 @@ _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
 _OPERATIONS = range(2, 8)
 _LONGEST_HEAD = 64 * 1024
 _HEAD_BEFORE = 300
-"""Maximum number of header bytes before the operation field of a record. Writers put other fields there."""
+"""Maximum number of header bytes before the operation field of a record. Writers put other fields before this field."""
 _OPERATION = re.compile(rb"\x04\0\0\0op=[\x02-\x07]")
 MAX_DEPTH = 2
 
