@@ -85,7 +85,7 @@ class ChildProcesses:
                 return
 
     def _kill(self, pid: int) -> None:
-        """Kill the process, unless its ID now belongs to a different process."""
+        """Kill the process, unless the kernel has given its ID to a different process."""
         with suppress(OSError):
             descriptor = os.pidfd_open(pid)
             try:

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 TICK_S = 0.05
 """Seconds of wall time between two checks of the clock."""
 CATCH_UP_S = 1.0
-"""Seconds of wall time by which a simulation may be late and still catch up. A simulation that is later continues from
-now on at the requested speed.
+"""Maximum lateness of a simulation, in seconds of wall time, that the simulation tries to make up. If it is later, it
+continues from the current time at the requested speed.
 """
 NEXT_RUN = math.inf
 """Length of a step that ends with the next handler run of any agent."""
@@ -34,7 +34,9 @@ class VirtualTimePace:
         self._now_s = 0.0
         self._limited = True
         self._anchor: tuple[float, float] | None = None
-        """Wall time and mission second at which the current factor began. If it is None, the next check sets it."""
+        """Wall time and mission second at which the current speed factor began. If the value is None, the next check
+        sets it.
+        """
         self._pace_changed = asyncio.Event()
 
     @property

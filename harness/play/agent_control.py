@@ -70,7 +70,7 @@ _SHELL_ERROR = re.compile(
 
 
 def last_line_in(log: Path) -> str:
-    """Return the last line of the file that contains text. Return an empty string if there is no such line."""
+    """Return the last line with text in the file. Return an empty string if the file has no such line."""
     try:
         with log.open("rb") as file:
             file.seek(max(0, log.stat().st_size - TAIL_BYTES))

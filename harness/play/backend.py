@@ -30,7 +30,9 @@ class Backend(ABC):
     """True if `harness.run.simulate` can play the same run in memory, for sweeps over thousands of runs."""
 
     not_in_uml: ClassVar[str | None] = None
-    """The reason why this backend cannot run inside User Mode Linux, with a solution. None if it can."""
+    """The reason why this backend cannot run inside User Mode Linux, with a solution. None if the backend can run
+    there.
+    """
 
     @abstractmethod
     def refuse(self, scenario: Scenario) -> None:
@@ -38,7 +40,7 @@ class Backend(ABC):
 
     def remark(self, scenario: Scenario) -> str | None:
         """Return a sentence about a part of the scenario that this backend plays differently from other backends.
-        Return None if it plays the whole scenario like other backends.
+        Return None if there is no such part.
         """
         return None
 

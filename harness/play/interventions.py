@@ -120,7 +120,7 @@ class Interventions(GrowingTimeline):
         """The event loop of the run. None before its start and after its end."""
         self._swarm: Swarm | None = None
         self._closed: str | None = "the mission has not started"
-        """Reason why the run does not accept requests of the user. None while the run accepts them."""
+        """Reason why the run does not accept requests of the user. None while the run accepts requests."""
         self._requests: deque[tuple[Entry, Future[float]]] = deque()
         self._request_arrived = asyncio.Event()
         self._by_hand: dict[float, TimelineEntry] = {}
@@ -140,9 +140,7 @@ class Interventions(GrowingTimeline):
     @property
     def prepares_all_agents(self) -> bool:
         """True if all agents are prepared for every event that the user may request. For example, each agent has a
-        disk, so that it can reboot.
-
-        It is false if the swarm has foreign agents, because these may not support a reboot.
+        disk, so that it can reboot. False if the swarm has foreign agents, because these may not support a reboot.
         """
         return not self._initial_scenario.foreign
 

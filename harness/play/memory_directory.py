@@ -27,9 +27,8 @@ _GUARD = 'trap "" HUP INT QUIT TERM; read _; rm -rf -- "$1"'
 
 @contextmanager
 def memory_directory(prefix: str) -> Iterator[Path]:
-    """Create a directory in memory for the context, and remove it at the end. Raises OSError.
-
-    Without `/dev/shm`, it is in the directory for temporary files.
+    """Create a directory in memory for the context, and remove it at the end. Raises OSError. If `/dev/shm` does not
+    exist, the directory is in the directory for temporary files.
     """
     remove_abandoned(prefix)
     unlocked = Path(tempfile.mkdtemp(prefix=f".{prefix}", dir=_place()))
@@ -49,7 +48,9 @@ def memory_directory(prefix: str) -> Iterator[Path]:
 
 
 def remove_abandoned(prefix: str) -> list[Path]:
-    """Remove the directories of this user with this prefix whose process was killed. Return their paths."""
+    """Remove the directories of this user with this prefix that belong to killed processes. Return the paths of these
+    directories.
+    """
     removed = []
     for directory in sorted(_place().glob(f"{prefix}*")):
         with suppress(OSError):  # in use, removed meanwhile, or of another user

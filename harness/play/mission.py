@@ -123,9 +123,7 @@ class Swarm(Protocol):
 
     async def hold(self, fate: Fate) -> int:
         """Hold back the messages that match `fate` and are sent at `fate.from_s` or later. Return the number of this
-        hold for `release`.
-
-        Raises ScenarioError if this backend cannot hold messages.
+        hold, for the method `release`. Raises ScenarioError if this backend cannot hold messages.
         """
 
     async def release(self, number: int, fate: Fate) -> None:
@@ -189,7 +187,9 @@ async def settle(swarm: Swarm, scenario: Scenario) -> None:
 
 
 async def reconcile_finally(swarm: Swarm, limit_s: float) -> None:
-    """Remove all network conditions. Then let each agent in turn reconcile, until a round changes no chain."""
+    """Remove all network conditions. Then let each agent in turn reconcile, and repeat this until no chain changes in a
+    round.
+    """
     await swarm.keep_chains()
     swarm.enter("final reconcile")
     began_s = swarm.now()

@@ -38,8 +38,8 @@ FINAL_ANSWERS_S = 0.1
 
 @asynccontextmanager
 async def serve_requests(interventions: Interventions, directory: Path) -> AsyncIterator[None]:
-    """Accept requests inside the context. Only the user who started the run may send them. Raises OSError if the socket
-    cannot be created.
+    """Accept requests inside the context. Only the user who started the run may send requests. Raises OSError if the
+    socket cannot be created.
     """
     connections: set[asyncio.Task[Any]] = set()
 
@@ -75,9 +75,8 @@ async def serve_requests(interventions: Interventions, directory: Path) -> Async
 
 
 async def ask_run(directory: Path, **request: Any) -> dict[str, Any]:
-    """Send a request to the active run, and return the answer.
-
-    Raises ScenarioError if the run refuses the request, and OSError if it does not answer.
+    """Send a request to the active run, and return the answer. Raises ScenarioError if the run refuses the request, and
+    OSError if the run does not answer.
     """
     reader, writer = await connect(directory / SOCKET)
     try:

@@ -21,7 +21,9 @@ from harness.scenario import Scenario
 MEGABYTE = 1_000_000
 SHARE_OF_FREE_SPACE = 0.5
 LEAST_BYTES_PER_AGENT = 8 * MEGABYTE
-"""Minimum quota of an agent. The limit also applies to its export and its store, which are much smaller."""
+"""Minimum quota of an agent's files in bytes. The quota also includes the export and the store, which are much smaller
+than the trace.
+"""
 MEAN_S = 30.0
 MESSAGES_PER_MINUTE = ((2, 4), (5, 38), (10, 229), (15, 885), (20, 2010), (30, 6050), (50, 25_500), (100, 90_700))
 """Messages per minute for some numbers of agents, if each agent logs an event every 30 s (docs/appendix/growth.md)."""

@@ -175,7 +175,7 @@ class NumberedHandler(Protocol):
 @contextmanager
 def replaced(tables: list[MutableMapping[Any, Any]], new: Mapping[int, Callable[[Any], Any]]) -> Iterator[None]:
     """Replace the handlers of these algorithms in all tables inside the context. Each function in `new` receives the
-    original handler and returns the replacement.
+    original handler and returns its replacement.
     """
     before = [dict(table) for table in tables]
     made: dict[int, Any] = {}

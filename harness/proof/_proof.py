@@ -57,7 +57,8 @@ OF_OTHERS = {
 }
 """Properties that an attacker with captured keys must not be able to violate."""
 RUN_LOOKED_FOR_S = 60.0
-"""Maximum number of seconds to search for a run of the whole swarm that shows the violation found in a single agent."""
+"""Maximum number of seconds of the search for a run of the whole swarm that shows a violation found in a single agent.
+"""
 PLAYED = {
     "honest": "4",
     "name": "1",
@@ -110,7 +111,9 @@ class Proof:
     whole_ended: Ended = "complete"
     example: ViolationExample | None = None
     fork: ViolationExample | None = None
-    """The nearest idle state with several chains. It violates no property, and does not change until an agent votes."""
+    """The nearest state in which all agents are idle and their chains differ. This state violates no property, and it
+    does not change until an agent starts a vote.
+    """
     reluctant: ViolationExample | None = None
     """The nearest state that needs more than one further vote until all chains are equal. None if no such state is
     known.
@@ -118,7 +121,7 @@ class Proof:
     forms: list[str] = field(default_factory=list)
     """The forms of all livelocks. Each is described by the timers of its states."""
     livelocks: list[Livelock] = field(default_factory=list)
-    """One livelock of each form, played as a run. The exploration that found them may be incomplete."""
+    """One livelock of each form, played as a run. The exploration that found the livelocks may be incomplete."""
     way: list[str] = field(default_factory=list)
     shown: dict[str, ViolationExample | None] = field(default_factory=dict)
     """Characteristic in `OF_CAPTORS` -> the nearest violation that an attacker can cause. None with the network

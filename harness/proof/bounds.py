@@ -149,9 +149,8 @@ class Bounds:
 
     @property
     def nameless(self) -> bool:
-        """True if states are stored without agent IDs. Each agent then counts itself as agent 1.
-
-        It is false with a captured agent and with the network `any`, because messages then depend on the sender's ID.
+        """True if states are stored without agent IDs. Each agent then counts itself as agent 1. False with a captured
+        agent and with the network `any`, because messages then depend on the sender's ID.
         """
         return self.reduced and self.captured is None and self.network != "any"
 

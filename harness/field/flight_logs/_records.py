@@ -27,9 +27,10 @@ class ModeChange(NamedTuple):
     utc_us: int | None
     number: int
     name: str
-    """The name of the mode, or its number if it has no known name."""
+    """The name of the flight mode, or its number if the mode has no known name."""
     failsafe: str | None = None
-    """The failsafe that caused the change of mode, such as "battery failsafe". Only DataFlash logs contain it."""
+    """The failsafe that caused the change of mode, such as "battery failsafe". Only DataFlash logs contain this cause.
+    """
 
 
 class ArmingChange(NamedTuple):
@@ -85,11 +86,12 @@ class GpsTime(NamedTuple):
 
     at_us: int
     utc_us: int
-    """UTC according to this record alone. The `utc_us` of other records comes from the median of many such records."""
+    """UTC according to this record alone. All other records get `utc_us` from the median of many records of this type.
+    """
     week: int
     week_ms: int
     leap_seconds: int
-    """GPS time minus UTC at this time. It comes from a table, because logs do not contain it."""
+    """GPS time minus UTC at this time, in seconds. The value comes from a table, because logs do not contain it."""
 
 
 class RadioStatus(NamedTuple):
@@ -171,8 +173,8 @@ class FlightLog:
     path: Path
     kind: LogKind
     vehicles: list[VehicleLog]
-    """The vehicles in the log. A DataFlash log has one. A telemetry log has one or more, in the order of their system
-    IDs.
+    """The vehicles in the log. A DataFlash log has one vehicle. A telemetry log has one or more vehicles, in the order
+    of their system IDs.
     """
     radio: list[RadioStatus]
     """The states of the radio at the autopilot (DataFlash), or at the recording computer (telemetry)."""

@@ -52,9 +52,8 @@ def split_into_flights(
 
 
 def _quality(incarnation: TraceIncarnation) -> tuple[bool, int, int]:
-    """Return a sort key that puts the best copy of a trace first.
-
-    Copies without clock jumps are best, then longer ones, then those with fewer gaps.
+    """Return a sort key that puts the best copy of a trace first. Copies without clock jumps come first, then longer
+    copies, then copies with fewer gaps.
     """
     return not incarnation.jumps, len(incarnation.runs), -len(incarnation.gaps)
 

@@ -1,5 +1,5 @@
-"""Find the mission of a packet capture, and the flight of a file with public keys. The files themselves do not name
-them.
+"""Find the mission of a packet capture, and the flight of a file with public keys. The files themselves name neither
+mission nor flight.
 """
 
 import base64

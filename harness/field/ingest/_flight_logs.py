@@ -14,8 +14,8 @@ from ucp.telemetry import Position, position_of
 def assign_flight_logs(
     flights: Sequence[Flight], logs: Iterable[FlightLog], left_out: list[UnusedPart], remarks: list[FileRemark]
 ) -> None:
-    """Assign each flight log to the first flight in which an agent flew on its vehicle. Logs of unknown vehicles are
-    left out.
+    """Assign each flight log to the first flight in which an agent flew on the vehicle of the log. Omit the logs of
+    unknown vehicles.
     """
     fixes = [_logged_positions(flight) for flight in flights] if logs else []
     for log in logs:

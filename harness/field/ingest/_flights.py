@@ -261,8 +261,8 @@ MAX_DRIFT = 0.05
 
 
 def _drift(incarnation: TraceIncarnation) -> float:
-    """Return the drift of an agent's clock. It is computed from the timer that expired earliest in proportion to its
-    duration. Without timers, it is 0.
+    """Return the drift of an agent's clock. The drift is computed from the timer that expired earliest in proportion to
+    its duration. Without timers, the drift is 0.
     """
     started: dict[str, tuple[float, float]] = {}
     drifts = []
@@ -327,8 +327,8 @@ def _inception(records: _FlightRecords) -> str:
 
 
 def _inception_chain_hash(records: _FlightRecords) -> str | None:
-    """Return the chain hash CH_0 (eq. 3.4) of the mission, which is the same for all its flights. Return None if it is
-    unknown.
+    """Return the inception chain hash CH_0 (eq. 3.4) of the mission, which is the same for all flights of the mission.
+    Return None if it is unknown.
     """
     data = _decoded(records.mission.initial_data)
     return None if data is None else InceptionBlock(data).chain_hash.hex()

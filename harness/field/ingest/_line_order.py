@@ -16,8 +16,8 @@ MAX_REPEATED = 10_000
 
 @dataclass(frozen=True, slots=True)
 class ReorderedPart:
-    """A part of a trace that was repaired. `first` and `last` are its positions before the repair. `why` is the reason
-    for the repair.
+    """A part of a trace that was repaired. `first` and `last` are the positions of the part before the repair. `why` is
+    the reason for the repair.
     """
 
     first: int

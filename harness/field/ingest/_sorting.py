@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MAX_DOCUMENTS = 1000
 """Maximum number of chain exports in one file."""
 MAX_LISTED_ALIKE = 3
-"""Maximum number of omitted files of one directory that are listed with the same reason."""
+"""Maximum number of omitted files of one directory that are listed separately if they have the same reason."""
 _BAGS = (b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd")
 _ARCHIVES = (b"PK\x03\x04", b"7z\xbc\xaf", b"\xfd7zXZ", b"BZh", b"Rar!")
 _BLANK = " \t\r\n\0\ufeff"

@@ -37,7 +37,7 @@ MAX_BYTES_BEFORE_TRACE, MAX_LINES_BEFORE_TRACE = 8 * 1024 * 1024, 100_000
 trace.
 """
 ROUNDING_S = 2e-3
-"""Maximum number of seconds by which a line may be earlier than the line before it. Times may be rounded to
+"""Maximum number of seconds by which a line may be earlier than the previous line. Times may be rounded to
 milliseconds.
 """
 FAR_AHEAD_S = 3600.0
@@ -57,7 +57,7 @@ class TraceIncarnation:
     header: TraceHeader | None
     first_line: int
     agent: int | None = None
-    """The agent ID, if it follows from the source of the lines. None otherwise."""
+    """The agent ID, if the source of the lines determines it. None otherwise."""
     counts: str = "line"
     """The unit of line numbers, such as "line" or "message"."""
     runs: list[HandlerRun] = field(default_factory=list)

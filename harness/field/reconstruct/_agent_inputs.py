@@ -17,7 +17,7 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 
 
 class UnusableInputError(Exception):
-    """An error: an input is not on record, or it is impossible. The message is one sentence."""
+    """An error: an input is not recorded, or it is impossible. The message is one sentence."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,7 +54,7 @@ class KnownState:
 
 class InferredInputPath:
     """The guessed inputs that lead an agent to a known state. The inputs are computed one at a time. `reached` is true
-    when the agent has reached the state.
+    as soon as the agent has reached the state.
     """
 
     def __init__(self, agent: Agent, known: KnownState) -> None:
@@ -111,7 +111,7 @@ class InferredInputPath:
 
     def _log(self, event_data: bytes) -> Cause | None:
         """Return the next event that the block under construction lacks. Return None if the block lacks no event, or if
-        its events differ from the known events.
+        its events differ from the known events of this block.
         """
         logged = bytes(self._agent.state.current_block)
         if not event_data.startswith(logged):

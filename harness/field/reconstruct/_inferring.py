@@ -172,8 +172,8 @@ def _infer_incarnation(
     tries: int,
     start_s: float = 0.0,
 ) -> "_InputSequence":
-    """Try different orders of the inputs. Return an order that explains all sent datagrams. If none does, return the
-    one that explains the longest sequence of inputs.
+    """Try different orders of the inputs. Return an order that explains all sent datagrams. Without such an order,
+    return the order that explains the longest sequence of inputs.
     """
     deferred: dict[int, int] = {}
     pauses: list[Pause] = []
@@ -230,8 +230,8 @@ class _InputSequence:
         self._header = header
         self._agent = _agent(header)
         self.pause: Pause | None = None
-        """A pause of the process that this order implies: the agent had a message to send, but sent nothing for a long
-        time.
+        """A pause of the process that this order of inputs implies: the agent had a message to send, but sent no
+        message for a long time.
         """
         self._pauses = pauses
         self._inputs_to_play: list[tuple[float, Cause]] = [
@@ -281,10 +281,9 @@ class _InputSequence:
             self._fail(self._sent[self._explained])
 
     def _end_of_pause(self, at_s: float, after_s: float = 0.0) -> float:
-        """Return the time at which the agent handles an input that arrives at `at_s`. If the agent was paused then,
-        this is the end of the pause.
-
-        After a pause, the process first reads its socket, then it handles timers, then events.
+        """Return the time at which the agent handles an input that arrives at `at_s`. If the agent was paused at this
+        time, it handles the input at the end of the pause. After a pause, the process first reads its socket, then
+        handles timers, then events.
         """
         return next((until_s + after_s for from_s, until_s in self._pauses if from_s <= at_s < until_s), at_s)
 

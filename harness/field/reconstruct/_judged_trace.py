@@ -30,7 +30,8 @@ class JudgedTrace:
         record = RecordedTrace(Path(f"agent {agent_id}"), "", trace, IngestedRecords(flight), [])
         player = RecordPlayer(record)
         self._known: dict[int, KnownState] = {}
-        """Handler run after which the state is known again -> this state. The key is the `id` of the handler run."""
+        """Handler run after which the state is known again -> the known state. The key is the `id` of the handler run.
+        """
         self._played: set[int] = set()
         """The `id` of each handler run that the reference could play."""
         self._names = ReplayNames(record)

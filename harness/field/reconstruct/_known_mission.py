@@ -25,7 +25,7 @@ from ucp.messages import BlockAddResponse, decode
 from ucp.settings import CHOICES
 
 TRIES = 10
-"""Maximum number of input orders that are tried for one agent and one combination of settings."""
+"""Maximum number of input orders that are tried for one agent with one combination of settings."""
 
 
 def likely_settings(

@@ -114,7 +114,7 @@ class OtherRecords:
         return events
 
     def _open(self, block: Block) -> bytes:
-        """Decrypt the event data of a block if the depot's key is given. Otherwise return them unchanged."""
+        """Decrypt the event data of a block if the depot's key is given. Otherwise return the event data unchanged."""
         if self._depot is None:
             return block.event_data
         from ucp.secure.sealing import NotOpenedError
@@ -128,8 +128,8 @@ class OtherRecords:
 
     @property
     def _reason_unreadable(self) -> str:
-        """The reason why event data cannot be divided into events, as the end of a sentence. Empty if they are not
-        encrypted.
+        """The reason why event data cannot be divided into events, as the end of a sentence. Empty if the event data
+        are not encrypted.
         """
         exports = self._exports.values()
         if not any(sealed_to(base64.b64decode(export.inception.block_data)) for export in exports):

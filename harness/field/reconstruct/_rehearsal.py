@@ -97,7 +97,7 @@ class SoloSimulation:
     chain: list[str] = field(default_factory=list)
     running_at_end: list[list[TimerStart]] = field(default_factory=list)
     truncated: bool = False
-    """True if the record ends before all effects of its last input. This input is simulated completely."""
+    """True if the record ends before all effects of its last input. The simulation completes this input."""
     matches_exactly: bool = True
     """True if branches and tallies also equal the recorded ones."""
     ignored: list[RecordedInput] = field(default_factory=list)
@@ -105,7 +105,9 @@ class SoloSimulation:
     inferred: int = 0
     """Number of guessed inputs that replace lost lines."""
     stopped: str | None = None
-    """The reason why lines were lost, if the simulation could not reach the state after them. It ends at this place."""
+    """The reason why lines were lost, if the simulation could not reach the state after these lines. The simulation
+    ends at this place.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +250,7 @@ class _IncarnationSimulation:
 
     def _sent(self, recorded_input: RecordedInput) -> list[bytes]:
         """Return the datagrams that the agent sent according to the record. If the record does not contain them, return
-        those of the simulated agent.
+        the datagrams of the simulated agent.
         """
         encoded = [encode(self.agent.agent_id, *numbered) for numbered in self.agent.messages_to_send()]
         recorded = [sent.datagram for run in recorded_input.runs for sent in run.sent]

@@ -25,8 +25,8 @@ MIN_GAP_S = 2e-5
 DIGITS = 6
 MILLION = 10.0**DIGITS
 MAX_WAIT_S = 86400.0
-"""Maximum mission second of the first input. If it is later, the clocks do not start at the beginning of the
-mission.
+"""Maximum mission second of the first input. If the first input is later, the clocks do not start at the beginning of
+the mission.
 """
 MAX_CLOCK_ERROR_S = 1.0
 """Maximum number of seconds by which a datagram may seem to be sent after its arrival. The limit is used to select one
@@ -110,10 +110,9 @@ def timetable(rehearsals: Mapping[int, SoloSimulation], ahead_s: Mapping[int, fl
 
 
 def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSimulation]) -> dict[int, ClockLine]:
-    """Choose mission second 0. Return the clocks of all agents relative to it.
-
-    Mission second 0 is the time at which the first clock shows 0. If the first input is earlier or much later, mission
-    second 0 is directly before this input.
+    """Choose mission second 0, and return the clocks of all agents relative to it. Usually, mission second 0 is the
+    time at which the first clock shows 0. If the first input is earlier or much later, mission second 0 is directly
+    before this input.
     """
     played = {agent: rehearsal.played[0] for agent, rehearsal in rehearsals.items() if rehearsal.played}
     first = min((clocks[agent].at(of_agent.input.at_s) for agent, of_agent in played.items()), default=0.0)
@@ -134,7 +133,7 @@ class _DatagramsBySender:
         self._rehearsals = rehearsals
         self.sent: dict[int, list[bytes]] = {agent: [] for agent in rehearsals}
         self._sent_by: dict[int, list[int]] = {agent: [] for agent in rehearsals}
-        """Sender -> for each of its datagrams, the position of the input that caused it."""
+        """Sender -> for each datagram of the sender, the position of the input that caused the datagram."""
         self._numbers: dict[bytes, list[tuple[int, int]]] = defaultdict(list)
         for agent, rehearsal in rehearsals.items():
             for place, played in enumerate(rehearsal.played):
@@ -198,8 +197,8 @@ class _TimetablePlanner:
         return self._table
 
     def _queue(self, agent: int) -> None:
-        """Find the next input of the agent that needs a time. The input is ready, or waits until another agent has sent
-        a message.
+        """Find the next input of the agent that needs a time. The input is ready, or it waits for a message that
+        another agent has not sent yet.
         """
         played = self._played[agent]
         place = self._next[agent]
@@ -295,7 +294,7 @@ class _TimetablePlanner:
         return expiry_local, self._table.clocks[agent].at(expiry_local)
 
     def _keep_running(self, agent: int, timer: TimerStart, until_s: float) -> None:
-        """Delay the timer so that it still runs at `until_s`."""
+        """Delay the expiry of the timer, so that the timer still runs at `until_s`."""
         _, expiry_s = self._expiry(agent, timer)
         if expiry_s < until_s + MIN_GAP_S:
             self._delay(agent, timer, _rounded_up(until_s + 2 * MIN_GAP_S - expiry_s))

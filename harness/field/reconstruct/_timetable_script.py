@@ -74,8 +74,8 @@ def _all_incarnations(known: Sequence[IncarnationTimes], count: int) -> list[Inc
 
 
 def _start_times(incarnations: Sequence[IncarnationTimes]) -> list[float]:
-    """Return the start times of an agent's incarnations. The first incarnation starts at 0. Later ones start at the
-    recorded restart, or just before their first reception.
+    """Return the start times of an agent's incarnations. The first incarnation starts at 0. Later incarnations start at
+    the recorded restart, or just before their first reception.
     """
     start_times = [0.0]
     for before, incarnation in pairwise(incarnations):

@@ -35,7 +35,7 @@ SEED = 1
 @dataclass(frozen=True)
 class AgentOutcome:
     """The result for one agent: the number of blocks in its simulated chain. `why` is the reason why this chain differs
-    from the recorded one. It is None if both are equal.
+    from the recorded chain, or None if both chains are equal.
     """
 
     agent_id: int

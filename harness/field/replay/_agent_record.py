@@ -75,8 +75,8 @@ class RecordedTrace:
         self.agent_id = trace.header.agent_id
         self.incarnations = len(trace.starts) + 1
         self.doubts: dict[int, str] | None = None
-        """Position -> the damage to a single line that explains a deviation there. None until such explanations were
-        searched.
+        """Position of a deviation -> the damage to a single line that explains the deviation. None until such
+        explanations were searched.
         """
         if not trace.header.has_inputs:
             raise FieldError(
@@ -144,7 +144,8 @@ class RecordedTrace:
         return found
 
     def sent_by_others(self, kind: str) -> Iterable[tuple[int, Message]]:
-        """Return the recorded messages of this type from other agents, with their senders. Equal ones occur once."""
+        """Return the recorded messages of this type from other agents, with their senders. Equal messages occur once.
+        """
         return self._sent_by_others.get(kind, ())
 
     @cached_property
@@ -159,9 +160,8 @@ class RecordedTrace:
         return {kind: [*messages] for kind, messages in found.items()}
 
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
-        """Return false if the records prove that this message did not reach the agent before `at_s`.
-
-        A capture of the vehicle can prove this, and so can a complete trace of the sender.
+        """Return false if the records prove that this message did not reach the agent before `at_s`. A capture of the
+        vehicle, or a complete trace of the sender, can prove this.
         """
         if self.arrivals and self.arrivals[0].at_s < at_s < self.arrivals[-1].at_s:
             return any(
@@ -233,8 +233,8 @@ class RecordedTrace:
         return unfinished(follower, trace, others_until_s, self._coming() if flight.exports else None)
 
     def _coming(self) -> Iterator[MessageArrival]:
-        """Yield the messages that reached the vehicle of the agent. Without a capture, yield the messages that were
-        sent to the agent.
+        """Yield the messages that reached the vehicle of the agent. Without a capture, yield the messages that other
+        agents sent to the agent.
         """
         if self.arrivals is None:
             yield from sent_to(self.agent_id, self.flight.traces)

@@ -66,8 +66,8 @@ def ignored_messages(record: RecordedTrace, play_to: Callable[[int], PlayedAgent
 
 
 def _without_line(record: RecordedTrace) -> Iterator[tuple[int, CapturedDatagram]]:
-    """Yield the messages that arrived between two lines of an incarnation but have no line. Each has the position of
-    the next entry.
+    """Yield the messages that arrived between two lines of an incarnation but have no line in the trace. Yield each
+    message with the position of the next entry.
     """
     known = {(run.sender, run.sequence) for entry in record.entries if (run := _received(entry)) is not None}
     times = [entry.content.t for entry in record.entries]

@@ -20,8 +20,8 @@ from ucp.trigger import MessageTrigger
 NEAR_S = 2.0
 """Maximum number of mission seconds between the current moment and a shown step."""
 STEPS_SHOWN = 2
-"""Maximum number of steps shown before the current moment, and after it. Steps related to the current one are shown as
-well.
+"""Maximum number of steps shown before the current moment, and after it. Steps that are related to the current step are
+shown as well.
 """
 
 
@@ -125,8 +125,8 @@ class _OtherAgent:
                 yield shown(f"    has no line for {message.message[:60]} {message.seq}", style="yellow")
 
     def _nearest(self, numbers: list[int], at_s: float) -> list[tuple[int, HandlerRun]]:
-        """Return the handler run that is nearest in time to the current step. Several may match, because sequence
-        numbers repeat after restarts.
+        """Return the handler run that is nearest in time to the current step. Several handler runs may match, because
+        sequence numbers repeat after restarts.
         """
         runs = (self.runs[number] for number in numbers)
         return sorted(runs, key=lambda numbered: abs(self.clock.at(numbered[1].t) - at_s))[:1]

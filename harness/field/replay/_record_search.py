@@ -170,17 +170,16 @@ def _read(file: Path) -> Trace | None:
 
 
 def _directory_of(file: Path) -> Path:
-    """Return the directory of the run to which the file belongs. If it belongs to no run, return the directory of the
-    file.
+    """Return the directory of the run to which the file belongs. If the file belongs to no run, return the directory of
+    the file.
     """
     run_records = file.parent.parent
     return run_records if file.parent.name == AGENTS and (run_records / RUN_FILE).is_file() else file.parent
 
 
 def _files_in(directory: Path, agent_id: int | None) -> list[Path]:
-    """Return the traces of all agents or of one agent, if the file names identify these traces without doubt.
-
-    Otherwise return an empty result. All files must then be read, which takes longer.
+    """Return the traces of all agents or of one agent, if the file names identify these traces without doubt. Otherwise
+    return an empty result, and the caller must read all files, which takes longer.
     """
     agents = agents_directory(directory)
     if (directory / RUN_FILE).is_file():

@@ -115,8 +115,8 @@ class ResumptionSearch:
                 top = bytes.fromhex(run.state.top) if _is_hex(run.state.top) else None
 
     def _block_in_progress(self, position: int) -> bytes | None:
-        """Return the content of the block under construction after an entry. It is computed from the following events.
-        Return None if it is unknown.
+        """Return the content of the block under construction after an entry. The content is computed from the following
+        events. Return None if the content is unknown.
         """
         logged = bytearray()
         for _, run in self._following_runs(position):
@@ -130,8 +130,8 @@ class ResumptionSearch:
         return b""  # The block is never completed, so its content has no effect.
 
     def _sequence(self, position: int) -> int:
-        """Return the sequence number of the first message that the agent sends after an entry. Return 0 if it sends
-        none.
+        """Return the sequence number of the first message that the agent sends after an entry. Return 0 if the agent
+        sends no further message.
         """
         return next((run.sent[0].seq for _, run in self._following_runs(position) if run.sent), 0)
 
@@ -156,7 +156,7 @@ def _is_hex(text: str) -> bool:
 WITHIN = 200
 """Number of lines before and after an entry in which a clock change is searched."""
 MESSAGES = 3
-"""Number of messages with one other agent, before and after the entry, from which medians are computed."""
+"""Number of messages with one other agent, before and after an entry of the trace, that are used for medians."""
 MIN_SHIFT_S = 1.0
 """Minimum change of a clock in seconds that is detected."""
 

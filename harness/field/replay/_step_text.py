@@ -48,7 +48,7 @@ class StepText:
         return shown(f"{'✘' if differs else ' '}{where}{text}", style="red" if differs else "")
 
     def step(self) -> Iterator[Text]:
-        """Yield the lines about the last step: its trigger, the rule of its Algorithm, its effects and its
+        """Yield lines of text about the last step: its trigger, the rule of its Algorithm, its effects and its
         deviations.
         """
         player = self._player

@@ -94,8 +94,8 @@ def source_of(handler: str) -> str:
 
 
 def _decorators(handler: str) -> Iterator[str]:
-    """Yield the lines of the handler's source before `def`. A debugger does not stop there, because they run only when
-    the module is imported.
+    """Yield the source lines of the handler before `def`. A debugger does not stop in these lines, because they run
+    only when the module is imported.
     """
     lines, _ = inspect.getsourcelines(HANDLERS[handler].run)
     return takewhile(lambda line: not line.startswith("def "), lines)

@@ -66,8 +66,8 @@ def _up_to_loss(trace: Trace, doubtful: Mapping[int, str]) -> Trace:
 
 
 def _judge_steps(evidence: Evidence, results: Mapping[int, ReplayResult | str]) -> Judgement:
-    """Return the judgement on the results of all replays. A result that is a text is the reason why the trace of this
-    agent cannot be judged.
+    """Return the judgement on the results of all replays. If a result is a text, the text is the reason why the trace
+    of this agent cannot be judged.
     """
     deviations: list[StepDeviation] = []
     judged, unjudged, lost = 0, 0, list[str]()

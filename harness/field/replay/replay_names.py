@@ -77,8 +77,8 @@ class RecordedBlocks(BlockIndex):
                 self.add(block)
 
     def _sources(self) -> Iterator[Iterator[Block]]:
-        """Yield the blocks from the trace, from the exports, and from the traces of the flight, in this order. The
-        first source is the fastest.
+        """Yield the blocks from the trace of the agent, then from the exports, and then from the other traces of the
+        flight. The first source is the fastest.
         """
         yield _blocks_of(self._record.trace)
         yield self._of_exports()

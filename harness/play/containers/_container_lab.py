@@ -268,8 +268,8 @@ class ContainerLab:
         return name, created["Id"]
 
     def _kept(self, vehicle: int, role: str, directory: str | None) -> list[Mount]:
-        """Return the mounts of the directories into which the container may write: its own directory, and that of its
-        keys.
+        """Return the mounts of the directories into which the container may write: its own directory, and the directory
+        of its keys.
         """
         if directory is None:
             return []
@@ -331,7 +331,7 @@ class ContainerLab:
             raise error
 
     def _kill_processes(self) -> None:
-        """Kill all processes in the networks of the lab. This is used if Docker does not answer."""
+        """Kill all processes in the networks of the lab. The harness uses this function if Docker does not answer."""
         for process in Path("/proc").iterdir():
             if process.name.isdecimal():
                 with contextlib.suppress(OSError):

@@ -57,7 +57,9 @@ class ContainerImage:
         return {key: value for key, value in env.items() if self.mounted or os.environ.get(key) != value}
 
     def shared(self, argv: Sequence[str]) -> list[Path]:
-        """Return the paths on this machine that the container must share so that the command `argv` can start."""
+        """Return the paths on this machine that the container must share, so that the command `argv` can start in the
+        container.
+        """
         files = [Path(word) for word in self.command(argv) if Path(word).is_absolute() and Path(word).is_file()]
         return outermost([*self.mounted, *([] if self.foreign else map(_with_environment, files))])
 
@@ -90,7 +92,7 @@ def is_shared(program: Path) -> bool:
 
 
 def named(engine: DockerEngine, name: str) -> ContainerImage:
-    """Return the image with this name. Raises DockerError if it is missing."""
+    """Return the image with this name. Raises DockerError if this machine does not have the image."""
     if not _exists(engine, name):
         raise DockerError(f"this machine has no image {name}: docker pull {name}, or build it")
     return ContainerImage(name, "python3", foreign=True)
@@ -165,7 +167,7 @@ def context() -> dict[str, bytes]:
 
 
 def _tar(files: Mapping[str, bytes]) -> bytes:
-    """Return a tar archive of the files. The same files always give the same archive."""
+    """Return a tar archive of the files. Equal files always give the same archive."""
     archive = io.BytesIO()
     with tarfile.open(fileobj=archive, mode="w") as tar:
         for name, content in files.items():

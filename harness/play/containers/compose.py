@@ -82,7 +82,7 @@ def write_compose(
 
 
 def _keys(scenario: Scenario) -> MissionKeys | None:
-    """Return the mission keys from the user's key directory. The key files stay there. Return None for a mission
+    """Return the mission keys from the user's key directory, without moving the key files. Return None for a mission
     without keys.
     """
     if scenario.security is None:

@@ -288,8 +288,8 @@ class RevocationAuthority:
         )
 
     def revoke(self, agent_id: int) -> bytes:
-        """Return a message body with a signed list of revoked agents that contains this agent. Sign a new list only if
-        the newest list lacks the agent.
+        """Return a message body with a signed list of revoked agents that contains this agent. If the newest list
+        already contains the agent, use this list. Otherwise sign a new list.
         """
         if self._last is None or agent_id not in self._last.revoked:
             assert self._private_key is not None, "was refused"

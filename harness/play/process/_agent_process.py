@@ -76,16 +76,18 @@ class _ProcessIncarnation:
     killed: bool = False
     """True if the incarnation ended by SIGKILL and its disk was not kept."""
     switched_off: bool = False
-    """True if the incarnation ended by SIGTERM. Its actions after the last status are known only from its files."""
+    """True if the incarnation ended by SIGTERM. After the last status, only the files of the incarnation show its
+    actions.
+    """
     reboot: bool = False
     """True if the incarnation started with the data on its disk."""
     completed_known: bool = False
-    """True if the blocks that this killed incarnation completed have been read from its trace."""
+    """True if the trace has shown which blocks this killed incarnation completed."""
     trace_bytes_copied: int = 0
     """Number of bytes of this incarnation's trace that were already appended to the trace of the first incarnation."""
 
     def handler_runs(self) -> HandlerRuns | None:
-        """Return the number of handler runs that the agent last reported, and the time of this report. Return None
+        """Return the number of handler runs in the last report of the agent, and the time of this report. Return None
         without a report.
         """
         if self.status is None:

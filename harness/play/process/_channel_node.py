@@ -135,8 +135,8 @@ class ChannelNode:
             channel.send(at_s, heard.vehicle, heard.frame, len(data), _sequence(data, heard.vehicle))
 
     def _deliver_to_all(self, relay: Relay, heard: ReceivedBroadcast) -> None:
-        """Deliver a broadcast of the rogue node (a sender outside the swarm) immediately. This broadcast does not
-        occupy the channel.
+        """Deliver a broadcast of the rogue node (a sender outside the swarm) immediately to all vehicles. This
+        broadcast does not occupy the channel.
         """
         for vehicle in self._roster:
             relay.deliver(vehicle, heard.frame)
@@ -249,10 +249,10 @@ class AnswerTimeMeter:
     def __init__(self) -> None:
         self._all = array("f")
         self._question: dict[bytes, int] = {}
-        """Frame of a query -> type code of its answers. Only the latest queries are kept."""
+        """Frame of a query -> type code of the answers to the query. Only the latest queries are kept."""
         self._asked_s: dict[tuple[int, int], float] = {}
-        """(Vehicle, type code of an answer) -> the time at which the vehicle received the latest query for such an
-        answer.
+        """(Vehicle, type code of an answer) -> the time at which the vehicle received the latest query that asks for
+        such an answer.
         """
 
     def sent(self, heard: ReceivedBroadcast, data: bytes, at_s: float) -> None:

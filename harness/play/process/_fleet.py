@@ -126,7 +126,7 @@ class Fleet:
         await self._vehicles[vehicle_id].kill()
 
     async def replace(self, vehicle_id: int, lab: MissionLab, incarnation: int) -> None:
-        """Kill the program of a vehicle, and start a new one with the same flight. In a run without vehicles, do
+        """Kill the program of a vehicle, and start a new program with the same flight. In a run without vehicles, do
         nothing.
         """
         if not self._vehicles:

@@ -368,7 +368,7 @@ class ProgramRun:
         return AgentProcess(agent_id, self.rundir, command, self.clock.now, controlled=controlled)
 
     async def _cut_off(self) -> None:
-        """Cut off the vehicles whose connections are lost, and connect those that are back."""
+        """Cut off the vehicles whose connections are lost, and connect the vehicles whose connections are back."""
         await self._apply_conditions(self._reach.cut_off(self.clock.now(), self._remote.cut_off))
 
     def _without_rogue(self, applied: AppliedConditions) -> dict[str, Any]:

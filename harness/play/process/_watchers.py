@@ -24,8 +24,8 @@ class MissionTasks:
 
     @asynccontextmanager
     async def guard(self, *watched: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
-        """Run the mission in this context, together with the tasks in `watched`. If one of these tasks fails, raise its
-        error.
+        """Run the mission in this context, together with the tasks in `watched`. If one of these tasks fails, raise the
+        error of the task.
         """
         try:
             async with self._group:
@@ -73,8 +73,8 @@ async def open_unless_interrupted(opening: Awaitable[T], interrupted: asyncio.Ev
 
 
 def _root_error(errors: BaseExceptionGroup[BaseException]) -> BaseException:
-    """Return the error that probably caused the other errors. This is the failure of an agent if there is one, and
-    otherwise a HarnessError.
+    """Return the error that probably caused the other errors. If an agent failed, return its failure. Otherwise return
+    a HarnessError.
     """
     flat: list[BaseException] = []
     for error in errors.exceptions:

@@ -10,7 +10,8 @@ from harness.play.remote._wire import Channel, Kind, Message, WireError
 
 
 class Connection(asyncio.Protocol):
-    """One TCP connection between a stand-in and a far end. `lost` is called when it has ended."""
+    """One TCP connection between a stand-in and a far end. The function `lost` is called when the connection has ended.
+    """
 
     def __init__(self, channel: Channel, receive: Callable[[Message], None], lost: Callable[[Connection], None]):
         self._channel, self._receive, self._lost = channel, receive, lost
@@ -37,7 +38,7 @@ class Connection(asyncio.Protocol):
         self.send_together([(kind, payload)])
 
     def send_together(self, messages: Iterable[tuple[Kind, bytes]]) -> None:
-        """Send messages at once, so that the other end wakes once for all of them."""
+        """Send messages at once, so that the other end of the connection wakes up only once for all of them."""
         if self._transport is not None:
             self._transport.write(b"".join(self._channel.encode(kind, payload) for kind, payload in messages))
 

@@ -33,7 +33,9 @@ _TAG_BYTES = 32
 
 
 class HandshakeError(Exception):
-    """An error: the other end has another secret or protocol. The message is one sentence without a subject."""
+    """An error: the other end of a connection has another secret or protocol. The message is one sentence without a
+    subject.
+    """
 
 
 class RefusedError(Exception):
@@ -102,7 +104,9 @@ async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, A
 
 
 def _mac(secret: bytes, *parts: bytes) -> bytes:
-    """Return the tag of these parts. Each part has its length in front, so that parts cannot be moved."""
+    """Return the authentication tag of these parts. Each part is preceded by its length, so that an attacker cannot
+    move bytes between parts.
+    """
     return hmac.digest(secret, b"".join(struct.pack("!I", len(part)) + part for part in parts), "sha256")
 
 

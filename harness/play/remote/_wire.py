@@ -29,7 +29,7 @@ _NUMBER = struct.Struct("!Q")
 
 
 class WireError(Exception):
-    """An error: the other end sent a message that is not authentic, or not a message. The text is one sentence."""
+    """An error: the other end sent data that are not authentic, or not a message. The text is one sentence."""
 
 
 class Kind(IntEnum):
@@ -112,7 +112,8 @@ class Channel:
         return messages
 
     def to_json(self) -> dict[str, Any]:
-        """Return the state, so that another process can continue. No message may be incomplete."""
+        """Return the state of the channel, so that another process can continue with it. No message may be incomplete.
+        """
         assert not self._unread, "a message is incomplete"
         return {
             "send_key": self._send_key.hex(),
@@ -177,18 +178,16 @@ def short_name(path: Path) -> Iterator[str]:
 
 
 def hand_over(inside: socket.socket, connection: socket.socket, state: dict[str, Any]) -> None:
-    """Send a connected socket and the state of its channel to the process inside the network, and close the socket.
-
-    Raises OSError.
+    """Send a connected socket and the state of its channel to the process inside the private network, and close the
+    socket. Raises OSError.
     """
     with connection:
         socket.send_fds(inside, [json.dumps(state).encode()], [connection.fileno()])
 
 
 def take_over(outside: socket.socket) -> tuple[socket.socket, dict[str, Any]] | None:
-    """Return a connected socket and its state, from the process outside. Return None at the end of that process.
-
-    Raises BlockingIOError if nothing arrived.
+    """Return a connected socket and its state, which the process outside has sent. Return None if that process has
+    ended. Raises BlockingIOError if no socket has arrived.
     """
     data, descriptors, _, _ = socket.recv_fds(outside, HANDED_OVER_BYTES, 1)
     if not data:

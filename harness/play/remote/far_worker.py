@@ -63,7 +63,9 @@ class FileTail:
         self._file: Any = None
 
     def read(self) -> bytes:
-        """Return the bytes after the position. They are empty if there are none, or no file yet."""
+        """Return the bytes after this position in the file. The result is empty if there are no such bytes, or if the
+        file does not exist yet.
+        """
         if self._file is None:
             try:
                 self._file = open_plain_file(self._path)
@@ -85,7 +87,9 @@ class FarWorker:
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
         self._in_step = False
-        """The stand-in and this program agree on the positions in the agent's files, so more can be sent."""
+        """True if the stand-in and this program agree on the positions in the agent's files, so that this program can
+        send more bytes.
+        """
         self._pinged_s = self._loop.time()
         self._frames = 0
         """Number of datagrams that the agent has sent, whether or not they left this computer."""
@@ -106,7 +110,7 @@ class FarWorker:
         """How the agent ended."""
 
     async def run(self) -> None:
-        """Run until the incarnation is over. At the end of this process, the kernel ends the agent."""
+        """Run until the incarnation has ended. When this process ends, the kernel ends the agent."""
         self._loop.add_reader(self._outside, self._take_over)
         await self._over.wait()
 
@@ -315,7 +319,7 @@ class FarWorker:
     # Datagrams and files
 
     def _leave(self) -> None:
-        """Send the datagrams that the agent broadcast. Its trace has their lines already."""
+        """Send the datagrams that the agent broadcast. The trace of the agent already contains their lines."""
         assert self._network is not None
         datagrams: list[bytes] = []
         with contextlib.suppress(OSError):  # no frame is left
@@ -385,7 +389,7 @@ def _limit_files(most_bytes: int) -> None:
 
 
 def _other_processes(own: set[int]) -> list[str]:
-    """Return the names of the processes in this network, except for those in `own`."""
+    """Return the names of the processes in this network, except the processes in `own`."""
     names = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) not in own:

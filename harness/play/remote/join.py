@@ -67,7 +67,7 @@ class JoinRequest:
 
 @dataclass(frozen=True)
 class _Connected:
-    """A connection whose other end knows the secret."""
+    """A connection whose other end has proved that it knows the secret."""
 
     connection: socket.socket
     channel: Channel
@@ -98,9 +98,8 @@ class _RunOverError(Exception):
 
 
 def join(request: JoinRequest, say: Callable[[str], None]) -> None:
-    """Play incarnations of the agent until the run is over, or for ever as a service.
-
-    Raises MachineError without private networks, and JoinError if no harness listens or if it refuses the agent.
+    """Play incarnations of the agent until the run has ended, or without end as a service. Raises MachineError without
+    private networks. Raises JoinError if no harness listens, or if the harness refuses the agent.
     """
     try:
         first_process = far_network.first_process([sys.executable, "-P", "-m", "harness.play.remote.far_worker"])
@@ -111,9 +110,8 @@ def join(request: JoinRequest, say: Callable[[str], None]) -> None:
 
 @contextmanager
 def _directory() -> Iterator[Path]:
-    """Provide a directory for the agent's files. Remove it afterwards, and remove those of killed processes.
-
-    A lock shows that the process of a directory still runs. A new directory has no lock for a moment.
+    """Create a directory for the agent's files, and remove it afterwards. Also remove the directories of killed
+    processes. A lock shows that the process of a directory still runs. A new directory has no lock for a moment.
     """
     for path in Path(tempfile.gettempdir()).glob(f"{DIRECTORY}*"):
         with contextlib.suppress(OSError):  # of another user, or in use
@@ -208,7 +206,9 @@ class _Joining:
             self._say(sentence)
 
     async def _play_incarnation(self, connected: _Connected, directory: Path) -> None:
-        """Run a worker with this connection until it ends, and give it another connection when it asks for one."""
+        """Run a worker with this connection until the worker ends. If the worker asks for another connection, provide
+        one.
+        """
         own_end, inside = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with own_end:
             own_end.setblocking(False)
@@ -242,7 +242,7 @@ class _Joining:
         )
 
     async def _asks(self, own_end: socket.socket, ended: asyncio.Task[int]) -> bool:
-        """Wait until the worker asks for a connection, or ends. Return true if it asks."""
+        """Wait until the worker asks for a connection, or ends. Return true if the worker asks for a connection."""
         asking = asyncio.create_task(asyncio.get_running_loop().sock_recv(own_end, 16))
         await asyncio.wait({asking, ended}, return_when=asyncio.FIRST_COMPLETED)
         if not asking.done():

@@ -19,7 +19,9 @@ class SecretError(HarnessError):
 
 
 def create_secret(path: Path) -> None:
-    """Create a file with a new secret. Raises SecretError if it exists, and MachineError if it cannot be written."""
+    """Create a file with a new secret. Raises SecretError if the file exists, and MachineError if the file cannot be
+    written.
+    """
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError:

@@ -430,7 +430,9 @@ class StandIn:
             self._send_signal(number)
 
     def _pause(self) -> None:
-        """Suspend the agent. Datagrams wait in the socket of this program, as they would in the agent's socket."""
+        """Suspend the agent. During the pause, datagrams wait in the socket of this program, as they would wait in the
+        agent's socket.
+        """
         self._paused = True
         if self._udp is not None:
             self._loop.remove_reader(self._udp)

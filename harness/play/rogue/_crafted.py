@@ -33,9 +33,8 @@ def forged_commit(block: Block, chain_hash: bytes) -> CommitBlock:
 
 
 def random_message(name: str | None, roster: Sequence[int], timestamp_us: int, rng: Random) -> Packet:
-    """Return a valid message with random content. If `name` is None, the type of the message is random, too.
-
-    Its block is in a roster agent's name.
+    """Return a valid message with random content. If `name` is None, the type of the message is random, too. The block
+    in the message names an agent of the roster.
     """
 
     def block() -> Block:

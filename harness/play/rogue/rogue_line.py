@@ -5,7 +5,7 @@ from ucp.secure.envelope import CONTROL_NAMES, NAMES, read_clear_header
 from ucp.secure.envelope import VERSION as SECURED
 
 OF_NO_INJECTION = -1
-"""Number in the log for datagrams that belong to no injection of the rogue node, because the scenario contains the
+"""The number that stands in the log for datagrams that belong to no injection, because the scenario contains the
 datagram itself (`harness.scenario.injection`).
 """
 

@@ -39,8 +39,8 @@ def cached_crypto() -> CryptoFunctions:
 
 
 class RecordedSignatures:
-    """A record of all signatures made in this process. It replaces the computation when such a signature is
-    verified.
+    """A record of all signatures made in this process. To verify such a signature, the process only searches this
+    record.
     """
 
     def __init__(self) -> None:

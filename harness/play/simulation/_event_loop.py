@@ -121,7 +121,7 @@ class EventLoop:
         self._found: int | None = None
         """The ID of the agent that ran the handler for which the caller waits."""
         self._stopped_within_instant = False
-        """True if `run` stopped at the handler run for which the caller waits, and other inputs of the same moment may
+        """True if `run` stopped at the handler run for which the caller waits. Other inputs of the same moment may
         remain.
         """
         self._recent_runs: list[tuple[int, HandlerRun]] | None = None

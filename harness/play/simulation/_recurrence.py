@@ -65,7 +65,7 @@ class RecurrenceSearch:
     def _reset(self) -> None:
         self._steps: list[CycleStep] = []
         self._answered_by: dict[int, set[int]] = defaultdict(set)
-        """Agent in a reconcile -> the agents that have answered its queries since the kept state."""
+        """Agent in a reconcile -> the agents that have answered its queries since the stored state."""
         self._order_is_certain = True
         """False if two timers expire so close to each other that rounding may decide their order."""
         self._delays_matter = False

@@ -16,8 +16,7 @@ from ucp.store import StoredState
 from ucp.trace import Entry, RecordedBytes
 
 AgentOutput = tuple[int, Message | None, RecordedBytes | None]
-"""An output of an agent: (sequence number, message, datagram). The datagram is None if nothing has encoded it yet.
-
+"""An output of an agent: (sequence number, message, datagram). The datagram is None if the message is not encoded yet.
 An output that is not a message of the agent has only the datagram, with sequence 0 and no message.
 """
 
@@ -88,7 +87,7 @@ class VirtualAgent(Protocol):
     def stored(self, now: float) -> DiskContents: ...
 
     def end(self, now: float) -> None:
-        """End the agent. Its methods return the state at the time `now` afterwards."""
+        """End the agent. After this call, the methods return the state at the time `now`."""
 
 
 class OwnAgent(Agent):

@@ -126,7 +126,9 @@ class _BroadcastCopies:
 
 
 _UNKNOWN = _BroadcastCopies([])
-"""A placeholder for the copies of a message on a shared channel. The copies are known only at the end of its frame."""
+"""A placeholder for the copies of a message on a shared channel. The copies are unknown until the frame of the message
+ends.
+"""
 
 ScheduledInput = tuple[float, int, int, MessageInFlight | DueEvent | StrayDatagram | None]
 """A scheduled input: (mission second, rank, agent number, input). The input is a message, an event, or None for a timer
@@ -154,11 +156,13 @@ class VirtualAir:
         deliver_all: bool,
     ) -> None:
         self.busy_until = [0.0] * len(roster)
-        """Agent number -> earliest possible end of its current reconcile. Until then the agent answers no query."""
+        """Agent number -> earliest possible end of the agent's current reconcile. Until this time, the agent answers no
+        query.
+        """
         self.started_at = [0.0] * len(roster)
         """Agent number -> time of its start. The agent does not receive messages that were sent before this time."""
         self.paused_at: dict[int, float] = {}
-        """Number of a paused agent -> start of the pause. Its inputs wait until the end of the pause."""
+        """Number of a paused agent -> start of the pause. Inputs of the agent wait until the end of the pause."""
         self.open_queries: list[dict[QueryKind, _OpenQuery]] = [{} for _ in roster]
         """Agent number -> its open queries."""
         self._quiet_at = 0.0
@@ -178,9 +182,7 @@ class VirtualAir:
         self._waiting: dict[str, list[tuple[MessageInFlight, int]]] = defaultdict(list)
         self._arrived_at: dict[str, float] = {}
         self._held: dict[int, list[tuple[MessageInFlight, int, float]]] = defaultdict(list)
-        """Number of a hold -> held messages, each with its receiver and the arrival time that it would have without the
-        hold.
-        """
+        """Number of a hold -> the held messages, each with its receiver and its arrival time without the hold."""
 
     def deliver_everything(self) -> None:
         """Deliver all messages from now on, including those that cannot have an effect on their receiver."""
@@ -346,9 +348,8 @@ class VirtualAir:
 
     def take_answers(self, number: int) -> list[tuple[float, int, MessageInFlight]]:
         """Return the answers that the agent must count now, in order of arrival, each as (mission second, rank,
-        answer).
-
-        These answers have arrived since the agent's query. Only the first answer of each sender counts.
+        answer). These answers have arrived since the agent's query. Of several answers from one sender, only the first
+        counts.
         """
         new = []
         now, rank, _, _ = self.position
@@ -432,8 +433,8 @@ class VirtualAir:
     def _earliest(
         self, flights: Iterable[MessageInFlight], receiver: int, since: ScheduledInput
     ) -> tuple[float, int, MessageInFlight] | None:
-        """Return the first arrival of these messages after `since`, as (mission second, rank, message). Return None if
-        there is none.
+        """Return the first of these messages that arrives after `since`, as (mission second, rank, message). Return
+        None if no message arrives after `since`.
         """
         since_s, since_rank, _, _ = since
         started_at = self.started_at[receiver]
@@ -489,8 +490,8 @@ class VirtualAir:
         return True
 
     def release(self, number: int, at: float) -> None:
-        """End the hold with this number. Each held message arrives at the time `at`, or at its original arrival time if
-        that is later.
+        """End the hold with this number. Each held message arrives at the time `at`. If its original arrival time is
+        later, it arrives at that time.
         """
         for flight, receiver, would_arrive in self._held.pop(number, ()):
             self._schedule_arrival(flight, receiver, max(at, would_arrive))

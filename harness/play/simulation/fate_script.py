@@ -48,7 +48,9 @@ class DecidedDelivery:
     waiting: list[tuple[int, str]] = field(default_factory=list)
     """(receiver, name): the copy arrives after the message that the fate with this name matches."""
     held: list[tuple[int, int, float]] = field(default_factory=list)
-    """(number, receiver, time): the copy arrives at this time, or later at the end of the hold with this number."""
+    """(number, receiver, time): the copy arrives at this time. If the hold with this number ends later, the copy
+    arrives at the end of the hold.
+    """
     named: list[tuple[str, float]] = field(default_factory=list)
     """(name, time): the message that the fate with this name matches arrives at this time."""
 
@@ -61,7 +63,7 @@ class FateScript:
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf) -> None:
         self.listens = bool(fates)
-        """True if there are fates, so that `decide` must be called."""
+        """True if the scenario has fates. Only then must the caller call `decide`."""
         self.last_s: float | None = None
         """The time at which a fate last changed the delivery of a message."""
         self._parts = [_ScriptedFate(index, fate) for index, fate in enumerate(fates)]
@@ -171,7 +173,7 @@ class FateScript:
                 yield part
 
     def _count_match(self, part: _ScriptedFate) -> bool:
-        """Count a matching message. Return true if the rule applies to the message with this count."""
+        """Count a matching message. Return true if the rule applies to a message with this number."""
         part.matches += 1
         counts = part.fate.counts
         return counts is None or part.matches in counts
@@ -182,7 +184,7 @@ class RunningTimer(NamedTuple):
 
     name: str
     number: int
-    """Number of timers that the agent started before this one."""
+    """Number of timers that the agent started before this timer."""
     deadline: float
     """Time on the agent's clock at which the timer expires."""
 

@@ -38,7 +38,7 @@ class SimulatedIncarnation:
     state: AgentState | None = None
     """The protocol state of the agent. None for a foreign agent, whose state the harness cannot read."""
     secured: KeyedAgent | None = None
-    """The same agent with its interface for keys. None if the agent has no keys."""
+    """The same agent, with its interface for keys. None if the agent has no keys."""
     rebooted: bool = False
     """True if the agent started with the data on its disk, after a power failure."""
     deadline: float | None = None

@@ -37,7 +37,7 @@ class DiskRecorder:
         self._append(agent_id, header_line(**header(incarnation)))
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
-        """Do nothing, because the file with the agent's blocks contains this information."""
+        """Do nothing, because the file with the agent's blocks also contains the logged events."""
 
     def write(self, agent_id: int, entries: list[Entry]) -> None:
         self._append(agent_id, "".join([entry.to_line() for entry in entries]))

@@ -98,7 +98,8 @@ class Simulation(EventLoop):
         self._breathe = on_progress
         self._pace = pace
         self._disks: dict[int, DiskContents] = {}
-        """Agent number -> content of its disk, for agents that are switched off and will reboot with it."""
+        """Agent number -> content of the agent's disk, for agents that are switched off and will reboot with this disk.
+        """
         self._switched_off: dict[int, SimulatedIncarnation] = {}
         self._failures: dict[int, AgentFailedError | AgentLacksError] = {}
         """Number of an agent -> its last failure."""
@@ -284,7 +285,8 @@ class Simulation(EventLoop):
         return RecurrenceSearch(delays)
 
     async def _run_until_recurrence(self, mission_s: float, recurrence: RecurrenceSearch) -> bool:
-        """Run until `mission_s`, or until the swarm repeats a cycle forever. Return true in the second case."""
+        """Run until `mission_s`, or until the swarm repeats a cycle forever. Return true if the swarm repeats a cycle.
+        """
         self._recurrence = recurrence
         while self._now < mission_s:
             if self._air.quiet_at > self._now:
@@ -471,8 +473,8 @@ class Simulation(EventLoop):
         )
 
     def _handler_runs(self, incarnation: SimulatedIncarnation, status: AgentStatus | None) -> HandlerRuns | None:
-        """Return the number of handler runs of the agent, with the time of the count. A foreign agent reports this
-        number itself.
+        """Return the number of handler runs of the agent, with the time of the count. A foreign agent counts its
+        handler runs itself.
         """
         if status is None:
             return None

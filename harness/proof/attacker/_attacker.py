@@ -30,7 +30,9 @@ class _KnowledgeFromAgent(NamedTuple):
 
     asked: PendingQuestions
     committed: frozenset[Block]
-    """The blocks in the agent's chain and on its reconcile stack. All agents receive a block when it is committed."""
+    """The blocks in the agent's chain and on its reconcile stack. An agent broadcasts each block when it commits the
+    block.
+    """
     named: frozenset[bytes]
 
 
@@ -88,8 +90,8 @@ class Attacker:
         return step.local != local or bool(step.sent or step.started)
 
     def material(self, locals_: tuple[int, ...]) -> Iterator[tuple[int, ForgeryMaterial]]:
-        """Yield the index of each living agent, and the blocks and hashes from which the attacker can form messages to
-        it.
+        """Yield the index of each living agent, with the blocks and hashes from which the attacker can form messages to
+        this agent.
         """
         knowledge = {place: self._known_from(local) for place, local in enumerate(locals_) if local != DEAD}
         blocks = self._own.union(*(agent.committed for agent in knowledge.values()))

@@ -100,7 +100,7 @@ def _commits(state: AgentState, blocks: Iterable[Block]) -> Iterator[Message]:
 
 
 def _questions(state: AgentState, others: Iterable[PendingQuestions]) -> Iterator[Message]:
-    """Yield forged queries to this agent. Other agents wait for exactly the answers to these queries."""
+    """Yield forged queries to this agent. The attacker sends only queries for whose answers another agent waits."""
     chain = state.chain
     for waits in sorted(others, key=repr):
         if waits.vote is not None:

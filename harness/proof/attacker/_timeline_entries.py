@@ -37,7 +37,7 @@ class AttackEntries:
         self._completed_s.append(at_s)
 
     def sees(self, local: int) -> None:
-        """Record the chain hashes that an agent knows in this state, so that timeline entries can name its chains."""
+        """Record the chain hashes that an agent knows in this state, so that timeline entries can name the chains."""
         chain = self._local.state(local).chain
         below: tuple[bytes, ...] = ()
         self._chains[chain.inception.chain_hash] = below

@@ -16,8 +16,8 @@ from harness.proof.model._shape import HeldBlockOrder, Shape, shape_of
 
 @dataclass
 class ExistingStates:
-    """The agent states and (state, input) pairs that exist within `bounds`. If `ended` is "complete", they are all of
-    them.
+    """The agent states and (state, input) pairs that exist within `bounds`. If `ended` is "complete", the object
+    contains all of them.
     """
 
     bounds: Bounds

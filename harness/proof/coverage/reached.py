@@ -111,9 +111,8 @@ class CoverageWatcher:
 
 
 def _given(run: HandlerRun | None, held: HeldBlockOrder) -> tuple[Any, ...] | None:
-    """Return the form in which an input is counted, for an agent that held the blocks in `held`.
-
-    Return None for inputs that do not exist within any bounds.
+    """Return the form in which an input is counted, for an agent that held the blocks in `held`. Return None for an
+    input that does not exist in any proof.
     """
     if run is None:
         return None

@@ -49,7 +49,9 @@ class ViolationExample:
 
 @dataclass(frozen=True)
 class PlayedExample:
-    """A simulated run: its bad verdicts, and the endless cycle of its agents or None."""
+    """A simulated run: its bad verdicts, and the endless cycle of its agents. The cycle is None if the run has no such
+    cycle.
+    """
 
     document: Document
     judged: dict[str, Judgement]

@@ -30,7 +30,9 @@ ROGUE_LATENCY_S = LATENCY.mean_s
 MOMENT_S = 0.001
 """Seconds between two events that must happen in a certain order."""
 NEXT_INSTANT_SOON_S = 0.1
-"""Seconds. If the next instant is nearer than this, messages take only MOMENT_S, so that they arrive before it."""
+"""Limit of the time until the next instant, in seconds. If the next instant is nearer, messages take only MOMENT_S, so
+that they arrive before it.
+"""
 SETTLES_S = 60
 NO_CLOCKS = "if ties of phase 2 go as no clocks make them go"
 """A text about contradictory ties: each of two blocks would have to be older than the other, or an agent's clock would
@@ -146,7 +148,8 @@ class PathScript:
             agents = [agents[old] for old in move.places]
 
     def _move(self, before: int, after: int) -> SwarmTransition:
-        """Return a transition from one state to the next. If possible, return one without lost messages."""
+        """Return a transition from one state to the next state. If possible, return a transition without lost messages.
+        """
         state, wanted = self._graph.states[before], self._graph.states[after]
         for lossy in (False, True) if self._swarm.bounds.network == "lossy" else (False,):
             for actions in self._swarm.actions(state):

@@ -23,8 +23,8 @@ FIRST_INSTANT_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class TimerRun:
-    """A timer that ran from one step of a path to a later step. If it has not `ended`, it ran at least until the later
-    step.
+    """A timer that ran from one step of a path to a later step. If `ended` is false, the timer ran at least until the
+    later step.
     """
 
     started: int
@@ -107,7 +107,7 @@ class BlockAges:
         self._events: list[int] = []
         """Ordinal of a block minus 1 -> index of the event that completes it."""
         self._older: dict[int, set[int]] = {}
-        """Index of an event -> indices of the events whose blocks are older than its block."""
+        """Index of an event -> indices of the events whose blocks are older than the block of this event."""
 
     def completed(self, ordinal: int) -> None:
         """Record that the next event completes the block with this number."""

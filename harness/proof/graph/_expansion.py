@@ -48,9 +48,8 @@ def expanded(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpan
 
 
 def quiet(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
-    """Return the successors of a state that are reached without a lost message and without a new block.
-
-    The field `transitions` of the result is 0.
+    """Return the successors of a state that are reached without a lost message and without a new block. In the result,
+    `transitions` is 0.
     """
     return _quiet(swarm, state, number_of, [*swarm.ending(state)], {})
 

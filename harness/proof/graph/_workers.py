@@ -103,8 +103,8 @@ class _NumberTranslator:
         self._new_definitions: Definitions = []
 
     def code(self, ours: int) -> int:
-        """Return the other process's number for a number of this process. If it is unknown, return a value below -1
-        that encodes this process's number.
+        """Return the number that the other process uses for a number of this process. If this number is unknown, return
+        a value below -1 that encodes the number of this process.
         """
         code = self._codes.get(ours)
         if code is None:
@@ -324,10 +324,8 @@ class Workers:
     def _answers(
         self, give: Give, states: Sequence[State], check: Check, first: int = 0
     ) -> Iterator[tuple[_WorkerHandle, int, SuccessorBatch | NeededVotes]]:
-        """Yield the answers of the workers in the order of the tasks. Each has its worker and the number of its first
-        state.
-
-        `states` may grow during the loop.
+        """Yield the answers of the workers in the order of the tasks. Each answer has its worker and the number of its
+        first state. `states` may grow during the loop.
         """
         if not self._handles:
             with signals_blocked():  # a Ctrl-C inside a fork must not end it halfway
@@ -358,8 +356,8 @@ class Workers:
 
 
 def _answered(busy: Mapping[int, _WorkerHandle], *, wait_for_one: bool) -> list[int]:
-    """Return the finished tasks, each as the number of its first state. Return an empty list if no task finishes within
-    WAIT_S seconds.
+    """Return the finished tasks. Each task is identified by the number of its first state. Return an empty list if no
+    task finishes within WAIT_S seconds.
     """
     ready = wait([other.connection for other in busy.values()], timeout=WAIT_S if wait_for_one else 0)
     return [number for number, other in busy.items() if other.connection in ready]

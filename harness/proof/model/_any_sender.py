@@ -127,9 +127,8 @@ class _BlockDistribution:
         self._names: dict[int, frozenset[int]] = {}
         self._by_agent: dict[int, list[Alone]] = {agent_id: [] for agent_id in self._own if agent_id != bounds.captured}
         self._heard = None if bounds.captured is None else AttackerKnowledge(bounds, self._own[bounds.captured])
-        """The knowledge of the attacker, which can send at any moment.
-
-        The attacker has the blocks of the captured vehicle from the beginning.
+        """The knowledge of the attacker, who can send at any moment. From the beginning, the attacker has the blocks of
+        the captured vehicle.
         """
         self._lied: dict[int, tuple[ForgeryMaterial, int]] = {}
         """Agent -> the data of the last forged messages to it, and the number of its states in which the exploration

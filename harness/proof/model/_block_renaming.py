@@ -15,7 +15,7 @@ from ucp.messages import Message
 Ordinals = tuple[int, ...]
 """Ordinals of blocks. The ordinal of a block is its number among all completed blocks."""
 Completed = tuple[bytes, int, int]
-"""A completed block: its hash, the number of its agent, and its ordinal."""
+"""A completed block: its hash, the number of the agent that completed it, and its ordinal."""
 
 
 class NumberedBlocks:
@@ -76,8 +76,8 @@ class NumberedBlocks:
         return frozenset().union(*(self.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     def of(self, snapshot: Snapshot) -> Ordinals:
-        """Return the numbers of the blocks in a state, each once. States that differ only in the identity of their
-        blocks list the blocks in the same order.
+        """Return the numbers of the blocks in a state. Each number occurs once. If two states differ only in the
+        identity of their blocks, their blocks are listed in the same order.
         """
         return tuple(dict.fromkeys(self._all(snapshot)))
 

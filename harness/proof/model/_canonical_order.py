@@ -35,9 +35,8 @@ class OrderedAgents(NamedTuple):
 MOST_KNOWN = 200_000
 """Maximum number of cached orders. Above it, the cache is emptied."""
 MOST_ORDERS = 120
-"""Maximum number of orders of similar agents that are compared.
-
-If there are more, equivalent states may count as several states.
+"""Maximum number of orders of similar agents that are compared. If more orders exist, equivalent states may count as
+several states.
 """
 
 
@@ -146,7 +145,7 @@ class CanonicalOrder:
             yield tuple(place for group in chosen for place in group)
 
     def _are_one(self, group: Sequence[int], locals_: Sequence[int], timers: Sequence[range]) -> bool:
-        """Return true if these agents are in the same state and have no running timers."""
+        """Return true if these agents are in the same state and no timer of these agents runs."""
         return not timers[group[0]] and len({locals_[place] for place in group}) == 1
 
     def _with_blocks(self, locals_: Sequence[int], descriptions: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
@@ -218,8 +217,8 @@ class CanonicalOrder:
 
 
 def _groups(descriptions: Sequence[Any]) -> list[list[int]]:
-    """Group the agents by equal descriptions. Return the positions of each group. The groups are in ascending order of
-    their descriptions.
+    """Group agents with equal descriptions. Return the positions of the agents in each group. The groups are in
+    ascending order of their descriptions.
     """
     in_order = sorted(range(len(descriptions)), key=descriptions.__getitem__)
     return [list(group) for _, group in groupby(in_order, descriptions.__getitem__)]

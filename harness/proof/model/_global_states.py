@@ -251,7 +251,7 @@ class ModelSwarm:
     # Results of an instant
 
     def after(self, state: State, actions: Actions, lossy: bool) -> Iterator[State]:
-        """Yield the possible states after these simultaneous actions. Yield none if their timers cannot expire
+        """Yield the possible states after these simultaneous actions. Yield no state if the timers cannot expire
         together.
         """
         key = state[AGENTS:], actions, self._most_lost(state, lossy)

@@ -33,7 +33,7 @@ MOST_KNOWN = 200_000
 """Maximum number of cached outcomes. Above it, the cache is emptied."""
 MOST_SEEN = 500
 """Maximum number of states that a correct agent can reach by one round of messages. A wrong agent may count messages
-without limit and exceed it.
+without limit, and exceed this maximum.
 """
 
 

@@ -22,7 +22,7 @@ without agent IDs.
 """
 
 Names = tuple[int, ...]
-"""The IDs that an agent uses for the other agents, in the order of these agents."""
+"""The IDs that one agent uses for the other agents, in the order of the other agents."""
 
 WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us": -1}
 """Parts of the state that no handler reads if no block is ever lost, with their initial values."""

@@ -43,7 +43,7 @@ Content = tuple[int, Snapshot, "PropertyViolation | None", Ordinals]
 OTHER_COUNTS = ((1, 0.0), (2, 60.0), (1000, 10_000.0))
 """Values of the counters, and mission seconds, with which each step of an unreduced proof is repeated."""
 COUNTED = ("reconciles", "sent", "chain_changed_at")
-"""Attributes of the state that the agent only counts, with their names in error messages."""
+"""Attributes of the state that only count events, each with its name in error messages."""
 
 
 class LocalStates(KnownStates):
@@ -352,8 +352,8 @@ class LocalStates(KnownStates):
         return pattern
 
     def about(self, local: int) -> Ordinals:
-        """Return the numbers of the blocks in a state, each once. States that differ only in the identity of their
-        blocks list the blocks in the same order.
+        """Return the numbers of the blocks in a state. Each number occurs once. If two states differ only in the
+        identity of their blocks, their blocks are listed in the same order.
         """
         about = self._about.get(local)
         if about is None:

@@ -57,7 +57,7 @@ _DEAD_PHASE_3: Snapshot = {"majority_response_block_hash": None}
 
 
 def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
-    """Return a snapshot of the agent's state. Parts that equal those of the snapshot `like` are shared with it."""
+    """Return a snapshot of the agent's state. The snapshot shares all parts that are equal in the snapshot `like`."""
     state = vars(agent.state)
     if like is None:
         return {name: _copied(value) for name, value in state.items() if name not in LEFT_OUT}

@@ -11,7 +11,9 @@ from harness.proof.model._snapshot import NAMES_OF_OTHERS, AgentStep, ReductionE
 from ucp.reconcile import most_named
 
 TALLIES = frozenset((*NAMES_OF_OTHERS, "vote_count", "reconcile_vote_count", "reconcile_response_dictionary"))
-"""Parts of the state that count answers. Only counting and timer expiries read them."""
+"""Parts of the state that count answers. Handlers read these parts only to count an answer and at the expiry of a
+timer.
+"""
 
 
 class VoteCounts:
@@ -70,9 +72,8 @@ class VoteCounts:
         return left
 
     def _of_phase_1(self, local: int) -> Snapshot:
-        """Return the simplified vote count of phase 1 if missing answers cannot change its result.
-
-        If they can, return an empty snapshot.
+        """Return the simplified vote count of phase 1 if missing answers cannot change the result of phase 1. Otherwise
+        return an empty snapshot.
         """
         snapshot = self._states.known[local].snapshot
         yes, no = (snapshot["reconcile_vote_count"][answer] for answer in ("yes", "no"))

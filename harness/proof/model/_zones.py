@@ -169,7 +169,7 @@ class ZoneTable:
 
 
 def _apart(matrix: Sequence[Sequence[int]], timers: range) -> int:
-    """Count the groups of timers. Timers whose differences are fixed belong to the same group."""
+    """Return the number of groups of timers. Timers whose differences are fixed belong to the same group."""
     return sum(
         not any(matrix[timer][other] + matrix[other][timer] == 0 for other in timers if other < timer)
         for timer in timers

@@ -38,7 +38,9 @@ class ForeignAnswer:
     """A valid answer of a foreign agent."""
 
     sent: list[tuple[bytes, RecordedBytes]]
-    """The sent datagrams. Each has its record, which contains the message if the datagram is one."""
+    """The sent datagrams. Each datagram has its record. If the datagram contains a message, the record contains the
+    message.
+    """
     timer: float | None
     """Time on the agent's clock at which its next timer expires."""
     trace: list[Entry] = field(default_factory=list)

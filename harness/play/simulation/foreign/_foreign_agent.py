@@ -129,7 +129,7 @@ class ForeignAgent:
         self._completed: list[bytes] | None = [] if tracing else None
         """Hashes of the completed blocks from the trace. None without a trace."""
         self._status: AgentStatus | None = None
-        """The current status. None if it is unknown, because an input may have changed it."""
+        """The current status of the agent. None if the status is unknown, because an input may have changed it."""
         self._export: dict[str, Any] | None = None
         """The export at the end of the incarnation."""
         first = {

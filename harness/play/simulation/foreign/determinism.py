@@ -80,8 +80,8 @@ def _error_message(record: IncarnationRecord, difference: str, *, used: bool) ->
 
 
 def _first_difference(program: LineProgram, record: IncarnationRecord) -> str | None:
-    """Give the recorded inputs to a program. Return a description of the first answer that differs. Return None if all
-    are equal.
+    """Give the recorded inputs to a program. Return a description of the first answer that differs from the record.
+    Return None if all answers are equal.
     """
     for line, answer in record.exchanges:
         try:
