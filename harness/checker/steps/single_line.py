@@ -48,8 +48,7 @@ class OtherRecords(Protocol):
         """Return the recorded datagrams with this sender and this sequence number."""
 
     def sent_by_others(self, kind: str) -> Iterable[tuple[int, Message]]:
-        """Return the recorded messages of this type from other agents, with their senders. Equal messages occur once.
-        """
+        """Return the recorded messages of this type from other agents, with their senders. Equal messages occur once."""
 
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
         """Return false if the records of other agents prove that the agent received no message of this kind from
@@ -315,8 +314,7 @@ def _with_answers_more(
 
 
 def _senders(runs: Iterable[HandlerRun]) -> set[int]:
-    """Return the senders of the answers that an agent received before it ended its question or asked another question.
-    """
+    """Return the senders of the answers that an agent received before it ended its question or asked another question."""
     senders = set()
     for run in runs:
         if not isinstance(run.trigger, MessageTrigger):
