@@ -48,7 +48,9 @@ class OtherRecords(Protocol):
         """Return the recorded datagrams with this sender and this sequence number."""
 
     def sent_by_others(self, kind: str) -> Iterable[tuple[int, Message]]:
-        """Return the recorded messages of this type from other agents, with their senders. Equal messages occur once."""
+        """Return the recorded messages of this type from other agents, with their senders. Equal messages
+        occur once.
+        """
 
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
         """Return false if the records of other agents prove that the agent received no message of this kind from

@@ -144,7 +144,9 @@ class RecordedTrace:
         return found
 
     def sent_by_others(self, kind: str) -> Iterable[tuple[int, Message]]:
-        """Return the recorded messages of this type from other agents, with their senders. Equal messages occur once."""
+        """Return the recorded messages of this type from other agents, with their senders. Equal messages
+        occur once.
+        """
         return self._sent_by_others.get(kind, ())
 
     @cached_property

@@ -10,7 +10,9 @@ from harness.play.remote._wire import Channel, Kind, Message, WireError
 
 
 class Connection(asyncio.Protocol):
-    """One TCP connection between a stand-in and a far end. The function `lost` is called when the connection has ended."""
+    """One TCP connection between a stand-in and a far end. The function `lost` is called when the connection
+    has ended.
+    """
 
     def __init__(self, channel: Channel, receive: Callable[[Message], None], lost: Callable[[Connection], None]):
         self._channel, self._receive, self._lost = channel, receive, lost

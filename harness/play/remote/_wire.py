@@ -112,7 +112,9 @@ class Channel:
         return messages
 
     def to_json(self) -> dict[str, Any]:
-        """Return the state of the channel, so that another process can continue with it. No message may be incomplete."""
+        """Return the state of the channel, so that another process can continue with it. No message may be
+        incomplete.
+        """
         assert not self._unread, "a message is incomplete"
         return {
             "send_key": self._send_key.hex(),

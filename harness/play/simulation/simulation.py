@@ -285,7 +285,9 @@ class Simulation(EventLoop):
         return RecurrenceSearch(delays)
 
     async def _run_until_recurrence(self, mission_s: float, recurrence: RecurrenceSearch) -> bool:
-        """Run until `mission_s`, or until the swarm repeats a cycle forever. Return true if the swarm repeats a cycle."""
+        """Run until `mission_s`, or until the swarm repeats a cycle forever. Return true if the swarm repeats
+        a cycle.
+        """
         self._recurrence = recurrence
         while self._now < mission_s:
             if self._air.quiet_at > self._now:

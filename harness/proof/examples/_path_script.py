@@ -148,7 +148,9 @@ class PathScript:
             agents = [agents[old] for old in move.places]
 
     def _move(self, before: int, after: int) -> SwarmTransition:
-        """Return a transition from one state to the next state. If possible, return a transition without lost messages."""
+        """Return a transition from one state to the next state. If possible, return a transition without lost
+        messages.
+        """
         state, wanted = self._graph.states[before], self._graph.states[after]
         for lossy in (False, True) if self._swarm.bounds.network == "lossy" else (False,):
             for actions in self._swarm.actions(state):
