@@ -316,7 +316,9 @@ def _with_answers_more(
 
 
 def _senders(runs: Iterable[HandlerRun]) -> set[int]:
-    """Return the senders of the answers that an agent received before it ended its question or asked another question."""
+    """Return the senders of the answers that an agent received before it ended its question or asked another
+    question.
+    """
     senders = set()
     for run in runs:
         if not isinstance(run.trigger, MessageTrigger):
