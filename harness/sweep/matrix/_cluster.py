@@ -7,22 +7,16 @@ it was started several times.
 import asyncio
 import concurrent.futures
 import contextlib
-import logging
-import re
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sized
 from itertools import islice
 from typing import Any, TypeVar
 
-from harness.errors import HarnessError, MachineError, extra
+from harness.errors import MachineError
+from harness.play.machine.dask_cluster import connected
 from harness.run.parallel import FailedTask, outcome_of, progress_bar, raise_error, sigterm_as_ctrl_c
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-CONNECT_S = 10.0
-SAME_VERSIONS = ("dask", "distributed", "ucp-harness")
-"""Packages that must have the same version on this machine, on the scheduler and on each worker."""
 
 
 @contextlib.contextmanager
@@ -39,61 +33,8 @@ def cluster(
     different versions, or if the connection is lost.
     """
     total = len(tasks) if isinstance(tasks, Sized) else None
-    with sigterm_as_ctrl_c(), progress_bar(what, total) as count, _connected(address) as client:
+    with sigterm_as_ctrl_c(), progress_bar(what, total) as count, connected(address) as client:
         yield _outcomes(client, tasks, work, address, count)
-
-
-@contextlib.contextmanager
-def _connected(address: str) -> Iterator[Any]:
-    if not re.fullmatch(r"tcp://[^/\s]+:\d+", address):
-        raise HarnessError(f"--scheduler {address} is not an address such as tcp://127.0.0.1:8786")
-    with extra("cluster", "--scheduler"):
-        import distributed
-    for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # we report errors ourselves
-    try:
-        versions = asyncio.run(asyncio.wait_for(_versions(address), CONNECT_S))
-    except Exception as error:  # another version or another program may raise any exception here
-        raise MachineError(
-            f"no Dask scheduler answers at {address} ({type(error).__name__}): start `dask scheduler` there, of "
-            f"version {distributed.__version__}"
-        ) from None
-    _refuse_other_versions(versions, address)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", distributed.versions.VersionMismatchWarning)
-        try:
-            client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-        except OSError as error:
-            raise MachineError(f"the scheduler at {address} was lost while we connected: {error}") from None
-    with client:
-        yield client
-
-
-async def _versions(address: str) -> dict[str, dict[str, str | None]]:
-    """Return the versions of the packages in SAME_VERSIONS on this machine, on the scheduler, and on each worker."""
-    from distributed import rpc
-    from distributed.versions import get_versions
-
-    async with rpc(address) as scheduler:
-        its = await scheduler.versions(packages=SAME_VERSIONS)
-        question = {"op": "versions", "packages": SAME_VERSIONS}
-        workers = await scheduler.broadcast(msg=question, on_error="ignore")
-    answers = {"here": get_versions(SAME_VERSIONS), f"the scheduler at {address}": its}
-    answers |= {f"the worker at {worker}": answer for worker, answer in workers.items()}
-    return {node: {name: answer["packages"].get(name) for name in SAME_VERSIONS} for node, answer in answers.items()}
-
-
-def _refuse_other_versions(versions: dict[str, dict[str, str | None]], address: str) -> None:
-    here, _, *workers = versions.values()
-    if not workers:
-        raise MachineError(f"the scheduler at {address} has no workers: start some with `dask worker {address}`")
-    for node, packages in versions.items():
-        for package, version in packages.items():
-            if version != here[package]:
-                has = f"{package} {version}" if version else f"no {package}"
-                raise MachineError(
-                    f"{node} has {has}, but this machine has {here[package]}: install the same version on both"
-                )
 
 
 def _outcomes(

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from harness.errors import HarnessError, MachineError
-from harness.sweep.matrix import _cluster as module
+from harness.play.machine import dask_cluster
 from harness.sweep.matrix._cluster import cluster
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 
@@ -143,7 +143,7 @@ def test_a_scheduler_of_another_version_is_one_sentence(tmp_path: Path, dask: Cl
 
 
 def test_no_scheduler_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "CONNECT_S", 0.5)
+    monkeypatch.setattr(dask_cluster, "CONNECT_S", 0.5)
     with socket.socket() as nobody_listens:
         nobody_listens.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{nobody_listens.getsockname()[1]}"
