@@ -365,6 +365,8 @@ class RemoteRecord(_RecordModel):
 
     host: str
     """Address from which it joined last."""
+    worker: str | None = None
+    """Address of the Dask worker that played the agent. null if a user let the agent join."""
     command: list[str] = []
     """Command of the agent on that computer."""
     joins: int = 0

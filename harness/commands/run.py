@@ -75,6 +75,12 @@ def run_command(
             metavar="ADDRESS:PORT", rich_help_panel=RARE, help="Address at which to wait for agents on other computers."
         ),
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TCP://HOST:PORT", rich_help_panel=RARE, help="Dask scheduler whose workers play the agents."
+        ),
+    ] = None,
     capture: Annotated[
         bool, typer.Option("--capture", help="Record each vehicle's frames in capture/ID.pcapng.")
     ] = False,
@@ -114,6 +120,8 @@ def run_command(
     fate matched no message. 3: this machine cannot play it, or an agent does not support it. 4: the only bad verdict is
     `not finished`. 130: interrupted.
     """
+    if scheduler is not None and listen is not None:
+        raise ScenarioError("--scheduler places all agents, so none joins at --listen: leave out one of them")
     console = output()
     loaded, recorded_seed = load_recorded_scenario(scenario)
     programs = programs_of(agents or ())
@@ -127,6 +135,11 @@ def run_command(
         _emit_compose(console, request, chosen_seed, emit_compose)
         return
     if kernel is UmlKernel.uml:
+        if scheduler is not None:
+            raise ScenarioError(
+                "--scheduler does not work with --kernel uml, because the workers do not reach a run "
+                "inside User Mode Linux: leave out one of them"
+            )
         if by_hand:
             raise ScenarioError(
                 "--by-hand does not work with --kernel uml, because commands do not reach a run "
@@ -193,6 +206,7 @@ def run_command(
                 backend,
                 delivers_all=delivers_all,
                 interventions=interventions,
+                scheduler=scheduler,
             )
         finally:
             shown.close()

@@ -2,8 +2,9 @@
 packet captures lack.
 """
 
+import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 
 from harness.archive.connectivity import QUALITY_LIMITS
@@ -90,14 +91,46 @@ def figures(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def cut_off(record: RunRecord) -> list[str]:
-    """Return a sentence for each time in which a remote agent was cut off, because its connection was lost."""
-    return [
-        f"agent {agent_id} was cut off from {cut.from_s:.0f} s "
-        f"{'until the end' if cut.until_s is None else f'to {cut.until_s:.0f} s'}, because the connection to its "
-        f"computer {found.host} was lost"
-        for agent_id, found in record.remote.items()
-        for cut in found.cut_off
-    ]
+    """Return a sentence for each time in which remote agents were cut off, because their connections were lost. The
+    agents of one worker have one sentence together.
+    """
+    lines = []
+    for computer, agents in _by_computer(record).items():
+        cuts = sorted(
+            (cut.from_s, math.inf if cut.until_s is None else cut.until_s, agent)
+            for agent in agents
+            for cut in record.remote[str(agent)].cut_off
+        )
+        while cuts:
+            from_s, until_s, agent = cuts.pop(0)
+            together = [agent]
+            while cuts and cuts[0][0] <= until_s:
+                _, later_s, agent = cuts.pop(0)
+                until_s, together = max(until_s, later_s), [*together, agent]
+            end = "until the end" if until_s == math.inf else f"to {until_s:.0f} s"
+            one = len(set(together)) == 1
+            lines.append(
+                f"{agents_in_words(together)} {'was' if one else 'were'} cut off from {from_s:.0f} s {end}, because "
+                f"the connection to {'its' if one else 'their'} {computer} was lost"
+            )
+    return lines
+
+
+def agents_in_words(agent_ids: Iterable[int]) -> str:
+    """Return "agent 3", or "agents 1-3 and 7"."""
+    *others, last = ranges(sorted({*agent_ids}))
+    if not others:
+        return f"agent{'s' if not last.isdigit() else ''} {last}"
+    return f"agents {', '.join(others)} and {last}"
+
+
+def _by_computer(record: RunRecord) -> dict[str, list[int]]:
+    """Return the remote agents by a phrase for the computer or the worker that played them."""
+    found: dict[str, list[int]] = {}
+    for agent, remote in record.remote.items():
+        computer = f"computer {remote.host}" if remote.worker is None else f"worker {remote.worker}"
+        found.setdefault(computer, []).append(int(agent))
+    return found
 
 
 def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:

@@ -22,10 +22,18 @@ from harness.checker.injections import account
 from harness.checker.recurring_cycles import cycle_of
 from harness.checker.survival import survival
 from harness.checker.timer_lag import TimerLag, timer_lag
-from harness.errors import WRONG_REQUEST, HarnessError, InterruptedRunError, MachineError, RunDirectoryError
+from harness.errors import (
+    WRONG_REQUEST,
+    HarnessError,
+    InterruptedRunError,
+    MachineError,
+    RunDirectoryError,
+    ScenarioError,
+)
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
+from harness.play.hosts.hosts_backend import HostsBackend
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import ProgressDisplay, SilentProgress
@@ -88,6 +96,7 @@ def run(
     *,
     delivers_all: bool = False,
     interventions: Interventions | None = None,
+    scheduler: str | None = None,
 ) -> Run:
     """Play a scenario, check it, and write the run directory. Return the finished run.
 
@@ -97,6 +106,7 @@ def run(
     - `backend`: `process` plays in network namespaces, `docker` in containers, `sim` in virtual time.
     - `delivers_all`: in virtual time, traces also record messages that have no effect, as traces of processes do.
     - `interventions`: faults that the user requests during the run. They belong to this scenario.
+    - `scheduler`: address of a Dask scheduler, whose workers play the agents. It needs the backend `process`.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end the mission early. The run is then exported and checked as far as it went.
     Ctrl-C during the check raises InterruptedRunError. The function also works inside a running event loop, for example
@@ -106,7 +116,9 @@ def run(
     """
     progress = progress or SilentProgress()
     out = out or default_path(scenario.name)
-    chosen = BACKENDS[backend]
+    chosen = BACKENDS[backend] if scheduler is None else HostsBackend(scheduler)
+    if chosen.name != backend:
+        raise ScenarioError(f"--scheduler does not work with --backend {backend}: leave out one of them")
     chosen.refuse(scenario)
     recording = RunRecording(scenario, seed, out, backend, all_delivered=delivers_all and in_virtual_time(backend))
     story: mission.Story = mission.play

@@ -22,6 +22,7 @@ DOORS = {
     "ucp.commit": "handlers, to read beside the thesis",
     "harness.cli": "a program",
     "harness.play.variant_agent": "a program",
+    "harness.play.hosts.far_host": "a program",
     "harness.play.remote.far_worker": "a program",
     "harness.play.remote.stand_in": "a program",
     "netem.init": "a program",

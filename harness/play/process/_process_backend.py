@@ -19,6 +19,8 @@ from harness.play.progress import ProgressDisplay
 from harness.scenario import Scenario
 
 if TYPE_CHECKING:
+    from harness.play.hosts._agent_hosts import AgentHosts
+    from harness.play.process._program_run import ProgramRun
     from harness.play.process._run_lab import MissionLab
 
 
@@ -64,6 +66,20 @@ class ProcessBackend(Backend):
         delivers_all: bool = False,
         pace: VirtualTimePace | None = None,
     ) -> AbstractAsyncContextManager[Swarm]:
+        return self.program_run(scenario, seed, rundir, progress, interrupted, interactive=interactive).opened()
+
+    def program_run(
+        self,
+        scenario: Scenario,
+        seed: int,
+        rundir: RunDirectory,
+        progress: ProgressDisplay,
+        interrupted: asyncio.Event,
+        *,
+        interactive: bool,
+        hosts: "AgentHosts | None" = None,
+    ) -> "ProgramRun":
+        """Return the run, which is not open yet. `hosts` plays the agents if they are not in the lab."""
         from harness.play.process._program_run import ProgramRun
         from harness.play.process.vehicle_kinds import choose_vehicles
 
@@ -81,4 +97,5 @@ class ProcessBackend(Backend):
             agent_commands=self.agent_commands(scenario),
             open_lab=self.open_lab,
             keeps_disks=interactive,
-        ).opened()
+            hosts=hosts,
+        )

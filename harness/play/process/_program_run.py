@@ -23,6 +23,7 @@ from harness.errors import HarnessError, InterruptedRunError, MachineError, Scen
 from harness.play._radio_range import TRACK_S, RadioRange
 from harness.play._vehicle_keys import KeyDirectories, key_directories
 from harness.play.agent_control import AgentRefusedError, AgentStatus
+from harness.play.hosts._agent_hosts import AgentHosts
 from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.process._agent_process import AgentProcess
 from harness.play.process._channel_process import ChannelProcess
@@ -74,6 +75,7 @@ class ProgramRun:
         agent_commands: Mapping[int, Sequence[str]],
         open_lab: OpenLab,
         keeps_disks: bool,
+        hosts: AgentHosts | None = None,
     ) -> None:
         """Prepare the run. Nothing is started yet.
 
@@ -83,6 +85,7 @@ class ProgramRun:
         - `open_lab`: opens a lab of processes or of containers.
         - `keeps_disks`: each agent has a disk with which it can reboot. Otherwise only the agents that the scenario
           reboots with their disk have one.
+        - `hosts`: plays all agents on other computers. By default, the agents run in the lab.
         """
         self.scenario = scenario
         self.seed = seed
@@ -99,7 +102,7 @@ class ProgramRun:
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
-        self._remote = RemoteAgents(scenario, rundir, self.clock.now)
+        self._remote = RemoteAgents(scenario, rundir, self.clock.now, hosts)
         self.agents = [
             AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now)
             if agent_id not in self._remote
@@ -178,6 +181,7 @@ class ProgramRun:
         self.stage = stage
 
     async def begin(self, first: Change) -> None:
+        self._watchers.start(self._remote.watch_hosts(), of="hosts")
         await self._fleet.start(self._lab, self._show)
         await self._start_agents(self._lab)
         if self._channel is not None:
@@ -189,6 +193,7 @@ class ProgramRun:
             self._capture = await LiveCapture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
             self._watchers.start(self._capture.watch())
         await self._start_clock()
+        self._watchers.stop("hosts")
         self._watchers.start(self._poll_agents())
         self._watchers.start(self._pack_traces())
         self._watchers.start(self._log_script(), of="script")
@@ -418,7 +423,7 @@ class ProgramRun:
     async def stop_events(self) -> None:
         self._watchers.stop("script")
         await asyncio.gather(*self._starting.values())
-        await asyncio.gather(*(agent.ask("stop_events") for agent in self._awake()))
+        await asyncio.gather(*(agent.ask("stop_events") for agent in self.agents if agent.awake))
 
     async def until_idle(self, limit_s: float) -> bool:
         deadline_s = self.clock.now() + limit_s
@@ -454,13 +459,14 @@ class ProgramRun:
         return replace(self.played, mission_s=mission_s, agents=agents, channel=channel, remote=remote)
 
     def _awake(self) -> list[AgentProcess]:
-        """Return the agents that are neither dead nor paused."""
-        return [agent for agent in self.agents if agent.awake]
+        """Return the agents that are neither dead, paused nor cut off from their computer."""
+        return [agent for agent in self.agents if agent.awake and agent.agent_id not in self._remote.cut_off]
 
     async def _statuses(self) -> dict[int, AgentStatus]:
-        """Return the status of each agent that is neither dead nor paused."""
-        polled = await asyncio.gather(*(agent.poll() for agent in self.agents))
-        return {agent.agent_id: status for agent, status in zip(self.agents, polled, strict=True) if status}
+        """Return the status of each agent that is neither dead, paused nor cut off from its computer."""
+        agents = [agent for agent in self.agents if agent.agent_id not in self._remote.cut_off]
+        polled = await asyncio.gather(*(agent.poll() for agent in agents))
+        return {agent.agent_id: status for agent, status in zip(agents, polled, strict=True) if status}
 
     async def _poll_agents(self) -> None:
         while True:

@@ -13,7 +13,7 @@ import json
 import secrets
 import socket
 import sys
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator, Coroutine, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +32,7 @@ JOIN_LIMIT_S = 300.0
 PINGS = 20
 PING_LIMIT_S = 10.0
 MAX_HANDSHAKES = 16
-"""Maximum number of connections in their handshake. Further connections are closed at once."""
+"""Maximum number of connections in their handshake, beside one of each agent. Others are closed at once."""
 MAX_COMPLAINTS = 10
 MAX_STAND_IN_BYTES = 4096
 MAX_TEXT = 200
@@ -104,11 +104,13 @@ class Host(Protocol):
 class FarEnds:
     """The listening sockets of a host, and the tasks that serve them."""
 
-    def __init__(self, host: Host, name: str, places: int = 1) -> None:
+    def __init__(self, host: Host, name: str, places: int = 1, *, agents: int = 1) -> None:
         """Create the object without listening. `name` describes the run to the user of the other computer.
 
-        `places` is the number of incarnations that each far end runs at the same time.
+        `places` is the number of incarnations that each far end runs at the same time, and `agents` the number of
+        agents that may join at the same time.
         """
+        self._max_handshakes = MAX_HANDSHAKES + agents
         self._host, self._name, self._places = host, name, places
         self._run = secrets.token_hex(8)
         self._tasks: set[asyncio.Task[None]] = set()
@@ -117,19 +119,20 @@ class FarEnds:
         self._complaints = 0
 
     @asynccontextmanager
-    async def opened(self, listen: str, secret: bytes, directory: Path) -> AsyncIterator[None]:
-        """Listen inside this context. Raises MachineError if the address cannot be used."""
-        listener = _listening(listen)
+    async def opened(self, listeners: Sequence[socket.socket], secret: bytes, directory: Path) -> AsyncIterator[None]:
+        """Accept far ends inside this context, and close the listening sockets at its end."""
         inside = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         path = directory / SOCKET
         try:
-            with listener, inside:
+            with contextlib.ExitStack() as sockets:
+                for each in (*listeners, inside):
+                    sockets.enter_context(each)
                 bind_path(inside, path)
                 path.chmod(0o600)
                 inside.listen(MAX_HANDSHAKES)
                 inside.setblocking(False)
                 accepting = [
-                    asyncio.create_task(self._accept(listener, secret)),
+                    *(asyncio.create_task(self._accept(listener, secret)) for listener in listeners),
                     asyncio.create_task(self._accept_stand_ins(inside)),
                 ]
                 try:
@@ -156,7 +159,7 @@ class FarEnds:
             except OSError:  # no file descriptor is free, or the client has gone
                 await asyncio.sleep(1.0)
                 continue
-            if self._handshakes >= MAX_HANDSHAKES:
+            if self._handshakes >= self._max_handshakes:
                 connection.close()
                 continue
             self._handshakes += 1
@@ -236,7 +239,8 @@ class FarEnds:
         stand_in.close()
 
 
-def _listening(listen: str) -> socket.socket:
+def listening(listen: str) -> socket.socket:
+    """Return a socket that listens at ADDRESS:PORT. Raises MachineError if the address cannot be used."""
     address = ListenAddress.parse(listen)
     try:
         family, kind, protocol, _, place = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,8 +18,9 @@ from typing import Any
 from harness.archive.directory import RunDirectory
 from harness.archive.run_record import CutOff, RemoteRecord
 from harness.errors import MachineError, ScenarioError
+from harness.play.hosts._agent_hosts import AgentHosts
 from harness.play.process.lab_program import LabProgram
-from harness.play.remote._far_ends import JOIN_LIMIT_S, SOCKET, FarEnd, FarEnds
+from harness.play.remote._far_ends import JOIN_LIMIT_S, SOCKET, FarEnd, FarEnds, listening
 from harness.play.remote._remote_program import RemoteProgram
 from harness.play.remote._stand_in_task import StandInTask
 from harness.play.remote.secret_file import read_secret
@@ -65,9 +66,13 @@ class _RemoteVehicle:
 class RemoteAgents:
     """The agents of a run that are on other computers. Without such agents, all methods do nothing."""
 
-    def __init__(self, scenario: Scenario, rundir: RunDirectory, now: Callable[[], float]) -> None:
-        self._scenario, self._rundir, self._now = scenario, rundir, now
-        self._vehicles = {agent: _RemoteVehicle(agent) for agent in (scenario.remote.agents if scenario.remote else ())}
+    def __init__(
+        self, scenario: Scenario, rundir: RunDirectory, now: Callable[[], float], hosts: AgentHosts | None = None
+    ) -> None:
+        """Prepare for remote agents. `hosts` plays all agents of the run, or is None if users let agents join."""
+        self._scenario, self._rundir, self._now, self._hosts = scenario, rundir, now, hosts
+        agents = hosts.agents if hosts else scenario.remote.agents if scenario.remote else ()
+        self._vehicles = {agent: _RemoteVehicle(agent) for agent in agents}
         self._ended = False
         self.when_cut_off: Callable[[], None] = lambda: None
         """Called when a vehicle was cut off, or came back."""
@@ -100,17 +105,14 @@ class RemoteAgents:
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[None]:
         """Listen inside this context. Raises HarnessError if the address or the secret cannot be used."""
-        options = self._scenario.remote
-        if options is None:
+        if not self._vehicles:
             yield
             return
-        secret = read_secret(Path(options.secret_file))
-        if options.listen is None:
-            named = ", ".join(map(str, options.agents))
-            raise ScenarioError(
-                f"agent {named} joins from another computer, but no address is set for it: add `--listen ADDRESS:PORT`"
-            )
-        async with FarEnds(self, self._scenario.name).opened(options.listen, secret, self._rundir.path):
+        secret, listeners = self._meeting_point()
+        far_ends = FarEnds(self, self._scenario.name, agents=len(self._vehicles))
+        async with far_ends.opened(listeners, secret, self._rundir.path):
+            if self._hosts is not None:
+                self._hosts.start()
             try:
                 yield
             finally:
@@ -118,25 +120,53 @@ class RemoteAgents:
                     if vehicle.held is not None:
                         vehicle.held.connection.close()
 
+    def _meeting_point(self) -> tuple[bytes, Sequence[socket.socket]]:
+        """Return the secret of the far ends, and the sockets at which they connect. Raises HarnessError."""
+        if self._hosts is not None:
+            return self._hosts.secret, self._hosts.listen()
+        options = self._scenario.remote
+        assert options is not None
+        secret = read_secret(Path(options.secret_file))
+        if options.listen is None:
+            named = ", ".join(map(str, options.agents))
+            raise ScenarioError(
+                f"agent {named} joins from another computer, but no address is set for it: add `--listen ADDRESS:PORT`"
+            )
+        return secret, [listening(options.listen)]
+
     async def wait(self, show: Callable[[str], None]) -> None:
         """Wait until all agents have joined. Raises MachineError after `JOIN_LIMIT_S`, and ScenarioError if the
         scenario asks for shorter delays than the connections have.
         """
         if not self._vehicles:
             return
+        joining = [asyncio.create_task(self._wait_for_all(show)), asyncio.create_task(self.watch_hosts())]
         try:
-            async with asyncio.timeout(JOIN_LIMIT_S):
-                while missing := [str(v.agent_id) for v in self._vehicles.values() if not v.joined.is_set()]:
-                    show(f"waiting for agent {', '.join(missing)} to join")
-                    await self._vehicles[int(missing[0])].joined.wait()
-        except TimeoutError:
-            raise MachineError(
-                f"agent {', '.join(missing)} did not join within {JOIN_LIMIT_S:g} s: type the command above on its "
-                "computer"
-            ) from None
+            done, _ = await asyncio.wait(joining, timeout=JOIN_LIMIT_S, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in joining:
+                task.cancel()
+        if not done:
+            missing = ", ".join(map(str, self._missing()))
+            how = "look at its worker" if self._hosts else "type the command above on its computer"
+            raise MachineError(f"agent {missing} did not join within {JOIN_LIMIT_S:g} s: {how}")
+        for task in done:
+            task.result()
         for change in timeline_of(self._scenario):
             if isinstance(change, NetworkChange):
                 self.compensated(change.conditions.at_speed(self._scenario.speedup))
+
+    async def watch_hosts(self) -> None:
+        """Raise MachineError if a worker of a cluster is lost. Without workers, wait for ever."""
+        await (self._hosts.watch() if self._hosts is not None else asyncio.Event().wait())
+
+    async def _wait_for_all(self, show: Callable[[str], None]) -> None:
+        while missing := self._missing():
+            show(f"waiting for agent {', '.join(map(str, missing))} to join")
+            await self._vehicles[missing[0]].joined.wait()
+
+    def _missing(self) -> list[int]:
+        return [vehicle.agent_id for vehicle in self._vehicles.values() if not vehicle.joined.is_set()]
 
     # The methods of harness.play.remote._far_ends.Host
 
@@ -145,6 +175,8 @@ class RemoteAgents:
         if vehicle is None:
             awaited = ", ".join(map(str, self._vehicles))
             return f"this mission awaits agent {awaited}, not agent {agent_id}: use --as {awaited}"
+        if self._hosts is not None and vehicle.session not in ("", session):
+            return f"agent {agent_id} has begun in another process, and its data are lost with it"
         if vehicle.session not in ("", session) and vehicle.is_alive:
             return f"agent {agent_id} has joined from {vehicle.host} already: end that one, or use another --as"
         return ""
@@ -225,6 +257,7 @@ class RemoteAgents:
         return {
             str(vehicle.agent_id): RemoteRecord(
                 host=vehicle.host,
+                worker=self._hosts.worker_of(vehicle.agent_id) if self._hosts else None,
                 command=vehicle.command,
                 joins=vehicle.joins,
                 epoch_us=vehicle.epoch_us,

@@ -19,7 +19,7 @@ from typing import Any
 
 from harness.errors import MachineError
 from harness.play.process.lab_program import LabProgram
-from harness.play.remote._far_ends import JOIN_LIMIT_S, SOCKET, FarEnd, FarEnds
+from harness.play.remote._far_ends import JOIN_LIMIT_S, SOCKET, FarEnd, FarEnds, listening
 from harness.play.remote._remote_program import RemoteProgram
 from harness.play.remote._stand_in_task import StandInTask
 
@@ -55,7 +55,7 @@ class AgentPool:
     async def opened(self, directory: Path) -> AsyncIterator[None]:
         """Listen inside this context. Raises MachineError if the address cannot be used."""
         self._directory = directory
-        async with FarEnds(self, "a conformance test", PLACES).opened(self.listen, self.secret, directory):
+        async with FarEnds(self, "a conformance test", PLACES).opened([listening(self.listen)], self.secret, directory):
             try:
                 yield
             finally:

@@ -101,15 +101,28 @@ def join(request: JoinRequest, say: Callable[[str], None]) -> None:
     """Play incarnations of the agent until the run has ended, or without end as a service. Raises MachineError without
     private networks. Raises JoinError if no harness listens, or if the harness refuses the agent.
     """
+    asyncio.run(_Joining(request, first_process(), say).run())
+
+
+def first_process() -> list[str]:
+    """Return the command of a process in a private network that runs an agent. Raises MachineError without private
+    networks.
+    """
     try:
-        first_process = far_network.first_process([sys.executable, "-P", "-m", "harness.play.remote.far_worker"])
+        return far_network.first_process([sys.executable, "-P", "-m", "harness.play.remote.far_worker"])
     except LabUnavailable as error:
         raise MachineError(str(error)) from None
-    asyncio.run(_Joining(request, first_process, say).run())
+
+
+async def play_incarnations(
+    request: JoinRequest, first_process: Sequence[str], say: Callable[[str], None], directory: Path
+) -> None:
+    """Play incarnations of one of several agents of this process, with its files in `directory`. See `join`."""
+    await _Joining(request, first_process, say).play(directory)
 
 
 @contextmanager
-def _directory() -> Iterator[Path]:
+def directory_of_agents() -> Iterator[Path]:
     """Create a directory for the agent's files, and remove it afterwards. Also remove the directories of killed
     processes. A lock shows that the process of a directory still runs. A new directory has no lock for a moment.
     """
@@ -146,8 +159,8 @@ class _Joining:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             loop.add_signal_handler(number, ended.set)
-        with _directory() as directory:
-            playing = asyncio.create_task(self._play(directory))
+        with directory_of_agents() as directory:
+            playing = asyncio.create_task(self.play(directory))
             waiting = asyncio.create_task(ended.wait())
             await asyncio.wait({playing, waiting}, return_when=asyncio.FIRST_COMPLETED)
             waiting.cancel()
@@ -155,7 +168,8 @@ class _Joining:
             with contextlib.suppress(asyncio.CancelledError):
                 await playing
 
-    async def _play(self, directory: Path) -> None:
+    async def play(self, directory: Path) -> None:
+        """Play until the run is over, or for ever as a service. Raises JoinError."""
         joined = False
         while True:
             try:

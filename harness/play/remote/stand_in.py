@@ -413,7 +413,7 @@ class StandIn:
             self._stop_events = True  # sent when the vehicle is back
             answer = {"ok": True}
         else:
-            why = "the connection to its computer is lost: run `ucp-harness join` there again"
+            why = "the connection to its computer is lost"
             answer = {"ok": False, "error": why}
         return json.dumps(answer).encode() + b"\n"
 

@@ -204,12 +204,12 @@ def test_malformed_ping_or_pong_is_refused(payload: bytes) -> None:
 
 def test_files_of_a_killed_far_end_are_removed_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with join._directory() as active:
+    with join.directory_of_agents() as active:
         (tmp_path / "ucp-join-killed").mkdir()
-        with join._directory() as second:
+        with join.directory_of_agents() as second:
             assert {*tmp_path.iterdir()} == {active, second, tmp_path / "ucp-join-killed"}, "it may be new"
         monkeypatch.setattr(join, "NEW_S", -1.0)
-        with join._directory() as third:
+        with join.directory_of_agents() as third:
             assert {*tmp_path.iterdir()} == {active, third}
     assert [*tmp_path.iterdir()] == []
 

@@ -1,0 +1,140 @@
+"""The workers of a Dask cluster that play the agents of one run.
+
+The run has a secret of its own. Dask hands it to the workers together with the address at which the harness listens.
+Each worker gets one task, which lasts as long as the run. Dask would start the task of a lost worker again. The harness
+refuses the agents of this second task, because the data of the first agents are lost.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import socket
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Any
+from urllib.parse import urlsplit
+
+from harness.errors import MachineError
+from harness.play.hosts._placement import place
+from harness.play.hosts._worker_task import HostOrder, play_agents
+from harness.play.machine.dask_cluster import connected
+
+BACKLOG = 512
+WATCH_EVERY_S = 0.5
+END_LIMIT_S = 10.0
+"""Wall seconds after the run in which the workers must end their tasks."""
+
+
+class AgentHosts:
+    """The workers that play the agents of a run, and the agents of each."""
+
+    def __init__(self, client: Any, commands: Mapping[int, Sequence[str] | None]) -> None:
+        """Distribute the agents. `commands` contains the command of each agent, or None for the harness's agent."""
+        self._client, self._commands = client, commands
+        self._placed = place([*commands], client.nthreads())
+        self._worker_of = {agent: worker for worker, agents in self._placed.items() for agent in agents}
+        self._listeners: dict[str, socket.socket] = {}
+        self._tasks: list[Any] = []
+        self._loop = asyncio.get_running_loop()
+        self._problem: asyncio.Future[str] = self._loop.create_future()
+        self.secret = secrets.token_bytes(32)
+
+    @classmethod
+    @asynccontextmanager
+    async def opened(cls, scheduler: str, commands: Mapping[int, Sequence[str] | None]) -> AsyncIterator[AgentHosts]:
+        """Connect to the scheduler for the context. Raises the errors of `connected`."""
+        connection = connected(scheduler)
+        client = await asyncio.to_thread(connection.__enter__)
+        try:
+            hosts = cls(client, commands)
+            try:
+                yield hosts
+            finally:
+                await hosts._end()
+        finally:
+            await asyncio.to_thread(connection.__exit__, None, None, None)
+
+    @property
+    def agents(self) -> Sequence[int]:
+        return [*self._commands]
+
+    def worker_of(self, agent_id: int) -> str:
+        """Return the address of the worker that plays the agent."""
+        return self._worker_of[agent_id]
+
+    def listen(self) -> list[socket.socket]:
+        """Listen at each address of this machine that a worker can reach. The caller closes the sockets.
+
+        Raises MachineError if a worker cannot be reached.
+        """
+        for worker in self._placed:
+            where = _own_address(worker)
+            if where not in self._listeners:
+                self._listeners[where] = _listener(where)
+        return [*self._listeners.values()]
+
+    def start(self) -> None:
+        """Let each worker play its agents. They connect to the addresses of `listen`."""
+        for worker, agents in self._placed.items():
+            host, port = self._listeners[_own_address(worker)].getsockname()[:2]
+            order = HostOrder(host, port, self.secret.hex(), {agent: _words(self._commands[agent]) for agent in agents})
+            task = self._client.submit(play_agents, order, workers=[worker], pure=False, allow_other_workers=False)
+            task.add_done_callback(partial(self._notify, worker))
+            self._tasks.append(task)
+
+    def _notify(self, worker: str, task: Any) -> None:
+        """Report the end of a task, from a thread of Dask."""
+        if task.status == "error":
+            problem = f"the worker at {worker} cannot play its agents: {task.exception()}"
+            with contextlib.suppress(RuntimeError):  # the run is over
+                self._loop.call_soon_threadsafe(self._fail, problem)
+
+    def _fail(self, problem: str) -> None:
+        if not self._problem.done():
+            self._problem.set_result(problem)
+
+    async def watch(self) -> None:
+        """Wait until a worker is lost or ends its task with an error, and raise MachineError. After the mission has
+        begun, this only cuts off the agents of the worker.
+        """
+        while not self._problem.done():
+            present = await asyncio.to_thread(self._client.nthreads)
+            if lost := [worker for worker in self._placed if worker not in present]:
+                raise MachineError(f"the worker at {lost[0]} was lost before the mission began: start it again")
+            await asyncio.wait([self._problem], timeout=WATCH_EVERY_S)
+        raise MachineError(self._problem.result())
+
+    async def _end(self) -> None:
+        """Wait until the workers have ended their agents, which they do when the harness no longer listens."""
+        from distributed import wait
+
+        with contextlib.suppress(Exception):  # a lost worker or scheduler, which the run has reported
+            await asyncio.to_thread(wait, self._tasks, timeout=END_LIMIT_S)
+
+
+def _words(command: Sequence[str] | None) -> list[str] | None:
+    return None if command is None else [*command]
+
+
+def _own_address(worker: str) -> str:
+    """Return the address of this machine from which packets to the worker leave. Raises MachineError."""
+    parts = urlsplit(worker)
+    try:
+        family, _, _, _, place = socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect(place)  # of a datagram socket: no packet is sent
+            return str(probe.getsockname()[0])
+    except OSError as error:
+        raise MachineError(f"the worker at {worker} cannot be reached from here ({error.strerror})") from None
+
+
+def _listener(host: str) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.bind((host, 0))
+    listener.listen(BACKLOG)
+    listener.setblocking(False)
+    return listener

@@ -1,0 +1,19 @@
+"""Distribute agents over workers in proportion to the threads of the workers."""
+
+from collections.abc import Mapping, Sequence
+
+
+def place(agents: Sequence[int], threads: Mapping[str, int]) -> dict[str, list[int]]:
+    """Return the agents of each worker. `threads` is the number of threads of each worker, by its address.
+
+    Each worker gets consecutive agents. Workers without an agent are left out.
+    """
+    workers, total = sorted(threads), sum(threads.values())
+    placed, before = dict[str, list[int]](), 0
+    for worker in workers:
+        after = before + threads[worker]
+        first, end = (round(len(agents) * count / total) for count in (before, after))
+        if first < end:
+            placed[worker] = [*agents[first:end]]
+        before = after
+    return placed

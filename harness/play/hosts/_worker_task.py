@@ -1,0 +1,62 @@
+"""Play agents on a worker of a Dask cluster. The functions of this module run in the worker."""
+
+import json
+import os
+import subprocess
+import sys
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from harness.errors import MachineError
+from harness.play.agent_control import last_line
+from netem import far_network
+from netem.errors import LabUnavailable
+
+
+@dataclass(frozen=True)
+class HostOrder:
+    """The agents that a worker plays, and where they join. Without a command, an agent is that of the harness."""
+
+    host: str
+    port: int
+    secret: str
+    """The secret of the run, in hexadecimal digits."""
+    commands: dict[int, list[str] | None]
+
+
+def why_not(programs: list[str]) -> str | None:
+    """Return a sentence if this computer cannot play agents, or lacks one of the programs. Otherwise return None."""
+    try:
+        far_network.first_process([])
+    except LabUnavailable as error:
+        return str(error)
+    missing = [program for program in programs if not os.access(program, os.X_OK)]
+    return f"it has no program {missing[0]}: install it there at the same path" if missing else None
+
+
+def play_agents(order: HostOrder) -> None:
+    """Let agents join a run, and wait until the run is over. Raises MachineError if they could not join.
+
+    The agents are in a process of their own, because its main thread must own the private networks. It ends when its
+    standard input ends, so it does not survive this worker.
+    """
+    path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
+    with subprocess.Popen(
+        [sys.executable, "-P", "-m", "harness.play.hosts.far_host"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": path},
+        start_new_session=True,  # Ctrl-C in the terminal of the worker must end the worker first
+    ) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        with suppress(BrokenPipeError):  # its output has the reason
+            process.stdin.write(json.dumps(vars(order)).encode() + b"\n")
+            process.stdin.flush()
+        lines = deque(process.stderr, maxlen=1)
+        status = process.wait()
+    if status != 0:
+        raise MachineError(last_line(b"".join(lines).decode(errors="replace")) or f"its agents ended with {status}")
