@@ -1,3 +1,3 @@
-"""Process the records of real flights: read them, replay them, reconstruct flights, find faulty commits, and merge
-chains.
+"""Process the records of real flights. The package imports records, replays them, reconstructs flights, finds the
+commit that caused an error, and merges chains.
 """

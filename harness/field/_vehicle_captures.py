@@ -34,9 +34,10 @@ class CapturedDatagram:
 
 @dataclass
 class AgentCapture:
-    """The datagrams in the capture of a vehicle, in order. `epoch_us` is the time of mission second 0 on its clock."""
+    """The datagrams in the capture of a vehicle, in order."""
 
     epoch_us: float
+    """The time of mission second 0 on the clock of the vehicle, in microseconds."""
     speedup: float
     sightings: list[CapturedDatagram] = field(default_factory=list)
     unreadable: int = 0

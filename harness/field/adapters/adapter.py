@@ -18,15 +18,15 @@ from harness.errors import FieldError
 @dataclass(frozen=True, slots=True)
 class TraceLine:
     """A line of an agent's trace in the format of the agent contract (`ucp-trace/2`), such as the header or a handler
-    run.
-
-    The lines of one agent come in their original order, the header first.
+    run. An adapter yields the lines of one agent in their original order, and the header first.
     """
 
     agent_id: int
     text: str | bytes
     where: int | None = None
-    """Number of the line, row or message in the source, counted from 1. The following classes have the same field."""
+    """Number of the line, row or message in the source file, counted from 1. The following classes have the
+    same field.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +42,11 @@ class Datagram:
 
 @dataclass(frozen=True, slots=True)
 class LoggedEvent:
-    """An event that the agent had to log. `time_ns` is the time of the event in nanoseconds since the Unix epoch
-    (Section 3.1).
-    """
+    """An event that the agent had to log."""
 
     agent_id: int
     time_ns: int
+    """The time of the event in nanoseconds since the Unix epoch (Section 3.1)."""
     event_id: int
     data: bytes
     where: int | None = None
@@ -63,10 +62,9 @@ class ChainExport:
 
 @dataclass(frozen=True, slots=True)
 class Unusable:
-    """A part of the source file that cannot be used. `why` completes a sentence, as in "it has no time".
-
-    If `of_a_trace` is true, the part may have been a line of a trace. The trace of `agent_id` then has a gap at this
-    place. If `agent_id` is None, all traces have a gap.
+    """A part of the source file that cannot be used. `why` is a reason that completes a sentence, as in "it has no
+    time". If `of_a_trace` is true, the part may have been a line of a trace, so the trace of agent `agent_id` has a gap
+    at this place. If `agent_id` is None, all traces have a gap at this place.
     """
 
     why: str
@@ -81,17 +79,15 @@ Observation = TraceLine | Datagram | LoggedEvent | ChainExport | Unusable
 
 
 class Adapter:
-    """The base class of adapters. A subclass recognises one file format and reads it.
-
-    `counts` is the unit of `where`: "line", "row" or "message".
+    """The base class of adapters. A subclass recognises files of one format and reads them. `counts` names the unit in
+    which `where` counts: "line", "row" or "message".
     """
 
     counts: ClassVar[str] = "line"
 
     def recognises(self, source: Path, beginning: bytes) -> bool:
-        """Return true if a file has this format. The adapter decides this by the file's name or first bytes.
-
-        The default accepts every file.
+        """Return true if a file has the format of this adapter. A subclass decides this by the file's name or first
+        bytes. The default implementation accepts every file.
         """
         return True
 

@@ -56,10 +56,9 @@ FILE = "import.json"
 
 
 class ImportedAgent(BaseModel):
-    """The imported files of one agent. Their names are relative to the directory of the flight.
-
-    `trace_from` lists the sources of the trace. `handler_runs`, `lives` (incarnations), `gaps` and `clock_jumps` are
-    numbers of these items in the trace.
+    """The imported files of one agent. The file names are relative to the directory of the flight. `trace_from` lists
+    the source files of the trace. `handler_runs`, `lives` (incarnations), `gaps` and `clock_jumps` are counts of these
+    items in the trace.
     """
 
     trace: str | None = None
@@ -86,8 +85,8 @@ class ImportedFlight(BaseModel):
 
 
 class ImportRemark(BaseModel):
-    """A remark on a source file or on a part of it. `counts` is the unit of positions in the file, such as lines. `why`
-    completes a sentence.
+    """A remark on a source file or on a part of it. `counts` names the unit in which positions in the file are counted,
+    such as lines. `why` is the text of the remark, which completes a sentence.
     """
 
     path: str
@@ -120,7 +119,7 @@ class ImportRecord(BaseModel):
 AGENTS = "agents"
 FLIGHT_LOGS = "flight-logs"
 INCOMPLETE_LINE = '{"lost_lines":'
-"""The beginning of a line about lost lines. A truncated trace ends with it."""
+"""The beginning of a trace line that reports lost lines. A truncated trace ends with this text."""
 _COPY_BYTES = 1024 * 1024
 
 
@@ -299,9 +298,8 @@ def _adapter_for(path: Path, adapters: Iterable[Adapter]) -> Adapter | None:
 
 
 class _RecordingReader:
-    """A reader of one recording, which may consist of several files.
-
-    It sorts the observations of the adapter by kind.
+    """A reader of one recording, which may consist of several files. The reader sorts the observations of the adapter
+    by their types.
     """
 
     def __init__(self, path: Path, adapter: Adapter, scratch: Path, left_out: list[UnusedPart]) -> None:
@@ -386,7 +384,7 @@ class _RecordingReader:
         capture.packet(datagram.time_ns, udp_broadcast(sender, PORT, datagram.data), outbound=datagram.sent)
 
     def end(self, sorter: RecordSorter) -> None:
-        """Pass the records to the sorter after the last file was read."""
+        """Pass the records to the sorter. Call this method after the last file was read."""
         for agent_id, capture in self._captures.items():
             capture.close()
             seen = summarise_capture(self._scratch / f"{agent_id}.pcapng", self._left_out)

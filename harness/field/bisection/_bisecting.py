@@ -15,9 +15,8 @@ from harness.run.code_state import GitBisection, GitCommit, RepositoryError, Sus
 
 @dataclass(frozen=True)
 class CommitTrial:
-    """The result of testing one commit: `good` (unchanged outcome), `bad` (changed outcome), or `skip` (not testable).
-
-    `why` is the reason.
+    """The result of testing one commit. `good` means that the outcome did not change. `bad` means that it changed.
+    `skip` means that the commit cannot be tested, for the reason `why`.
     """
 
     commit: str
@@ -27,15 +26,14 @@ class CommitTrial:
 
 @dataclass
 class BisectionResult:
-    """The result of a bisection. `first` is the first commit that changes the outcome of a scenario or a record.
-
-    If some commits cannot be tested, `first` contains several candidates. It is empty if the good and the bad commit
-    have the same outcome.
-    """
+    """The result of a bisection, the search for the first commit that changes the outcome."""
 
     good: Outcome
     bad: Outcome
     first: list[GitCommit] = field(default_factory=list)
+    """The first commit that changes the outcome. If some commits cannot be tested, there are several candidates. Empty
+    if the outcome is the same at the good and at the bad commit.
+    """
     tried: list[CommitTrial] = field(default_factory=list)
     changes: list[str] = field(default_factory=list)
     """Differences between the outcome of the good commit and the outcome after the change."""

@@ -83,9 +83,8 @@ class ExpectedMessage:
 
 @dataclass(frozen=True)
 class ScriptedDatagram:
-    """A datagram to send to the agent program.
-
-    If the datagram is an answer, `after` is the agent's query, and `asked_s` is the time of the query.
+    """A datagram that the harness sends to the agent program at a given time. If the datagram is an answer, `after` is
+    the agent's query, and `asked_s` is the time of this query.
     """
 
     t: float
@@ -100,8 +99,8 @@ class ScriptedDatagram:
 
 @dataclass(frozen=True)
 class PeerScript:
-    """A script for the peers of the agent program: the datagrams and commands to send to the program at each mission
-    second, and the messages expected from it.
+    """A script for the simulated peers of the agent program. The script contains the datagrams and commands to send to
+    the program at each mission second, and the messages that the program should send.
     """
 
     datagrams: list[ScriptedDatagram]
@@ -120,9 +119,8 @@ class PeerScript:
         return self.lines[max(0, bisect_right(self.lines, at_s, key=itemgetter(0)) - 1)][1] if self.lines else 0
 
     def is_near_reconcile_end(self, at_s: float, slack_s: float) -> bool:
-        """Return true if a reconcile of the recorded agent ended at about that time.
-
-        Around this time, a process may begin to answer queries slightly earlier or later.
+        """Return true if a reconcile of the recorded agent ended near this mission second. Near this time, a process
+        may begin to answer queries slightly earlier or later than in the record.
         """
         index = bisect_left(self.finished, at_s - slack_s)
         return index < len(self.finished) and self.finished[index] <= at_s + slack_s
@@ -217,9 +215,9 @@ def _messages(run: HandlerRun) -> Iterator[tuple[str, Message]]:
 def play_live(
     record: RecordedTrace, command: Sequence[str], directory: Path, *, speedup: float
 ) -> list[RecordDifference]:
-    """Send the recorded inputs to an agent program. Return the differences between its messages and the recorded ones.
-
-    Raises MachineError, NotStartedError, ReplayFailedError, or FieldError if the record has unknown names.
+    """Send the recorded inputs to an agent program. Return the differences between the messages of the program and the
+    recorded messages. Raises MachineError, NotStartedError, ReplayFailedError. Raises FieldError if the record has
+    unknown names.
     """
     if unknown := first_unknown(unknown_names(record.trace.runs), ("trigger", "handler", "branch", "timer")):
         raise FieldError(f"{record.path}: {unknown}, so it cannot be played; give another record")
@@ -362,9 +360,8 @@ def _received(path: Path, agent_id: int) -> list[tuple[float, Message]]:
 def _compare(
     script: PeerScript, received: list[tuple[float, Message]], slack_s: float
 ) -> Iterator[tuple[float, RecordDifference]]:
-    """Yield the messages that are missing, different or unexpected, each with its mission second.
-
-    An agent does not answer during a reconcile. Messages about the end of a reconcile are therefore not compared.
+    """Yield each message that is missing, different or unexpected, with its mission second. Messages about the end of a
+    reconcile are not compared, because an agent does not answer during a reconcile.
     """
     unmatched = list(received)
     for expected_message in script.expected:

@@ -32,15 +32,16 @@ CODE = "{code}"
 
 
 class UntestableError(HarnessError):
-    """An error: this commit cannot be tested, because its code cannot be started or lacks a feature."""
+    """An error: this commit cannot be tested, because its code does not start or lacks a required feature."""
 
 
 class SubjectPlayer:
-    """A player that plays one scenario or record once for each commit. Each play has its own directory in `directory`,
-    and may take `limit_s` seconds.
+    """A player of one scenario or record, for several commits. It plays each commit in a directory of its own inside
+    `directory`, for at most `limit_s` seconds.
 
-    Without `command`, the code under test plays a scenario in virtual time, and its core plays records. With `command`,
-    the installed harness plays a scenario with agent processes, and an agent process replays the record of one agent.
+    Without `command`, the code of the commit plays a scenario in virtual time, and the agent core of the commit plays
+    records. With `command`, the installed harness starts agent processes with this command. They play the scenario, or
+    the record of one agent.
     """
 
     def __init__(
@@ -122,9 +123,8 @@ class SubjectPlayer:
         return self._judge(played, run_dir, exact=False), run_dir
 
     def _judge(self, played: ProcessResult, run_dir: Path, *, exact: bool) -> Outcome:
-        """Return the result of a run. The installed checker judges the run, not the checker of the tested commit.
-
-        Raises UntestableError.
+        """Return the result of a run. The installed checker judges the run. The checker of the tested commit is not
+        used. Raises UntestableError.
         """
         if played.status is None:
             raise UntestableError(f"it did not end within {self._limit_s:g} s; allow more time with --limit-s")

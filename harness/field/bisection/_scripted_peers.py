@@ -45,9 +45,8 @@ MAX_QUESTION_GAP_S = 6.0
 
 
 class AgentLateness:
-    """The delay of the agent during a reconcile, compared with the record, in mission seconds.
-
-    `margin_s` is the additional delay that its next timer is expected to have.
+    """The delay of the agent process during a reconcile, compared with the record, in mission seconds. `margin_s` is an
+    allowance for a further delay of the agent's next timer.
     """
 
     def __init__(self, margin_s: float) -> None:
@@ -56,7 +55,7 @@ class AgentLateness:
         self._asked_s = -math.inf
 
     def note_question(self, now: float, in_record: Iterable[float]) -> None:
-        """Update the delay with a query that the agent sent. `in_record` contains the times of this query in the
+        """Update the measured delay when the agent sends a query. `in_record` contains the times of this query in the
         record.
         """
         nearest = min(in_record, key=lambda at_s: abs(now - at_s), default=None)
@@ -64,7 +63,7 @@ class AgentLateness:
             self._late_s, self._asked_s = max(0.0, now - nearest), nearest
 
     def at(self, mission_s: float) -> float:
-        """Return the delay for a datagram that was sent at this mission second in the record."""
+        """Return the current delay for a datagram that the record contains at this mission second."""
         return self._late_s + self._margin_s if mission_s - self._asked_s < MAX_QUESTION_GAP_S else 0.0
 
 

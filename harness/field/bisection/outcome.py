@@ -1,5 +1,5 @@
-"""Define the scenario or records that a bisection plays, the result of playing them once, and the differences between
-two results.
+"""Define the subject of a bisection (a scenario or records), the result of playing the subject once, and the
+differences between two results.
 """
 
 from collections.abc import Iterator
@@ -36,11 +36,10 @@ class RecordDifference(_OutcomeModel):
 
 
 class AgentResult(_OutcomeModel):
-    """The result of one agent. A field that is None is not compared.
-
-    `chain` contains the names of the agent's blocks, oldest first, and `top` is its top chain hash. `deviates` is the
-    handler of its first deviation, or "" if that is no handler of the protocol. `differences` contains the differences
-    from its record.
+    """The result of one agent. A field is None if it is not compared. `chain` contains the names of the agent's blocks,
+    oldest first, and `top` is the top chain hash. `deviates` is the name of the handler in which the agent first
+    deviates from the protocol, or "" without such a handler. `differences` contains the differences from the agent's
+    record.
     """
 
     chain: list[str] | None = None
@@ -50,15 +49,14 @@ class AgentResult(_OutcomeModel):
 
 
 class Outcome(_OutcomeModel):
-    """The outcome of playing a scenario or record once. If an exception in the tested code ended it, `crashed` is the
-    place of this exception.
-    """
+    """The outcome of playing a scenario or record once."""
 
     schema_: Literal["ucp-outcome/1"] = "ucp-outcome/1"
     subject: str
     agents: dict[int, AgentResult] = {}
     verdicts: dict[str, str] = {}
     crashed: str | None = None
+    """The place of the exception that ended the tested code. None without an exception."""
 
     def as_recorded(self) -> "Outcome":
         """Return the outcome of an agent core that does not differ from the records."""
@@ -180,8 +178,8 @@ YAML = (".yaml", ".yml")
 
 @dataclass(frozen=True)
 class BisectionSubject:
-    """The scenario or the records to play. If `scenario` is None, the subject is the records in `path`. `agent` selects
-    the records of one agent.
+    """The subject of a bisection. If `scenario` is None, the subject is the records in `path`, and `agent` selects the
+    records of one agent.
     """
 
     path: Path

@@ -31,15 +31,15 @@ from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 from ucp.trigger import MessageTrigger
 
 ON_AIR_S = 0.005
-"""Maximum difference of the sending times of two messages, in seconds, at which both messages count as on the air at
-the same time.
+"""Maximum difference between the sending times of two messages, in seconds, at which both messages count as on the air
+at the same time.
 """
 _NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitBlock, ChainContainQuery))
 
 
 class _SentMessage(NamedTuple):
-    """A message with the vehicles that received it (`reached`) and the vehicles that did not (`lost`), as far as the
-    records show.
+    """A message, with the vehicles that received it (`reached`) and the vehicles that did not receive it (`lost`), as
+    far as the records show this.
     """
 
     at_s: float

@@ -43,7 +43,9 @@ LEVEL = 0.95
 PARAMETERS = ("range_m", "spread", "floor", "load")
 
 _STEPS_PER_FOLD = 50
-"""Number of steps per factor e of distance. Transmissions in the same step are counted together."""
+"""Number of steps per factor e (2.718) of distance. Transmissions whose distances fall into the same step are counted
+together.
+"""
 _MOST_ITERATIONS = 60
 _LEAST = 1e-9
 _LOWEST = (math.log(1.0), math.log(0.02), 0.0, 0.0)
@@ -382,8 +384,8 @@ def student(freedom: float) -> float:
 
 
 def wilson(delivered: float, attempts: float) -> ConfidenceInterval:
-    """Return Wilson's confidence interval of a probability from independent draws (Wilson, JASA 22, 1927). Without
-    draws, it is 0 to 1.
+    """Return Wilson's confidence interval of a probability, computed from independent draws (Wilson, JASA 22, 1927).
+    Without draws, the interval is 0 to 1.
     """
     if not attempts:
         return ConfidenceInterval(0.0, 1.0)

@@ -20,7 +20,7 @@ _PLAUSIBLE = (1.0, 6.0)
 _METRES_PER_DEGREE = 111_195.0
 
 Sample = tuple[float, float, int]
-"""A sample: ln(distance), signal strength in dB, number of the minute."""
+"""A signal strength measurement: ln(distance), signal strength in dB, and number of the minute."""
 
 
 @dataclass(frozen=True)

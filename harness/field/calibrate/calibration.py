@@ -27,8 +27,8 @@ from netem.channel import PRESETS
 from netem.radio import LogDistance
 
 TRAINING_SHARE = 2 / 3
-"""Length of the first part of the flight, as a share of the flight time. The validation fits the model to this part.
-The model then predicts the rest.
+"""The share of the flight to which the validation fits the model, from the beginning of the flight. The model then
+predicts the rest of the flight.
 """
 BLOCK_S = 120.0
 _BINS = 10
@@ -138,9 +138,8 @@ class CalibrationResult:
             yield self.validation.sentence
 
     def network(self, preset: str | None = None) -> dict[str, object]:
-        """Return the section `network` of a scenario. It contains a radio, or the shared channel of a preset.
-
-        A shared channel simulates the losses caused by other messages, so only `floor` remains as its constant loss.
+        """Return the section `network` of a scenario. The section contains a radio, or the shared channel of a preset.
+        A shared channel simulates the losses by other messages, so the section then has only the loss rate `floor`.
         """
         if self.fit is None:
             delivered = sum(attempt.delivered for attempt in self.attempts)
@@ -337,6 +336,6 @@ def share_of(attempts: Sequence[TransmissionAttempt]) -> DeliveryShare:
 
 
 def model_of(radio: LogDistance, loss: float = 0.0) -> DeliveryModel:
-    """Return a delivery model with the same probabilities as this radio with an additional loss rate."""
+    """Return a delivery model that has the same probabilities as this radio together with an additional loss rate."""
     range_m = 10 ** (radio.margin_db(1.0) / (10 * radio.exponent))
     return DeliveryModel(range_m, radio.shadowing_db * math.log(10) / (10 * radio.exponent), loss)

@@ -59,10 +59,9 @@ EXPORT_AGAIN = "export it again if you can"
 
 @dataclass(frozen=True)
 class ReadExport:
-    """A chain export and its file. The hashes in `export` are the computed ones.
-
-    `problems` has a sentence for each error. If a block has a wrong hash in the file, `claims` maps its computed hash
-    to the wrong one.
+    """A chain export and its file. The hashes in `export` are computed from the content of the blocks. `problems` has a
+    sentence for each error. If the file gives a wrong hash for a block, `claims` maps the computed hash to the wrong
+    hash.
     """
 
     path: Path
@@ -120,9 +119,8 @@ class CollectedExports:
 
     @property
     def claims(self) -> dict[str, str]:
-        """The blocks that have a wrong hash in a file: computed hash -> wrong hash.
-
-        A block is not included if another export contains it with the computed hash, or if its agent completed it.
+        """The blocks for which a file gives a wrong hash: computed hash -> wrong hash. A block is not included if
+        another export contains it with the computed hash, or if its agent completed it.
         """
         claims = {true: claimed for read_export in self.read_exports for true, claimed in read_export.claims.items()}
         for read_export in self.read_exports if claims else ():
@@ -133,10 +131,9 @@ class CollectedExports:
 
 @gc_paused()
 def collect_exports(paths: Iterable[Path], keys: "PublicKeys | None" = None) -> CollectedExports:
-    """Read the exports in these files and directories. Return those of the mission with the most agents.
-
-    `keys` are public keys that the user trusts. Without them, signatures are verified with the keys in the directories.
-    Raises FieldError if a path does not exist, and ExportError if no export is usable.
+    """Read the exports in these files and directories. Return the exports of the mission with the most agents. `keys`
+    are public keys that the user trusts. Without `keys`, the keys in the directories verify the signatures. Raises
+    FieldError if a path does not exist, and ExportError if no export is usable.
     """
     reader, read_exports, left_out = _ExportReader(), list[ReadExport](), list[str]()
     skipped, context_files, flight_logs = list[UnusedPart](), list[ComparedFile](), list[FlightLog]()
@@ -224,8 +221,8 @@ class NotAnExportError(ExportError):
 
 
 def _largest_mission(read_exports: Iterable[ReadExport]) -> str:
-    """Return the hash of the inception block of the mission with the most agents. Of several such missions, return the
-    one with the most blocks.
+    """Return the hash of the inception block of the mission with the most agents. If several missions have the same
+    number of agents, return the mission with the most blocks.
     """
     agents: dict[str, set[int]] = {}
     blocks: Counter[str] = Counter()
@@ -252,8 +249,8 @@ def _other_missions(read_exports: Iterable[ReadExport], mission: str) -> Iterato
 
 
 def _by_agent(read_exports: Iterable[ReadExport], left_out: list[str]) -> CollectedExports:
-    """Group the exports by agent. The latest export of an agent contains its current state. Earlier exports may contain
-    blocks that the latest one lacks.
+    """Group the exports by agent. The latest export of an agent contains the current state of the agent. Earlier
+    exports may contain further blocks.
     """
     collected = CollectedExports({}, [], left_out, [])
     for each in read_exports:

@@ -42,7 +42,7 @@ _HEADER = struct_of(EVENT_FIELDS)
 
 @dataclass(frozen=True)
 class RecordedBlock:
-    """A block of the merged record. Its events are decoded only when they are needed."""
+    """A block of the merged record. The object decodes the events of the block only when they are needed."""
 
     line: Block
     event_data: bytes
@@ -77,15 +77,14 @@ class MergedRecord:
 
     @property
     def unfinished(self) -> list[RecordedBlock]:
-        """The unfinished blocks: their agents had not completed them when they exported their chains."""
+        """The blocks that agents had not completed when they exported their chains."""
         return [block for block in self.blocks if block.line.block_hash is None]
 
 
 @gc_paused()
 def consolidate(collected: CollectedExports, depot: "Depot | None" = None) -> MergedRecord:
-    """Merge the exports of a mission into one record, and return this record.
-
-    `depot` decrypts event data. Raises ExportError if its key does not fit the mission.
+    """Merge the exports of a mission into one record, and return this record. `depot` decrypts event data. Raises
+    ExportError if the key in `depot` does not belong to the mission.
     """
     event_data = EventData.of(collected.exports.values(), depot)
     blocks = all_blocks(collected.read_exports)
@@ -178,8 +177,8 @@ def _event_data(block: ExportedBlock, event_data: EventData) -> tuple[bytes, boo
 
 
 def events_in(event_data: bytes) -> list[tuple[int, int, int, int]]:
-    """Return the events up to the first unreadable one. Each event has its timestamp, its ID, and the start and end
-    positions of its data.
+    """Return the events in the event data, up to the first unreadable event. Each event has its timestamp, its ID, and
+    the start and end positions of its data.
     """
     events, offset = [], 0
     last_header = len(event_data) - EVENT_HEADER_BYTES
@@ -198,7 +197,7 @@ def _unreadable(event_data: bytes, events: Sequence[tuple[int, int, int, int]]) 
 
 
 def _names(collected: CollectedExports) -> dict[str, str]:
-    """Return block hash -> name of the block. If a file contains a modified block, its name is that of the original
+    """Return block hash -> name of the block. If a file contains an edited block, its name is the name of the original
     block, followed by "(edited)".
     """
     claims = collected.claims
@@ -249,8 +248,8 @@ def _holdings(collected: CollectedExports) -> dict[str, list[Holding]]:
 
 
 def _add_unfinished(recorded_blocks: list[RecordedBlock], collected: CollectedExports) -> None:
-    """Add the unfinished block of each export. If a recorded block begins with the same events, both are the same
-    block, and only its holders are added.
+    """Add the unfinished block of each export to the record. If a recorded block begins with the same events, both are
+    the same block. In this case, only the holders of the unfinished block are added.
     """
     building = [
         (base64.b64decode(export.current_block.event_data), export)

@@ -114,7 +114,7 @@ def _scenario(record: MergedRecord) -> Scenario:
 
 
 def _signatures(collected: CollectedExports) -> dict[bytes, bytes]:
-    """Return the signatures in the exports, by block hash. They are not verified."""
+    """Return the signatures in the exports, by block hash. This function does not verify the signatures."""
     return {
         bytes.fromhex(block.block_hash): base64.b64decode(block.signature)
         for read_export in collected.read_exports
@@ -124,8 +124,8 @@ def _signatures(collected: CollectedExports) -> dict[bytes, bytes]:
 
 
 def _stored(collected: CollectedExports) -> dict[int, StoredState]:
-    """Return the initial state of each agent, which comes from its export. Repeated blocks and modified blocks are
-    omitted.
+    """Return the state with which each agent starts the reconcile. The state comes from the agent's export. Repeated
+    and edited blocks are omitted.
     """
     claims, shared_blocks = collected.claims, dict[str, Block]()
     stored = {}

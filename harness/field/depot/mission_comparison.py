@@ -66,8 +66,8 @@ class ComparedFile:
 
 @dataclass(frozen=True)
 class MissionDifference:
-    """A difference between files. `file` is None if a file is missing. `key` is None if the file as a whole
-    is wrong.
+    """A difference between the compared files. `file` is None if a file is missing. `key` is None if the whole file is
+    wrong.
     """
 
     file: Path | None
@@ -156,8 +156,8 @@ def differences(files: Sequence[ComparedFile]) -> list[MissionDifference]:
 
 
 def read(path: Path) -> ComparedFile:
-    """Read a file of a vehicle or of the mission. Raises UnreadableFileError with the reason, which does not contain
-    the name of the file.
+    """Read a file of a vehicle or of the mission. Raises UnreadableFileError. The message gives the reason, but not the
+    name of the file.
     """
     document = _beginning(path)
     schema = document.get("schema")
@@ -287,8 +287,8 @@ def _shown(value: Any) -> str:
 
 
 def _deviating_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifference]:
-    """Yield a difference for each value that differs from the expected value. The expected value is in the manifest.
-    Without a manifest, it is the most frequent value.
+    """Yield a difference for each value that differs from the expected value. The manifest contains the expected
+    values. Without a manifest, the most frequent value is expected.
     """
     names = dict.fromkeys(name for file in files for name in file.shared)
     for name in names:
@@ -316,8 +316,8 @@ def _deviating_values(files: Sequence[ComparedFile]) -> Iterator[MissionDifferen
 
 
 def _has_settings_to_compare(file: ComparedFile, others: Sequence[ComparedFile]) -> bool:
-    """Return true if single settings can be compared. The comparison then names the differing settings instead of
-    reporting a different hash of all settings.
+    """Return true if the settings can be compared one by one. The comparison then names the settings that differ, and
+    does not report a different hash of all settings.
     """
     return file.mission is not None and any(other.mission is not None for other in others)
 
@@ -374,7 +374,9 @@ def _roster_differences(files: Sequence[ComparedFile]) -> Iterator[MissionDiffer
 
 
 def _files(paths: Iterable[Path]) -> list[tuple[Path, bool]]:
-    """Return each file once, with true if the user named the file itself, and false if the user named its directory."""
+    """Return each file once, in a pair. The second element is true if the user named the file itself, and false if the
+    user named its directory.
+    """
     files: dict[Path, tuple[Path, bool]] = {}
     for path in paths:
         if path.is_dir():

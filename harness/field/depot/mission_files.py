@@ -50,8 +50,7 @@ class ManifestInception(BaseModel):
 
 
 class Manifest(BaseModel):
-    """The manifest of a mission. `files` maps each agent ID to its mission file in the same directory.
-    `settings_sha256` is the SHA-256 hash of the settings."""
+    """The manifest of a mission."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -60,9 +59,11 @@ class Manifest(BaseModel):
     roster: list[AgentId]
     inception: ManifestInception
     settings_sha256: Hash
+    """The SHA-256 hash of the settings."""
     broadcast: str
     port: Annotated[int, Field(ge=1, le=65535)]
     files: dict[VehicleKey, str]
+    """Agent ID -> the mission file of the agent, in the same directory."""
 
     def to_json(self) -> dict[str, Any]:
         return self.model_dump(mode="json", by_alias=True)
@@ -164,10 +165,9 @@ class MissionPlan:
 
 
 def write(plan: MissionPlan, directory: Path, *, overwrite: bool = False) -> list[Path]:
-    """Write the mission files and the manifest. Return their paths, with the manifest as the last one.
-
-    Raises MissionFileError, or MachineError on a disk error. Raises RunDirectoryError if a file exists and `overwrite`
-    is false, or if the directory contains further mission files.
+    """Write the mission files and the manifest. Return their paths, the path of the manifest last. Raises
+    MissionFileError, or MachineError on a disk error. Raises RunDirectoryError if a file exists and `overwrite` is
+    false, or if the directory contains other mission files.
     """
     documents = {f"{agent_id}{SUFFIX}": document for agent_id, document in plan.documents().items()}
     missions = {name: parse_mission(document) for name, document in documents.items()}

@@ -39,8 +39,8 @@ class RecordLine(BaseModel):
 
 
 class ExportUsed(RecordLine):
-    """A chain export that was used, and the numbers of blocks in it. `latest` is true for the most recent export of an
-    agent.
+    """A chain export that was used for the record, and the number of blocks in the export. `latest` is true for the
+    most recent export of an agent.
     """
 
     agent_id: AgentId
@@ -81,8 +81,8 @@ class Header(RecordLine):
 
 
 class ForkBranch(RecordLine):
-    """The agents whose chains continue with the same block `next` after a fork. `next` is null if their chains end at
-    the fork.
+    """One branch of a fork: the agents whose chains continue with the same block `next` after the fork. `next` is null
+    if the chains of these agents end at the fork.
     """
 
     agents: list[AgentId]
@@ -103,16 +103,18 @@ class Fork(RecordLine):
 
 
 class Holding(RecordLine):
-    """A place at which some agents hold a block, and the IDs of these agents. `position` counts from 1: in a chain from
-    the inception block, in a deque from the front, in a stack from the bottom.
-
-    Blocks with the same `chain_hash` have the same predecessors. The place `current block` means that the agent had not
-    completed the block yet. `earlier export` means that only an older export of the agent contains the block.
-    """
+    """A place at which some agents hold a block, and the IDs of these agents."""
 
     place: Place
+    """The place. `current block` means that the agent had not completed the block yet. `earlier export` means that only
+    an older export of the agent contains the block.
+    """
     position: Number | None
+    """The position of the block, counted from 1: in a chain from the inception block, in a deque from the front, in a
+    stack from the bottom.
+    """
     chain_hash: Hash | None
+    """The chain hash at the block. Blocks with the same chain hash have the same predecessors."""
     agents: list[AgentId]
 
 
@@ -145,8 +147,8 @@ class Block(RecordLine):
 
 
 class Event(RecordLine):
-    """The line of an event. `block` is the number of its block, and `index` is its position in the block, counted from
-    0.
+    """The line of an event in the merged record. `block` is the number of the event's block, and `index` is the
+    position of the event in this block, counted from 0.
     """
 
     line: Literal["event"] = "event"
@@ -160,7 +162,7 @@ class Event(RecordLine):
 
 class MissingItem(RecordLine):
     """The line of a missing block of agent `agent_id`. If `block` is null, the vehicle itself is missing. `agents`
-    lists the missing vehicles that may have the block, or only `agent_id`.
+    lists the missing vehicles that may have the block. If no other vehicle is missing, it contains only `agent_id`.
     """
 
     line: Literal["lost"] = "lost"

@@ -125,10 +125,8 @@ MAX_NAMES = 8
 
 
 def in_words(record: MergedRecord, reconciled: ReconcileResult | None = None, *, opened: bool = False) -> Iterator[str]:
-    """Yield sentences about the exports, diverged chains, blocks that only one vehicle holds, lost blocks, and the
-    reconcile.
-
-    `opened` is true if the depot's key was given.
+    """Yield sentences about the exports, the places at which chains differ, the blocks that only one vehicle holds, the
+    lost blocks, and the reconcile. `opened` is true if the depot's key was given.
     """
     header = record.header
     with_export = sorted(record.collected.latest)

@@ -28,8 +28,8 @@ Kind = TypeVar("Kind", bound=FlightRecord)
 
 
 class LogClock:
-    """The clock of a flight log. It rejects a single record with a wrong time. Several records with consistent new
-    times count as a jump of the clock.
+    """The clock of a flight log. The object rejects a single record with a wrong time. If several records have new
+    times that are consistent with each other, the clock has jumped.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ def _consistent(before_us: int, after_us: int) -> bool:
 
 
 class RecordBudget:
-    """The number of further records that may be stored from a file."""
+    """A budget for the records of a file: the number of further records that may be stored."""
 
     def __init__(self) -> None:
         self.left = MAX_RECORDS
@@ -93,7 +93,7 @@ class RecordCollector:
         return kept
 
     def add_gps_time(self, time: GpsTime) -> bool:
-        """Store a GPS time, at most one per second. Return true if it was stored."""
+        """Store a GPS time, but at most one GPS time per second. Return true if the time was stored."""
         if not self._is_due(GpsTime, time.at_us, None) or not self.add(time):
             return False
         self.use_gps_time(time)
@@ -106,14 +106,14 @@ class RecordCollector:
         self._times.setdefault(time.at_us // _BIN_US, []).append((time.at_us, time.utc_us))
 
     def add_sample(self, record: FlightRecord, source: Hashable, state: Hashable = None) -> None:
-        """Store a record if the previous record from the same source is at least a second older or has a different
+        """Store a record if the previous record from the same source is at least one second older, or has a different
         state.
         """
         if self._is_due((type(record), source), record.at_us, state):
             self.add(record)
 
     def add_change(self, record: FlightRecord, state: Hashable) -> None:
-        """Store a record if its state differs from that of the previous record of its type."""
+        """Store a record if its state differs from the state in the previous record of its type."""
         if self._last_state.get(type(record), _UNKNOWN) != state:
             self._last_state[type(record)] = state
             self.add(record)
@@ -152,8 +152,8 @@ class RecordCollector:
 
 
 class _PiecewiseLinearClock:
-    """A conversion of times to UTC by straight lines through points (time on the log's clock, UTC). The first and the
-    last line are extended beyond the points.
+    """A conversion from the clock of a log to UTC, by straight lines through points (time on the log's clock, UTC). The
+    first and the last line are extended beyond the first and the last point.
     """
 
     def __init__(self, points: list[tuple[int, int]]) -> None:

@@ -62,7 +62,7 @@ _FAILSAFES = {
 general reason 25 if it lost its radio or its ground station.
 """
 _FIRMWARE = {"ArduPlane": 1, "ArduCopter": 2, "ArduRover": 10, "Rover": 10}
-"""First word of the firmware's text -> type of the vehicle (MAV_TYPE)."""
+"""First word of the text about the firmware -> type of the vehicle (MAV_TYPE)."""
 
 Values = dict[str, Any]
 

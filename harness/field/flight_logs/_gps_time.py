@@ -6,8 +6,8 @@ _EPOCH_S = 315_964_800
 """The beginning of GPS time, 1980-01-06, in seconds since the Unix epoch."""
 _WEEK_MS = 7 * 86_400_000
 _LEAPS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (1_230_768_000, 15), (1_136_073_600, 14))
-"""Leap seconds as (seconds since the Unix epoch, GPS time minus UTC from then on). The newest entry is first (IERS
-Bulletin C).
+"""Leap seconds as pairs: seconds since the Unix epoch, and GPS time minus UTC from this time on. The newest pair is
+first (IERS Bulletin C).
 """
 _OLDEST_S, _NEWEST_S = 1_136_073_600, 4_102_444_800
 """The years 2006 and 2100, as limits of a plausible time. Times outside of these limits come from damage, or from a

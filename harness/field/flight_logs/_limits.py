@@ -30,7 +30,7 @@ class DamagedBytes:
             self.first_at = at
 
     def ends_reading(self, at: int) -> bool:
-        """Return true if the damage before the byte `at` is large enough to stop reading."""
+        """Return true if the damage before the position `at` is so large that reading must stop."""
         if self.searches <= MAX_SEARCHES:
             return False
         self.ends_at = at

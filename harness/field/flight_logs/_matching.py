@@ -21,15 +21,19 @@ from typing import Protocol
 from harness.field.flight_logs._records import FlightLog, Position, VehicleLog
 
 MAX_PLACES = 500
-"""Maximum number of an agent's positions that vote for a time difference."""
+"""Maximum number of an agent's positions that are used to find the time difference between the agent and a
+flight log.
+"""
 MAX_ASIDE_M = 3.0
-"""Maximum distance in metres of a logged position from the track in the flight log. It is small because vehicles may
-fly side by side.
+"""Maximum distance in metres of a logged position from the track in the flight log. The distance is small, because
+vehicles may fly side by side.
 """
 _CELL_DEG = 1e-4
-"""Size of a cell in degrees of latitude, about eleven metres."""
+"""Size of a cell of the search grid in degrees of latitude. A cell has a length of about eleven metres."""
 _PAUSE_US = 5_000_000
-"""Microseconds between two positions near a place. After a longer time, they belong to two different visits."""
+"""Microseconds between two positions near the same place. If the time between the positions is longer, they belong to
+two different visits of this place.
+"""
 _MAX_VISIT_US = 20_000_000
 """Maximum duration of a visit in microseconds. If a vehicle is near a place for longer, it stays there, and the visit
 is not used to find the time difference.
@@ -63,23 +67,24 @@ Fixes = Sequence[tuple[int, LoggedPosition]]
 
 @dataclass(frozen=True)
 class MatchedLog:
-    """A vehicle in a flight log, and its agent. `agent_id` is None if none of the known agents flew on the vehicle.
-
-    `evidence` completes a sentence such as "is of agent 10 by ..." or "matches no agent: ...". `clock_ahead_s` is the
-    time on the agent's clock minus GPS time. It is None if unknown.
-    """
+    """A vehicle in a flight log, and its agent."""
 
     log: FlightLog
     vehicle: VehicleLog
     agent_id: int | None
+    """The ID of the agent. None if no known agent flew on the vehicle."""
     evidence: str
+    """The evidence for the agent. It completes a sentence such as "is of agent 10 by ..." or "matches no
+    agent: ...".
+    """
     clock_ahead_s: float | None = None
+    """The time on the agent's clock minus GPS time, in seconds. None if unknown."""
 
 
 def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[MatchedLog]:
-    """Find the agent of each vehicle in the flight logs. `agents` contains the logged positions of each agent.
-
-    If an agent matches several flights along the same path, it gets the one that is nearest in time by its own clock.
+    """Find the agent of each vehicle in the flight logs. `agents` contains the logged positions of each agent. If
+    several flights along the same path match an agent, the agent gets the flight that is nearest in time by its own
+    clock.
     """
     matches = [_match(log, vehicle, agents) for log in logs for vehicle in log.vehicles]
     nearest: dict[int, float] = {}

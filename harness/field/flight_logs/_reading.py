@@ -59,9 +59,8 @@ def _begins_with_frame(beginning: bytes) -> bool:
 
 @gc_paused()
 def read_flight_log(path: Path) -> FlightLog:
-    """Read a flight log. The file may be compressed with gzip.
-
-    Raises FieldError if the file cannot be read, or is no flight log. Every other problem is a sentence in the result.
+    """Read a flight log. The file may be compressed with gzip. Raises FieldError if the file cannot be read, or is not
+    a flight log. The result reports every other problem as a sentence.
     """
     try:
         with BoundedFile(path, MAX_LOG_BYTES) as file:

@@ -95,7 +95,9 @@ class GpsTime(NamedTuple):
 
 
 class RadioStatus(NamedTuple):
-    """The state of a telemetry radio (SiK, RFD900). RSSI and noise have the units of the radio, usually 0.5 dB."""
+    """The state of a telemetry radio (SiK, RFD900). RSSI and noise have the unit of the radio, which is
+    usually 0.5 dB.
+    """
 
     at_us: int
     utc_us: int | None
@@ -107,7 +109,7 @@ class RadioStatus(NamedTuple):
     """Free space in the transmit buffer."""
     rx_errors: int
     fixed: int
-    """Number of packets that the error correction of the radio repaired."""
+    """Number of packets that the radio repaired with error correction."""
 
 
 class Parameter(NamedTuple):

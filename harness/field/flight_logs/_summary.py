@@ -16,7 +16,9 @@ MAX_NAMED_MODES = 8
 
 @dataclass(frozen=True)
 class LoggedChange:
-    """A change of a vehicle. `at_us` is UTC if the log has GPS time, otherwise the time on the log's own clock."""
+    """A change of a vehicle, such as a new flight mode. `at_us` is UTC if the log has GPS time. Otherwise it is the
+    time on the log's own clock.
+    """
 
     at_us: int
     agent_id: int | None

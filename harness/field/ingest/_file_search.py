@@ -73,9 +73,8 @@ def is_incarnation_copy(path: Path) -> bool:
 def _walk(
     path: Path, left_out: list[UnusedPart], *, named: bool = False, depth: int = 0, in_run: bool = False
 ) -> Iterator[Path]:
-    """Yield the files below a path.
-
-    Links inside a directory are not followed, because their targets often do not belong to the flight.
+    """Yield the files below a path. The function does not follow links inside a directory, because their targets often
+    do not belong to the flight.
     """
     try:
         if path.is_symlink() and not named:
@@ -100,7 +99,7 @@ def _walk(
 
 
 def _files_first(path: Path) -> tuple[bool, int, str]:
-    """Return a sort key that puts files before directories, and short names before long names, so that 9 comes before
-    10.
+    """Return a sort key that puts files before directories, and short names before long names. For example, 9 comes
+    before 10.
     """
     return path.is_dir(), len(path.name), path.name

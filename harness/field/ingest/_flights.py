@@ -64,7 +64,9 @@ class _FlightRecords:
 
     @cached_property
     def time_span(self) -> tuple[float, float]:
-        """The times of the first and the last handler run on the agents' clocks, in seconds since the Unix epoch."""
+        """The times of the first and the last handler run, on the agents' own clocks, in seconds since the
+        Unix epoch.
+        """
         times = [
             run.t
             for incarnations in self.incarnations.values()
@@ -141,9 +143,7 @@ def _assign_to_flights(
     groups: list[_FlightRecords], mission: _MissionInHeader, agent_id: int, flights: list[list[TraceIncarnation]]
 ) -> None:
     """Assign the records of one agent to the flights of the other agents. Records belong to the flight with the most
-    directories in common.
-
-    This is only a guess. It is used if no record distinguishes the flights.
+    directories in common. This assignment is a guess for records that no other fact assigns to a flight.
     """
 
     def shared_directories(flight_incarnations: list[TraceIncarnation], records: _FlightRecords) -> int:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FileRemark:
-    """A remark on a file or one of its lines. `why` completes a sentence, as in "it is not of this mission"."""
+    """A remark on a file, or on one line of the file. `why` completes a sentence, as in "it is not of this mission"."""
 
     path: Path
     why: str
@@ -73,15 +73,14 @@ class Flight:
 
 @dataclass
 class IngestResult:
-    """The flights in the files (the one with the most records first), and the omitted files.
-
-    `remarks` concerns files that are used, for example a changed clock, or a header that was taken from another agent's
-    trace.
-    """
+    """The flights in the files, and the omitted files. The flight with the most records is first."""
 
     flights: list[Flight]
     left_out: list[UnusedPart]
     remarks: list[FileRemark] = field(default_factory=list)
+    """Remarks on files that are used, for example on a changed clock, or on a header that was copied from another
+    agent's trace.
+    """
 
     def largest(self) -> Flight:
         """Return the flight with the most records. Raises FieldError if no file is usable."""

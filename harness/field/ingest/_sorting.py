@@ -42,11 +42,9 @@ _BLANK = " \t\r\n\0\ufeff"
 
 @gc_paused()
 def ingest_files(paths: Iterable[Path], opener: "DatagramOpener | None" = None) -> IngestResult:
-    """Return the records in files and directories, grouped by flight. The names of the files do not matter, and damaged
-    files are used as far as possible.
-
-    `opener` decrypts captures of a secured mission. Raises FieldError if a path does not exist. Every other problem is
-    reported in `left_out` of the result.
+    """Return the records in files and directories, grouped by flight. File names have no effect. Damaged files are used
+    as far as possible. `opener` decrypts captures of a secured mission. Raises FieldError if a path does not exist. The
+    field `left_out` of the result reports every other problem.
     """
     left_out: list[UnusedPart] = []
     sorter = RecordSorter(left_out, opener)

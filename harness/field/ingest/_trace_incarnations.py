@@ -98,7 +98,7 @@ class TraceIncarnation:
         return zip(self.asides, self.aside_lines, strict=True)
 
     def add_gap(self, lines: int, lost_bytes: int) -> None:
-        """Record lost or damaged lines. If they directly follow other lost lines, all of them form one gap."""
+        """Record that lines are lost or damaged. If these lines directly follow other lost lines, both form one gap."""
         position = len(self.runs)
         if self.gaps and self.gaps[-1].position == position:
             last = self.gaps.pop()
@@ -164,9 +164,8 @@ class TraceReader:
     """
 
     def __init__(self, path: Path, agent_id: int | None = None, counts: str = "line") -> None:
-        """Create a reader for one trace.
-
-        `agent_id` is the agent, if the source determines it. `counts` is the unit of line numbers.
+        """Create a reader for one trace. `agent_id` is the ID of the agent, or None if the source does not determine
+        it. `counts` names the unit of line numbers.
         """
         self.path = path
         self._agent_id, self._counts = agent_id, counts
@@ -177,7 +176,7 @@ class TraceReader:
         self._cut_off: int | None = None
 
     def add_line(self, number: int, line: bytes, finish: bool = True) -> None:
-        """Read one line. If it has no line end, it may be truncated."""
+        """Read one line. A line without a line end may be truncated."""
         self._read_bytes += len(line)
         self._lines += 1
         self.gave_up = not self.incarnations and (
@@ -281,7 +280,9 @@ class TraceReader:
 
 
 def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield (number, line, true if the line has a line end). If a line is too long, only its last part is returned."""
+    """Yield the lines as triples: line number, content, and true if the line has a line end. If a line is too long,
+    only its last part is yielded.
+    """
     number, kept = 1, b""
     while text := file.readline(MAX_LINE_BYTES):
         if not text.endswith(b"\n") and len(text) == MAX_LINE_BYTES:

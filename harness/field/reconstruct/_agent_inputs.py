@@ -56,22 +56,23 @@ Cause = EventLogged | DatagramReceived | TimerExpired | ReconcileRequested | Boo
 
 @dataclass(slots=True)
 class RecordedInput:
-    """One input of an agent. `at_s` is a time on the agent's clock, and `line` is the line number in the agent's trace
-    (from 1).
-
-    `runs` are the handler runs that the input caused, including those of local events. If `is_partial` is true, some of
-    them may be lost.
-    """
+    """One input of an agent."""
 
     at_s: float
+    """The time of the input on the agent's clock."""
     line: int
+    """The line number in the agent's trace, counted from 1."""
     cause: Cause
     runs: list[HandlerRun] = field(default_factory=list)
+    """The handler runs that the input caused, including the runs for local events."""
     is_partial: bool = False
+    """True if some of the handler runs may be lost."""
 
 
 class MissingInputs(Protocol):
-    """Records other than the agent's trace. They may contain inputs that a trace of version 1 does not contain."""
+    """Records other than the agent's own trace. These records may contain inputs that a trace of version 1 does not
+    contain.
+    """
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]: ...
 
@@ -81,10 +82,8 @@ class MissingInputs(Protocol):
 def inputs_by_incarnation(
     trace: Trace, header: CheckedHeader, missing: MissingInputs
 ) -> tuple[list[list[RecordedInput]], str | None]:
-    """Return the usable inputs of each incarnation, and the reason why later inputs are unusable. The reason is None if
-    all inputs are usable.
-
-    The reason names the line of the trace.
+    """Return the usable inputs of each incarnation, and the reason why later inputs are unusable. The reason names the
+    line of the trace. It is None if all inputs are usable.
     """
     reader = _InputReader(header, missing)
     incarnations: list[list[RecordedInput]] = []

@@ -35,7 +35,7 @@ from ucp.messages import (
 )
 
 FIRST_SEQUENCE = 0xF000_0000
-"""Sequence number of the first guessed message. Agents never send that many messages."""
+"""Sequence number of the first guessed message. The number is so large that real agents never reach it."""
 STEPS_PER_BLOCK = 200
 """Maximum number of guessed inputs for each block of the chain."""
 
@@ -43,8 +43,8 @@ STEPS_PER_BLOCK = 200
 @dataclass(frozen=True)
 class KnownState:
     """The known state of an idle agent after lost trace lines. `why` is the reason why the lines are missing.
-
-    `current_block` is None if the block is empty, or if its content has no later effect.
+    `current_block` is the block under construction. It is None if this block is empty, or if its content has no later
+    effect.
     """
 
     chain: tuple[Block, ...]

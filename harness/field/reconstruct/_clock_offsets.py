@@ -28,8 +28,8 @@ OFFSET_DIGITS, DRIFT_DIGITS = 6, 9
 
 @dataclass(frozen=True)
 class ClockLine:
-    """A linear relation between a clock and a reference clock. When the reference clock shows t, this clock shows
-    offset_s + rate * t.
+    """A linear relation between two clocks. When the reference clock shows t, the other clock shows offset_s + rate *
+    t.
     """
 
     offset_s: float = 0.0
@@ -58,10 +58,9 @@ def estimate(
     deliveries: Iterable[DeliveredMessage],
     ahead_s: Mapping[int, float] = {},
 ) -> dict[int, ClockLine]:
-    """Return each agent's clock relative to a common reference clock.
-
-    `ahead_s` contains differences of clocks from GPS time. They are used for agents that exchanged no messages with the
-    reference. Without them, the clocks of these agents are assumed to equal the reference clock.
+    """Return the clock of each agent relative to a common reference clock. `ahead_s` contains the differences between
+    clocks and GPS time. These differences are used for agents that exchanged no messages with the reference agent.
+    Without such a difference, the agent's clock is assumed to equal the reference clock.
     """
     between: dict[tuple[int, int], tuple[list[Point], list[Point]]] = defaultdict(lambda: ([], []))
     for delivery in deliveries:

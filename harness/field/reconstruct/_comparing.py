@@ -31,16 +31,13 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True)
 class FirstDifference:
-    """The first step at which the simulation differs from a record. `at_s` is a mission second of the reconstructed
-    scenario.
-
-    `line` is the line of the trace. It is None if the record has no further steps. `recorded` and `played` describe
-    both steps.
-    """
+    """The first step at which the simulation differs from a record."""
 
     agent_id: int
     at_s: float
+    """The mission second in the reconstructed scenario."""
     line: int | None
+    """The line number in the trace. None if the record has no further step."""
     handler: str
     recorded: str
     played: str
@@ -61,7 +58,7 @@ PlayedStep = tuple[float, int | None, HandlerRun]
 def first_difference(
     table: InputTimetable, rehearsals: Mapping[int, SoloSimulation], simulated: Simulated
 ) -> FirstDifference | None:
-    """Return the difference with the earliest mission time. Return None if all steps with an effect are equal."""
+    """Return the difference with the earliest mission time. Return None if all steps that have an effect are equal."""
     differences = []
     for agent_id in rehearsals:
         recorded = [*_effective(_recorded(table, agent_id))]
@@ -83,7 +80,7 @@ def _played(trace: Trace | None) -> Iterator[PlayedStep]:
 
 
 def _effective(steps: Iterable[PlayedStep]) -> Iterator[PlayedStep]:
-    """Yield the steps that have an effect. Messages that only changed a vote count have none."""
+    """Yield the steps that have an effect. A step has no effect if its message only changed a vote count."""
     return (
         step for step in steps if step[2].changes or step[2].sent or not isinstance(step[2].trigger, MessageTrigger)
     )
@@ -121,15 +118,13 @@ RecordedInputs = Sequence[Sequence[RecordedInput]]
 
 
 class SoloSimulations:
-    """The simulations of single agents. Each agent is simulated alone with its recorded inputs.
-
-    `rehearsals` contains the simulations of all agents that can be simulated. `why` contains the reasons why some are
-    incomplete.
-    """
+    """The simulations of single agents. Each agent is simulated alone, with its recorded inputs."""
 
     def __init__(self, flight: Flight, other_records: OtherRecords) -> None:
         self.rehearsals: dict[int, SoloSimulation] = {}
+        """The simulations of all agents that can be simulated."""
         self.why: dict[int, str] = {}
+        """The reasons why some simulations are incomplete."""
         self._flight = flight
         self._other_records = other_records
         self._by_captures: list[int] = []
@@ -145,10 +140,8 @@ class SoloSimulations:
         return [*self._remarks, inferred]
 
     def rehearse(self, header: CheckedHeader) -> None:
-        """Simulate an agent with the inputs in its trace.
-
-        If the simulation does not end in the state of the agent's export, use the capture of its vehicle instead,
-        provided that it explains more inputs.
+        """Simulate an agent with the inputs in its trace. If this simulation does not end in the state of the agent's
+        export, try a simulation with the capture of its vehicle. Return the simulation that explains more inputs.
         """
         agent_id = header.agent_id
         rehearsal = self._by_trace(header) if agent_id in self._flight.traces else None
@@ -316,8 +309,8 @@ class SoloSimulations:
         return explaining[names[0]]
 
     def _explain_by_tolerance(self, header: CheckedHeader, incarnations: Incarnations) -> SoloSimulation | None:
-        """Return a simulation of an agent that may ignore messages or let timers expire early, if it explains the whole
-        record. Return None otherwise.
+        """Return a simulation in which the agent may ignore messages or let timers expire early, if this simulation
+        explains the whole record. Otherwise return None.
         """
         agent = f"agent {header.agent_id}"
         ignoring = rehearse(header, incarnations, tolerance=ToleratedDeviations(ignoring=True))

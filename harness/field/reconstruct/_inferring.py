@@ -44,7 +44,7 @@ from ucp.trace import HandlerRun
 
 MAX_TRIES = 400
 MAX_INPUTS = 200_000
-"""Maximum number of inputs that all attempts together may play. They take some seconds."""
+"""Maximum number of inputs that all attempts together may simulate. This number takes some seconds."""
 MAX_LATE_WALL_S = 0.1
 """Maximum delay of a timer in seconds of wall time. If a timer is later, the process was paused."""
 MAX_UNREAD_WALL_S = 0.005
@@ -64,8 +64,8 @@ SENT_ON_TIMER_EXPIRY = (BlockAddRequest, CommitBlock, ChainContainQuery, ChainHa
 
 @dataclass
 class InferredInputs:
-    """The guessed inputs of each incarnation, which explain the sent datagrams. `problem` names the first datagram that
-    the inputs do not explain.
+    """The guessed inputs of each incarnation, which explain the datagrams that the agent sent. `problem` names the
+    first datagram that the inputs do not explain.
     """
 
     incarnations: list[list[RecordedInput]] = field(default_factory=list)
@@ -195,8 +195,8 @@ def _infer_incarnation(
 
 
 def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
-    """Choose the next order of inputs to try: change the last timer that allows another position. Return false if no
-    timer allows one.
+    """Choose the next order of inputs to try. The method changes the last timer that has another possible position.
+    Return false if no timer has one.
     """
     for place in range(len(choices) - 1, -1, -1):
         if deferred.get(place, 0) < choices[place]:
@@ -208,9 +208,8 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 
 
 class _InputSequence:
-    """One possible order of the inputs of an agent in one incarnation.
-
-    `deferred` maps the number of a timer to its deviation from the most likely position.
+    """One possible order of the inputs of an agent in one incarnation. `deferred` maps the number of a timer to the
+    distance between its position and the most likely position.
     """
 
     def __init__(
@@ -249,7 +248,7 @@ class _InputSequence:
         self._stored = stored
         self._explained = 0
         self._ended = False
-        """True if the incarnation has ended: the capture contains no further sent datagram."""
+        """True if the incarnation has ended, so that the capture contains no further datagram of the agent."""
         self._now = start_s
 
     def stored_at_end(self) -> StoredState:
@@ -292,7 +291,7 @@ class _InputSequence:
         return None if deadline is None else self._end_of_pause(deadline, JUST_AFTER_S)
 
     def _begin_requested_reconcile(self, next_s: float) -> bool:
-        """Begin a reconcile if the capture shows that one began before the next input without another cause. The
+        """Begin a reconcile if the capture shows a reconcile before the next input that no other input caused. The
         operator must have requested this reconcile. Return true if a requested reconcile begins.
         """
         if self._explained == len(self._sent) or self._agent.state.reconcile_in_progress:
@@ -321,10 +320,9 @@ class _InputSequence:
         return position
 
     def _inputs_before_timer(self, deadline: float, position: int) -> tuple[int, int, int]:
-        """Return the most likely, the smallest and the largest number of inputs before the expiry of the timer.
-
-        The time of the expiry follows from the datagrams that it caused. Datagrams that arrived directly before it may
-        have waited in the socket.
+        """Return the most likely, the smallest and the largest number of inputs before the expiry of the timer. The
+        datagrams that the expiry caused show its time. Datagrams that arrived shortly before this time may have waited
+        in the socket.
         """
         latest_s = deadline + self._late_s
         for sighting in self._sent[self._explained :]:

@@ -33,7 +33,7 @@ class JudgedTrace:
         """Handler run after which the state is known again -> the known state. The key is the `id` of the handler run.
         """
         self._played: set[int] = set()
-        """The `id` of each handler run that the reference could play."""
+        """The `id` of each handler run that the reference could execute."""
         self._names = ReplayNames(record)
         self._export = flight.exports.get(agent_id)
         self._is_last_line_lost = False

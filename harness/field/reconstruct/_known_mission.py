@@ -35,8 +35,8 @@ def likely_settings(
     events = {agent_id: other_records.events(agent_id) for agent_id in captures}
 
     def explained(settings: Settings) -> tuple[int, int]:
-        """Return the number of agents whose inputs are completely explained with these settings, and the number of
-        explained inputs of all agents.
+        """Return two numbers for these settings: the number of agents whose inputs are completely explained, and the
+        number of explained inputs of all agents.
         """
         inferred = [
             infer(header_of(agent_id, settings), capture, events[agent_id], tries=TRIES)
@@ -79,8 +79,8 @@ def _visible_settings(other_records: OtherRecords) -> Settings:
 
 
 def _max_block_bytes(blocks: Iterable[bytes], largest: int) -> int:
-    """Return the setting max_block_bytes as the sizes of the blocks reveal it. A block is full if an event of the
-    largest size might not fit into it.
+    """Return the setting max_block_bytes. It follows from the sizes of the blocks, because a block is full if an event
+    of the largest size might not fit into it.
     """
     least, most = largest, MAX_EVENT_DATA_BYTES
     for event_data in blocks:

@@ -32,7 +32,7 @@ class OtherRecords:
     def __init__(self, flight: Flight, opener: "DatagramOpener | None" = None, depot: "Depot | None" = None) -> None:
         """Read the files. In a secured mission, `opener` decrypts datagrams, and `depot` decrypts event data."""
         self.sealed: dict[int, dict[bytes, bytes]] = defaultdict(dict)
-        """Agent ID -> encoded event that filled a block -> encrypted event data of the block."""
+        """Agent ID -> event that filled a block, in encoded form -> encrypted event data of the block."""
         self._depot = depot
         self.captures: dict[int, AgentCapture] = {}
         self.problems: list[str] = []
@@ -82,8 +82,8 @@ class OtherRecords:
         return [*self._event_data.values()]
 
     def with_seal(self, header: CheckedHeader) -> CheckedHeader:
-        """Return the header of a trace. If the mission encrypts event data, it also contains the encrypted data that
-        the agent recorded.
+        """Return the header of a trace. If the mission encrypts event data, the returned header also contains the
+        encrypted data that the agent recorded.
         """
         if sealed_to(header.initial_data) is None:
             return header

@@ -42,15 +42,14 @@ MAX_NAME = 40
 
 @dataclass(frozen=True, slots=True)
 class TimerStart:
-    """A timer that the agent started. The timers of the agent are numbered in `number`. `place` is the position of the
-    input that started this timer.
-
-    `duration_s` is measured on the agent's own clock.
-    """
+    """A timer that the agent started."""
 
     number: int
+    """The number of the timer. All timers of the agent are numbered in the order of their starts."""
     place: int
+    """The position of the input that started the timer, in the list of inputs."""
     duration_s: float
+    """The duration of the timer on the agent's own clock."""
 
 
 @dataclass(frozen=True)
@@ -67,39 +66,37 @@ class ProtocolDeviation:
 
 @dataclass(slots=True)
 class PlayedInput:
-    """An input that was simulated and can be simulated again. `sent` contains the datagrams that the input caused.
-
-    `matters` is false for a message without effect. If the input is a timer expiry, `expired` is this timer. `stopped`
-    contains the timers that the input stopped before their expiry.
-    """
+    """An input that was simulated, in a form that can be simulated again."""
 
     incarnation: int
     input: RecordedInput
     sent: list[bytes]
+    """The datagrams that the input caused."""
     matters: bool
+    """False for a message without effect."""
     expired: TimerStart | None = None
+    """The timer that expired, if the input is a timer expiry."""
     stopped: list[TimerStart] = field(default_factory=list)
+    """The timers that the input stopped before their expiry."""
 
 
 @dataclass
 class SoloSimulation:
-    """The simulation of one agent with its recorded inputs. If the record deviates from the protocol, `played` contains
-    only the inputs before `deviation`.
-
-    `chain` contains the block hashes of the agent's chain after the last input. `running_at_end` contains the timers
-    that were running at the end of each incarnation.
-    """
+    """The simulation of one agent with its recorded inputs."""
 
     agent_id: int
     quirks: Quirks
     played: list[PlayedInput] = field(default_factory=list)
+    """The simulated inputs. If the record deviates from the protocol, only the inputs before `deviation`."""
     deviation: ProtocolDeviation | None = None
     chain: list[str] = field(default_factory=list)
+    """The block hashes of the agent's chain after the last input."""
     running_at_end: list[list[TimerStart]] = field(default_factory=list)
+    """The timers that were running at the end of each incarnation."""
     truncated: bool = False
     """True if the record ends before all effects of its last input. The simulation completes this input."""
     matches_exactly: bool = True
-    """True if branches and tallies also equal the recorded ones."""
+    """True if the branches and tallies of the simulation also equal the recorded branches and tallies."""
     ignored: list[RecordedInput] = field(default_factory=list)
     """Messages that the agent ignored although they should have had an effect. The simulation omits them."""
     inferred: int = 0
@@ -119,7 +116,7 @@ class ToleratedDeviations:
 
 
 Incarnations = Sequence[Sequence[RecordedInput | KnownState]]
-"""The inputs of each incarnation. A known state replaces lost inputs that lead to this state."""
+"""The inputs of each incarnation. If inputs are lost, the known state after them takes their place."""
 
 
 def rehearse(
@@ -331,7 +328,7 @@ def _matches_exactly(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -
 
 
 def _difference(recorded: Sequence[HandlerRun], entries: Sequence[Entry]) -> str | None:
-    """Describe the first difference that has an effect. Return None if no difference has one."""
+    """Describe the first difference that has an effect. Return None if no difference has an effect."""
     runs = [entry for entry in entries if isinstance(entry, HandlerRun)]
     for ours, theirs in zip_longest(runs, recorded):
         if ours is None:

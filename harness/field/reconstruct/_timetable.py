@@ -36,10 +36,8 @@ of several equal datagrams.
 
 @dataclass(slots=True)
 class TimedInput:
-    """An input of an agent at mission second `at_s`. If the input is a datagram of a simulated agent, `sender` and
-    `number` identify the datagram.
-
-    `late_s` is the delay of an expired timer.
+    """An input of an agent at mission second `at_s`. If a simulated agent sent the input as a datagram, `sender` and
+    `number` identify this datagram. `late_s` is the delay of an expired timer.
     """
 
     played: PlayedInput
@@ -51,28 +49,25 @@ class TimedInput:
 
 @dataclass
 class IncarnationTimes:
-    """The mission seconds of the first and the last input of an incarnation. `boots` is true if the incarnation began
-    with data on the disk.
-
-    The incarnation was running at `present_s`, the time at which its first received message was sent, or its first
-    other input.
-    """
+    """The mission seconds of the first and the last input of an incarnation."""
 
     number: int
     present_s: float
+    """A time at which the incarnation was running: the sending time of its first received message, or the time of its
+    first other input.
+    """
     began_s: float
     ended_s: float
     boots: bool
+    """True if the incarnation began with data on the disk."""
 
 
 @dataclass
 class InputTimetable:
-    """The inputs of all agents in mission time. `clocks` relates each agent's clock to mission time.
-
-    `contradictions` has a sentence for each record that contradicts every order of inputs.
-    """
+    """The inputs of all agents in mission time."""
 
     clocks: dict[int, ClockLine]
+    """The relation between each agent's clock and mission time."""
     inputs: dict[int, list[TimedInput]] = field(default_factory=dict)
     sent: dict[int, list[bytes]] = field(default_factory=dict)
     """All datagrams that each agent sends, in order."""
@@ -80,6 +75,7 @@ class InputTimetable:
     lateness: dict[int, dict[int, float]] = field(default_factory=dict)
     """Agent -> number of a timer -> delay of the timer in seconds."""
     contradictions: list[str] = field(default_factory=list)
+    """A sentence for each record that contradicts every order of inputs."""
 
     def incarnations(self, agent_id: int) -> list[IncarnationTimes]:
         incarnations: list[IncarnationTimes] = []
@@ -231,9 +227,8 @@ class _TimetablePlanner:
         return before[-1] if before else candidates[0]
 
     def _break_cycle(self) -> None:
-        """Resolve a deadlock in which each agent waits for a message that another agent has not yet sent.
-
-        The waiting input with the earliest time becomes a stray.
+        """Resolve a deadlock in which each agent waits for a message that another agent has not yet sent. The earliest
+        waiting input becomes a *stray*, a datagram that no agent of the scenario sends.
         """
         waiting = [
             (self._recorded_s(agent, self._next[agent]), agent, sent)

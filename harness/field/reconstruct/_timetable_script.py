@@ -165,9 +165,8 @@ def _fates(
     incarnations: Mapping[int, Sequence[IncarnationTimes]],
     strays: _StrayDatagrams,
 ) -> Iterator[Document]:
-    """Yield the scripted delivery of each datagram that arrives.
-
-    All other datagrams are lost. Datagrams that no agent can send to the receiver become strays.
+    """Yield the scripted delivery of each datagram that arrives. All other datagrams are lost. If no agent can send a
+    datagram to its receiver, the datagram becomes a *stray*, which the scenario itself delivers.
     """
     arrivals: dict[tuple[int, int], list[tuple[int, float]]] = defaultdict(list)
     for receiver, inputs in table.inputs.items():

@@ -187,7 +187,7 @@ def reconstruct(
 
 
 def _check_signatures(flight: Flight, keys: "PublicKeys | None", remarks: list[str]) -> list[str]:
-    """Return a sentence about each wrong signature. Add a remark if the exports are not confirmed by signatures."""
+    """Return a sentence about each wrong signature. If signatures do not confirm the exports, add a remark."""
     trusted = TrustedKeys(keys, "--keys") if keys is not None else None
     if trusted is None and flight.public_keys is not None:
         trusted = TrustedKeys(flight.public_keys, None)

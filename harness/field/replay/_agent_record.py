@@ -30,16 +30,15 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class RecordEntry:
-    """An entry of the record: one line of the trace. Line numbers and incarnations count from 1.
-
-    `gap` describes missing lines directly before this line, such as "2 lines are damaged". It is None if no lines are
-    missing.
-    """
+    """One line of the trace. Line numbers and incarnations count from 1."""
 
     line: int
     incarnation: int
     content: HandlerRun | DroppedDatagram | CommandEntry
     gap: str | None = None
+    """A description of missing lines directly before this line, such as "2 lines are damaged". None if no lines are
+    missing.
+    """
 
 
 class FlightRecords(Protocol):
@@ -60,15 +59,13 @@ class FlightRecords(Protocol):
 
 
 class RecordedTrace:
-    """The trace of one agent. `path` is the file of the trace, and `argument` is the name that the user gave on the
-    command line.
-
-    Raises FieldError if no part of the trace can be played.
-    """
+    """The trace of one agent. Raises FieldError if no part of the trace can be replayed."""
 
     def __init__(self, path: Path, argument: str, trace: Trace, flight: FlightRecords, problems: list[str]) -> None:
         self.path = path
+        """The file of the trace."""
         self.argument = argument
+        """The name of the file or directory that the user gave on the command line."""
         self.trace = trace
         self.flight = flight
         self.problems = problems
@@ -109,7 +106,7 @@ class RecordedTrace:
 
     @property
     def doubtful_runs(self) -> dict[int, str]:
-        """Position of a handler run whose deviations damage to a single line may explain -> the damage."""
+        """Position of a handler run -> damage to a single trace line that may explain the deviations of this run."""
         of_entries = [number for number, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
         doubts = self.doubts or {}
         return {number: doubts[entry] for number, entry in enumerate(of_entries) if entry in doubts}
@@ -197,9 +194,8 @@ class RecordedTrace:
 
     @cached_property
     def present_until_s(self) -> float | None:
-        """A mission second after the last line until which the agent certainly ran. None if no such time is known.
-
-        If a step was due before this time but has no line, its line was lost.
+        """A mission second after the last line until which the agent certainly ran. None if no such time is known. If a
+        step was due before this time and has no line, this line was lost.
         """
         if self.trace.cut_off or self.trace.problem or self.agent_id not in self.flight.exports:
             return None

@@ -20,13 +20,13 @@ from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
 
 MAX_PLACES = 3
-"""Maximum number of places at which messages without a line are explained by lost lines or a full socket."""
+"""Maximum number of places with messages without a line that lost lines or a full socket can explain."""
 MAX_TRIED = 200
 """Maximum number of messages without a line for which the effect is computed."""
 
 
 class PlayedAgent(Protocol):
-    """An object that plays an agent's record and is at some position in it."""
+    """A replayed agent, at some position in its record."""
 
     @property
     def lost(self) -> str | None: ...

@@ -42,8 +42,8 @@ class OtherAgents:
         return {agent_id: _OtherAgent(record, trace) for agent_id, trace in others.items()}
 
     def at(self, player: RecordPlayer) -> Iterator[Text]:
-        """Yield text about each other agent: its steps near this moment, its state, and its messages that are related
-        to the current step.
+        """Yield text about each other agent: its steps near this moment, its state, and the messages that connect it
+        with the current step.
         """
         entry = player.entry
         now = entry.content.t if entry else 0.0
@@ -68,7 +68,7 @@ class OtherAgents:
 
 
 class _OtherAgent:
-    """An agent that is not replayed. `clock` relates its clock to that of the replayed agent."""
+    """An agent that is not replayed. `clock` relates the clock of this agent to the clock of the replayed agent."""
 
     def __init__(self, record: RecordedTrace, trace: Trace) -> None:
         self._messages = PeerMessages(record, trace)

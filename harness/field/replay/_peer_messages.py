@@ -28,10 +28,11 @@ class PeerMessage(NamedTuple):
 
 
 class PeerMessages:
-    """The messages between two agents. `runs` contains the handler runs of the second agent with their line numbers."""
+    """The messages between two agents."""
 
     def __init__(self, record: RecordedTrace, other_trace: Trace) -> None:
         self.runs = [numbered for numbered_runs in other_trace.incarnations() for numbered in numbered_runs]
+        """The handler runs of the second agent, with their line numbers."""
         self._record = record
         self._agents = record.agent_id, other_trace.header.agent_id
         self._sent: dict[tuple[object, object], list[int]] = {}

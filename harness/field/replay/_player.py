@@ -39,7 +39,9 @@ MAX_TRIED = 20
 """Maximum number of deviations for which damage to a line is tried as an explanation."""
 
 PERHAPS = "perhaps"
-"""A word before the damage that may explain a deviation. It occurs in the reasons why steps are not judged."""
+"""A word that precedes the damage that may explain a deviation. The reasons why steps are not judged contain
+this word.
+"""
 
 _OF_TIMERS = frozenset(handler.name for handler in ON_TIMER.values())
 
@@ -56,7 +58,9 @@ class ReplayResult:
     """Reasons why handler runs could not be compared, as sentences."""
     deviations: list[StepDeviation] = field(default_factory=list)
     positions: list[int] = field(default_factory=list)
-    """The position of each deviation in the record. A missing step is found at the entry after it."""
+    """The positions of the deviations in the record. If a step is missing, its deviation is at the position of the next
+    entry.
+    """
 
     def copy(self) -> "ReplayResult":
         return ReplayResult(self.steps, self.unjudged, list(self.lost), list(self.deviations), list(self.positions))
@@ -85,11 +89,10 @@ class _PlayerCheckpoint:
 
 
 class RecordPlayer:
-    """A player of a record. `position` is the number of entries that were played, and `result` is the result of these
-    entries.
+    """A player of a record, which gives the recorded inputs to an agent core up to mission second `until_s`.
 
-    `until_s` is the last mission second to play. `implementation` handles the recorded inputs. It is the reference,
-    which judges agents, or the installed core (`harness.checker.steps.core_in_use`).
+    The agent core is `implementation`: the reference, which judges agents, or the installed core
+    (`harness.checker.steps.core_in_use`).
     """
 
     def __init__(
@@ -100,14 +103,18 @@ class RecordPlayer:
         entries = record.entries
         self.entries = entries if until_s is None else entries[: _later_than(entries, until_s)]
         self.position = 0
+        """The number of trace entries that were played."""
         self.result = ReplayResult()
+        """The result of the played entries."""
         self._parts = OptionalTraceFields.of(record.trace)
         self._unknown = unknown_names(record.trace.runs)
         self._blocks = RecordedBlocks(record)
         self._clock_set = ClockChangeDetector(record)
         self._resumption = ResumptionSearch(record, self._blocks)
         self.resumed_at: int | None = None
-        """The position after the last entry at which the state became known again. None if this did not happen."""
+        """The position after the last entry at which the state became known again. None if it did not become known
+        again.
+        """
         self._follower, self._incarnation = self._new_follower(), 1
         self._checkpoints = {0: _PlayerCheckpoint(self._follower.copy(), 1, self.result.copy())}
 
@@ -306,7 +313,7 @@ class _DoubtingPlayer(RecordPlayer):
     def __init__(self, record: RecordedTrace) -> None:
         super().__init__(record)
         self.found: dict[int, str | None] = {}
-        """Position of a deviation -> the damage that explains it, or None."""
+        """Position of a deviation -> the damage that explains the deviation, or None."""
 
     def _doubt(self, deviations: list[StepDeviation]) -> str | None:
         if self.position not in self.found:
@@ -335,7 +342,7 @@ def _short(block_hash: str) -> str:
 
 
 def _later_than(entries: Iterable[RecordEntry], until_s: float) -> int:
-    """Return the number of entries before the first entry that is later than `until_s`."""
+    """Return the number of entries up to the mission second `until_s`."""
     count = 0
     for entry in entries:
         if entry.content.t > until_s:

@@ -38,8 +38,8 @@ class ResumptionSearch:
         self._inception = InceptionBlock(record.header.initial_data).chain_hash
 
     def resume(self, follower: StepComparer, position: int) -> bool:
-        """Set a new `StepComparer` to the agent's state after the entry at `position`. Return false if this state is
-        unknown.
+        """Set a new `StepComparer` to the agent's state after the entry at `position`. Return false if the agent's
+        state is unknown there.
         """
         entry = self._record.entries[position]
         run = entry.content

@@ -163,7 +163,7 @@ class StepText:
         return ", ".join(text)
 
     def chain(self, chain_hash: bytes) -> str:
-        """Describe a chain hash. The text states whether it belongs to the agent's own chain."""
+        """Describe a chain hash. The text states whether the chain hash belongs to the agent's own chain."""
         chain = self._player.state.chain
         if chain_hash == chain.top_chain_hash:
             own = "our top"

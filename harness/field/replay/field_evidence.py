@@ -45,8 +45,8 @@ def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
 
 
 def _up_to_loss(trace: Trace, doubtful: Mapping[int, str]) -> Trace:
-    """Return the part of a trace before the first missing or doubtful line. The reason becomes the problem of the
-    trace.
+    """Return the part of a trace before the first missing or doubtful line. The problem of the returned trace is the
+    reason why it ends there.
     """
     lost = {**doubtful, **lost_lines(trace)}
     lost |= {gap.position: "lines are damaged" for gap in trace.gaps}

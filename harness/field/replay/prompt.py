@@ -36,9 +36,8 @@ SHORT_FORMS = {
 
 
 class ReplayPrompt(cmd.Cmd):
-    """A command line that reads commands until the input ends or the user enters `quit`. Then `quit` is true.
-
-    `breaks` are the places at which `continue` stops, in addition to differences.
+    """A command line that reads commands until the input ends or the user enters `quit`. `breaks` are the breakpoints.
+    The command `continue` stops at these breakpoints and at differences.
     """
 
     identchars = cmd.Cmd.identchars + "-"

@@ -23,8 +23,8 @@ def is_block(text: str) -> bool:
 
 
 class ReplayNames:
-    """The names of blocks by hash, and the hashes by name. The names come from exports, or from traces without
-    exports.
+    """The names of blocks by hash, and the hashes by name. The names come from exports. Without exports, they come from
+    traces.
     """
 
     def __init__(self, record: RecordedTrace) -> None:

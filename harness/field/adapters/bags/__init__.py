@@ -29,22 +29,20 @@ MAGICS = (_version_1.MAGIC, _mcap_bag.MAGIC, _sqlite.MAGIC, ZSTD_MAGIC)
 
 
 class BagMessage(NamedTuple):
-    """A message in a ROS bag.
-
-    `number` counts the messages of the file from 1. `time_ns` is the recording time in nanoseconds since the Unix
-    epoch.
-    """
+    """A message in a ROS bag."""
 
     number: int
+    """The position of the message in the file, counted from 1."""
     topic: str
     type_name: str
     time_ns: int
+    """The time at which the bag recorded the message, in nanoseconds since the Unix epoch."""
     data: bytes
 
 
 def messages(path: Path) -> Iterator[BagMessage | UnreadablePart]:
-    """Yield all messages in a ROS bag, and an UnreadablePart for each place between them that cannot be read. Raises
-    OSError.
+    """Yield all messages in a ROS bag. For each place between messages that cannot be read, yield an UnreadablePart.
+    Raises OSError.
     """
     number = 0
     with TemporaryDirectory(prefix="ucp-bag-") as directory:

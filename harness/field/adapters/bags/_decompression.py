@@ -22,7 +22,9 @@ MAX_TRIES = 2_000_000
 
 
 class RawMessage(NamedTuple):
-    """A message as it is stored in the ROS bag. `time_ns` is the recording time in nanoseconds since the Unix epoch."""
+    """A message in the form in which the ROS bag stores it. `time_ns` is the time of the recording in nanoseconds since
+    the Unix epoch.
+    """
 
     topic: str
     type_name: str
@@ -40,10 +42,8 @@ Item = RawMessage | UnreadablePart
 
 
 class BagTopics:
-    """Topics by channel in a ROS bag.
-
-    A message whose channel has no known topic is kept until the end, because an index at the end of the file may
-    declare the topic. Messages of one channel keep their order.
+    """The topics of a ROS bag by channel. The object stores a message without a known topic until the end, because an
+    index at the end of the file may declare the topic. Messages of one channel keep their order.
     """
 
     def __init__(self) -> None:

@@ -46,10 +46,8 @@ class _McapReader:
         self.closed = False
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Yield the messages in the file, or in one compressed part of the file (a chunk).
-
-        `whole` is false for a chunk that was decompressed only in part. An incomplete last record is then not reported
-        as damage.
+        """Yield the messages in the file, or in a compressed part of the file (a chunk). `whole` is false if only a
+        part of the chunk could be decompressed. In this case, an incomplete last record does not count as damage.
         """
         while (
             position < len(buffer)
@@ -106,8 +104,8 @@ class _McapReader:
 
 
 def _record_at(buffer: Buffer, position: int) -> tuple[int, int, int]:
-    """Return (operation, start, end) of the record at a position. Return zeros if no record begins there. A chunk
-    record may be truncated.
+    """Return (operation, start, end) of the record at a position in an MCAP file. Return zeros if no record begins
+    there. A chunk record may be truncated.
     """
     if position + _RECORD.size > len(buffer):
         return 0, 0, 0

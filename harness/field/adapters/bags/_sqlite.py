@@ -29,9 +29,8 @@ _FIRST = -(2**63)
 
 
 def items(path: Path, scratch: Path) -> Iterator[Item]:
-    """Yield the messages in the database.
-
-    If a database was not closed, its journal also contains messages. SQLite then repairs a copy of both files.
+    """Yield the messages in the database. If the recorder did not close the database, the journal file also contains
+    messages. SQLite then repairs a copy of the database and the journal.
     """
     journal = path.with_name(f"{path.name}{JOURNAL}")
     if journal.is_file() and 0 < journal.stat().st_size < MAX_FILE_BYTES:

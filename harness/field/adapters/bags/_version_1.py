@@ -45,10 +45,8 @@ class _BagVersion1Reader:
         self.records = iter(range(MAX_RECORDS))
 
     def items(self, buffer: Buffer, position: int, depth: int, whole: bool = True) -> Iterator[Item]:
-        """Yield the messages in the file, or in one compressed part of the file (a chunk).
-
-        `whole` is false for a chunk that was decompressed only in part. An incomplete last record is then not reported
-        as damage.
+        """Yield the messages in the file, or in a compressed part of the file (a chunk). `whole` is false if only a
+        part of the chunk could be decompressed. In this case, an incomplete last record does not count as damage.
         """
         while position < len(buffer) and next(self.records, None) is not None:
             record = _record_at(buffer, position)
@@ -93,8 +91,8 @@ class _BagVersion1Reader:
 
 
 def _declared_length(buffer: Buffer, end: int, data: bytes) -> int:
-    """Return the value of the length field of the record whose data end at `end`. The length field is directly before
-    `data`.
+    """Return the value of a length field. `end` is the position of the end of the data to which the length field
+    belongs. The field is directly before the data.
     """
     return int(_U32.unpack_from(buffer, end - len(data) - _U32.size)[0])
 

@@ -88,8 +88,8 @@ def draw(record: MergedRecord, reconciliation: ReconciledExports | None = None) 
 
 
 def _title(record: MergedRecord) -> str:
-    """Return the title of the page. It is the data of the inception block if they are readable text, and otherwise a
-    text with the hash of this block.
+    """Return the title of the page. If the data of the inception block are readable text, the title is this text.
+    Otherwise the title is a text with the hash of the inception block.
     """
     text = base64.b64decode(record.header.inception.block_data).decode("utf-8", errors="replace")
     if text and text.isprintable() and "\ufffd" not in text:

@@ -78,13 +78,12 @@ def draw(record: MergedRecord) -> Markup:
 
 
 Column = tuple[str, str, Mapping[int, str]]
-"""A column for a block: its group, its name, and the place of the block on each vehicle."""
+"""A column of the drawing, which shows a block: its group, its name, and the place of the block on each vehicle."""
 
 
 class _BlockRange(NamedTuple):
-    """A range of columns from `begin` to before `end`. The agent holds the blocks of these columns at the same place.
-
-    `fraction` is "part" if it does not hold all of them.
+    """A range of columns, from `begin` up to but not including `end`. The agent holds the blocks of these columns at
+    the same place (chain, deque or others). `fraction` is "part" if the agent does not hold all of these blocks.
     """
 
     place: str
@@ -178,8 +177,8 @@ def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Itera
 
 
 def _cell_state(cell: Sequence[Column], agent_id: int) -> tuple[str | None, str]:
-    """Return the place at which the agent holds most of the blocks in this cell, and "part" if the agent does not hold
-    all of them.
+    """Return the place at which the agent holds most of the blocks in this cell. The second value is "part" if the
+    agent does not hold all of them.
     """
     places = Counter(place for _, _, held in cell if (place := held.get(agent_id)) is not None)
     if not places:

@@ -33,7 +33,7 @@ _WIDTH, _HEIGHT = 900, 560
 
 @dataclass(frozen=True)
 class EventMap:
-    """A map of the positions in events, and sentences about the events that it does not show."""
+    """A map with the positions of events, and sentences about the events that the map does not show."""
 
     drawing: Markup
     notes: list[str]
@@ -46,10 +46,8 @@ def draw(
     ink: Mapping[int, AgentColours],
     flown: Sequence[EventTrack] = (),
 ) -> EventMap:
-    """Draw the map. `rare` contains the names of blocks that only one vehicle holds, `lost` the numbers of each agent's
-    lost blocks, and `flown` the paths from flight logs.
-
-    There is at least one position.
+    """Draw the map. `rare` contains the names of blocks that only one vehicle holds. `lost` contains the numbers of
+    each agent's lost blocks. `flown` contains the paths from flight logs. At least one position must exist.
     """
     field = _MetricProjection([*tracks, *flown])
     paths = {track.agent_id: [field.fix(at_us, position) for at_us, position in track.fixes] for track in tracks}
@@ -149,9 +147,8 @@ def _paths(
 def _pieces(
     track: EventTrack, path: Sequence[PositionFix], lost: Mapping[int, Sequence[int]]
 ) -> Iterable[tuple[bool, Sequence[PositionFix]]]:
-    """Divide a path into pieces. Yield (true if the piece is a gap, positions).
-
-    A gap is a piece between two positions where blocks were lost.
+    """Divide the path of a vehicle into pieces. Yield pairs: true if the piece is a gap, and the positions of the
+    piece. A gap is a piece between two positions where blocks were lost.
     """
     missing = lost.get(track.agent_id, ())
     ordinals = [_ordinal(entry.block) for entry in track.entries if entry.is_position]

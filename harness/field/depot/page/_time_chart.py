@@ -28,13 +28,12 @@ MAX_NAMED = 8
 
 @dataclass(frozen=True)
 class TimeSpan:
-    """An interval of time in microseconds. `outside` is the number of events outside the interval. Their times come
-    from wrong clocks.
-    """
+    """An interval of time in microseconds."""
 
     first_us: int
     last_us: int
     outside: int
+    """Number of events outside of the interval. The times of these events come from wrong clocks."""
 
 
 def time_span_of(record: MergedRecord) -> TimeSpan | None:
@@ -51,8 +50,8 @@ def time_span_of(record: MergedRecord) -> TimeSpan | None:
 
 
 def extended(time_span: TimeSpan, marks: Iterable["Mark"]) -> TimeSpan:
-    """Extend the interval to marks before and after it, and return it. A mark is ignored if its distance exceeds the
-    length of the interval, because its clock must be wrong.
+    """Return the interval, extended so that it contains marks before and after it. A mark is ignored if it is farther
+    away than the length of the interval, because its clock must then be wrong.
     """
     length = time_span.last_us - time_span.first_us
     near = [at for at, _ in marks if time_span.first_us - length <= at <= time_span.last_us + length]
@@ -60,7 +59,9 @@ def extended(time_span: TimeSpan, marks: Iterable["Mark"]) -> TimeSpan:
 
 
 Mark = tuple[int, str]
-"""A mark: the time on the agent's clock in microseconds, and a change of its vehicle, such as "mode LAND"."""
+"""A mark in the chart: the time on the agent's clock in microseconds, and a change of the agent's vehicle, such as
+"mode LAND".
+"""
 
 
 def draw(
@@ -171,8 +172,8 @@ def _bars(
 
 
 def shade(holders: int, vehicles: int) -> int:
-    """Return the number of the shade for a block with this number of holders. 0 stands for one holder, and the last
-    number stands for all vehicles.
+    """Return the number of the shade of grey for a block with this number of holders. Shade 0 stands for one holder,
+    and the last shade stands for all vehicles.
     """
     if holders <= 1:
         return 0
