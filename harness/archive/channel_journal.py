@@ -16,7 +16,7 @@ class ChannelLine(BaseModel):
     None for a datagram that is not a message of the vehicle's agent.
     """
 
-    model_config = ConfigDict(strict=True)
+    model_config = ConfigDict(strict=True, defer_build=True)
 
     sender: int
     sequence: int | None

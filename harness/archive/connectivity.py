@@ -122,7 +122,7 @@ class Connectivity:
 class NetworkLine(BaseModel):
     """A line of `network.jsonl`: a change of the network, or a fault of agents."""
 
-    model_config = ConfigDict(strict=True)
+    model_config = ConfigDict(strict=True, defer_build=True)
 
     at_s: MissionSeconds
     what: Annotated[str, Field(max_length=200)]

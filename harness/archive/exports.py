@@ -57,7 +57,7 @@ class ExportedBlock(BaseModel):
     `signature` exists only in a secured mission. The agent that completed the block made it.
     """
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
 
     agent_id: AgentId
     timestamp_us: Annotated[int, Field(ge=0, lt=2**64, strict=True)]
@@ -77,7 +77,7 @@ class ExportedBlock(BaseModel):
 class ExportedInception(BaseModel):
     """The inception block, which is the same for all agents of a mission. Its data is in base64."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
 
     block_data: Base64
     block_hash: Hash
@@ -92,7 +92,7 @@ class ExportedInception(BaseModel):
 class CurrentBlock(BaseModel):
     """The incomplete block of an agent: its events so far, in base64."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
 
     event_data: EncodedEventData
 
@@ -100,7 +100,7 @@ class CurrentBlock(BaseModel):
 class ExportedHead(BaseModel):
     """The signed head of an export in a secured mission. The agent contract defines the signed bytes."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
 
     mission: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
     boot: Annotated[str, Field(pattern="^[0-9a-f]{32}$")]
@@ -120,7 +120,7 @@ class ExportedHead(BaseModel):
 class Export(BaseModel):
     """The chain export of one agent. Unknown fields are ignored."""
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
 
     schema_: Annotated[Literal["ucp-chain-export/1"], Field(alias="schema")]
     agent_id: AgentId

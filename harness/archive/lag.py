@@ -26,7 +26,7 @@ class LagLine(BaseModel):
     processor. Agents without processes are not included.
     """
 
-    model_config = ConfigDict(extra="ignore")
+    model_config = ConfigDict(extra="ignore", defer_build=True)
 
     from_s: Annotated[float, Field(allow_inf_nan=False)]
     until_s: Annotated[float, Field(allow_inf_nan=False)]

@@ -36,7 +36,7 @@ AgentKey = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,4}$")]
 
 
 class _RecordModel(BaseModel):
-    model_config = ConfigDict(extra="ignore", populate_by_name=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="ignore", populate_by_name=True, allow_inf_nan=False, defer_build=True)
 
 
 class FindingRecord(_RecordModel):

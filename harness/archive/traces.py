@@ -44,7 +44,7 @@ class TraceHeader(BaseModel):
     datagram that seems valid in the trace may have been dropped.
     """
 
-    model_config = ConfigDict(extra="ignore", populate_by_name=True)
+    model_config = ConfigDict(extra="ignore", populate_by_name=True, defer_build=True)
 
     schema_: Version = Field(default="ucp-trace/1", alias="schema")
     agent_id: int

@@ -59,7 +59,7 @@ def between(before: PositionFix, after: PositionFix, at_s: float) -> PositionFix
 class TrackLine(BaseModel):
     """A line of `tracks.jsonl`: the positions of vehicles at one moment, in metres north, east and up."""
 
-    model_config = ConfigDict(strict=True)
+    model_config = ConfigDict(strict=True, defer_build=True)
 
     at_s: MissionSeconds
     places: dict[int, tuple[Metres, Metres, Metres]]

@@ -72,7 +72,7 @@ class InjectedDatagram(BaseModel):
     datagrams.
     """
 
-    model_config = ConfigDict(extra="ignore")
+    model_config = ConfigDict(extra="ignore", defer_build=True)
 
     message: str | None = None
     sender: int | None = None
@@ -84,7 +84,7 @@ class InjectedDatagram(BaseModel):
 class NetworkLogEntry(BaseModel):
     """A line of `network.jsonl`. It describes a change of the network, or a fault of agents."""
 
-    model_config = ConfigDict(extra="ignore")
+    model_config = ConfigDict(extra="ignore", defer_build=True)
 
     at_s: float
     what: str

@@ -38,7 +38,7 @@ class _RogueLine(BaseModel):
     datagrams.
     """
 
-    model_config = ConfigDict(extra="ignore")
+    model_config = ConfigDict(extra="ignore", defer_build=True)
 
     at_s: float
     injection: int

@@ -108,7 +108,7 @@ class AgentStatus(BaseModel):
     default.
     """
 
-    model_config = ConfigDict(extra="ignore", frozen=True)
+    model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
 
     started: bool
     idle: bool

@@ -37,7 +37,7 @@ Data = Annotated[str, AfterValidator(_check_base64)]
 
 
 class StrictModel(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 MAX_CHARACTERS = 1024 * 1024
