@@ -128,7 +128,7 @@ def _counted(
             "1",
         )
     if recorded.reconciles is not None and not evidence.describe_unknown_name("handler", "branch", agent_id=agent_id):
-        begun = sum([run.handler == "reconcile_begin" and run.branch == "begun" for run in trace.runs])
+        begun = len([run for run in trace.runs if run.handler == "reconcile_begin" and run.branch == "begun"])
         if recorded.reconciles != begun:
             detail = (
                 f"it began {_count(recorded.reconciles, 'reconcile')} according to run.json, but {begun} "

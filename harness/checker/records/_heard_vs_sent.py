@@ -4,7 +4,6 @@ An agent handles a message after its sender sent it, with the content that was s
 the network duplicates messages.
 """
 
-from collections import Counter
 from collections.abc import Iterator
 
 from harness.checker._trace_replay import TraceObservation
@@ -26,7 +25,7 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
     sendings = evidence.sendings
     once = not _may_duplicate(evidence)
     for agent_id, incarnations in evidence.incarnations.items():
-        handled: Counter[tuple[int, str, int]] = Counter()
+        handled: dict[tuple[int, str, int], int] = {}
         for incarnation in incarnations:
             for line, run in incarnation.numbered_runs():
                 trigger = run.trigger
@@ -37,8 +36,8 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
                     continue  # characteristic 1 reports messages that no agent sent
                 if once:
                     key = trigger.sender, trigger.message, trigger.sequence
-                    handled[key] += 1
-                    if handled[key] > len(sent) and not evidence.injected.may_include(trigger):
+                    count = handled[key] = handled.get(key, 0) + 1
+                    if count > len(sent) and not evidence.injected.may_include(trigger):
                         what = f"handled {_named(trigger)} again, although nothing duplicates messages"
                         yield Contradiction(finding(evidence, agent_id, TraceObservation(line, run, what)), "1")
                 first_s, message = sent[0]

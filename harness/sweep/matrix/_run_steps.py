@@ -11,6 +11,7 @@ without effect, which would hide the first real change.
 import base64
 import zlib
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import NamedTuple
 
 from pydantic import BaseModel
@@ -77,8 +78,13 @@ def name_change(scenario: Scenario, seed: int, position: int) -> FirstChange:
 
 def _steps(traces: Mapping[int, Trace]) -> list[HandlerStep]:
     """Return the handler runs of all agents that had an effect, in the order of mission time."""
-    steps = (HandlerStep(run.t, agent_id, run) for agent_id, trace in sorted(traces.items()) for run in trace.runs)
-    return sorted((step for step in steps if step.run.sent or not only_receives(step.run)), key=lambda step: step.t)
+    steps = [
+        HandlerStep(run.t, agent_id, run)
+        for agent_id, trace in sorted(traces.items())
+        for run in trace.runs
+        if run.sent or not only_receives(run)
+    ]
+    return sorted(steps, key=attrgetter("t"))
 
 
 def _digest(step: HandlerStep) -> int:
