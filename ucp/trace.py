@@ -49,6 +49,11 @@ class RecordedBytes:
             self._text = in_base64(self.content.encode())
         return self._text
 
+    def keep_only_text(self) -> None:
+        """Forget the decoded object, so that later changes of this object do not change the record."""
+        self._text = self.text
+        self.content = None
+
     def __eq__(self, other: object) -> bool:
         if self is other:
             return True

@@ -89,9 +89,10 @@ class RunArchive:
     directory has a run.json, it is the first given directory, or None if there is no directory. `exports` and `traces`
     contain the readable files by agent. `problems` contains a sentence for each damaged file, and `gaps` one for each
     missing file. If `skim` is true, large traces are read without the handler runs that only received a message. `keys`
-    are public keys that the user trusts. They are used instead of the keys in the directory. `report_progress` receives
-    a text before each long step of reading and judging. Raises RunDirectoryError if a path does not exist, or is a
-    directory with other content.
+    are public keys that the user trusts. They are used instead of the keys in the directory. `traces` are the traces by
+    agent, if the caller still has them in memory. The trace files are not read then. `report_progress` receives a text
+    before each long step of reading and judging. Raises RunDirectoryError if a path does not exist, or is a directory
+    with other content.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class RunArchive:
         *given: Path | str,
         skim: bool = False,
         keys: "PublicKeys | None" = None,
+        traces: dict[int, Trace] | None = None,
         report_progress: ReportProgress = lambda step: None,
     ) -> None:
         self.report_progress = report_progress
@@ -106,6 +108,7 @@ class RunArchive:
         self._trusted_keys = keys
         self._export_files = export_files(paths)
         self._skim = skim
+        self._given_traces = traces
         directories = [path for path in paths if path.is_dir()]
         recorded = (path for path in directories if (path / RUN_FILE).exists())
         self.directory = next(recorded, directories[0] if directories else None)
@@ -241,6 +244,8 @@ class RunArchive:
     @cached_property
     def _read_traces(self) -> tuple[dict[int, Trace], list[str], list[str]]:
         """Return the traces, and sentences about their problems and gaps."""
+        if self._given_traces is not None:
+            return self._given_traces, [], []
         traces: dict[int, Trace] = {}
         problems, gaps = [], []
         skim = self._skim and self.large

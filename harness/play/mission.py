@@ -22,6 +22,7 @@ from harness.archive.run_record import (
     NetworkState,
     RemoteRecord,
 )
+from harness.archive.traces import Trace
 from harness.errors import HarnessError, UnsupportedError
 from harness.scenario import Scenario
 from harness.scenario.changes import RANGE, Change, final_reconcile, timeline_of
@@ -58,6 +59,8 @@ class RunOutcome:
     ground_station: GroundStationRecord | None = None
     remote: dict[str, RemoteRecord] = field(default_factory=dict)
     unmatched_fates: list[str] = field(default_factory=list)
+    traces: dict[int, Trace] | None = None
+    """The traces by agent, exactly as the run directory has them. None if they are only in files."""
 
     def end_early(self, outcome: Outcome, error: HarnessError) -> None:
         """Record that the mission ended early because of `error`."""

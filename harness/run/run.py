@@ -216,7 +216,7 @@ class RunRecording:
         """
         self._record = _updated(self._record, outcome=played.outcome, outcome_detail=played.outcome_detail)
         self.record_outcome(played)
-        archive = RunArchive(self.directory.path, report_progress=report_progress)
+        archive = RunArchive(self.directory.path, traces=played.traces, report_progress=report_progress)
         evidence = checker.gather(archive)
         result, survived = checker.check(evidence), survival(evidence)
         wall_s = time.monotonic() - self._started

@@ -15,7 +15,6 @@ from harness.archive.connectivity import NetworkLine, link_losses
 from harness.archive.directory import default_path
 from harness.archive.exports import Export, ExportMaker
 from harness.archive.run_record import JudgedRecord
-from harness.archive.traces import Trace, TraceHeader
 from harness.checker import Evidence, Result
 from harness.checker.evidence import InjectedDatagram, NetworkLogEntry, RogueTraffic
 from harness.checker.judgement import Finding, Judgement
@@ -26,14 +25,14 @@ from harness.play import mission
 from harness.play.core_version import edited_files
 from harness.play.mission import RunOutcome
 from harness.play.simulation.incarnations import SimulatedIncarnation
-from harness.play.simulation.run_files import header
+from harness.play.simulation.run_files import TraceCollection
 from harness.play.simulation.simulation import Simulation
 from harness.play.simulation.virtual_time import SimulationBackend
 from harness.play.variant import variant_in_use
 from harness.scenario import Scenario
 from harness.scenario.verdict_names import CHARACTERISTICS, ENDED, RUN_CHECKS
 from netem.radio import Place
-from ucp.trace import SCHEMA, Entry, in_base64
+from ucp.trace import Entry
 
 if TYPE_CHECKING:
     from ucp.secure.secured_agent import SecuredAgent
@@ -120,17 +119,12 @@ def run_to_end(story: Coroutine[Any, Any, Returned]) -> Returned:
     raise AssertionError("the coroutine waits")
 
 
-def _header(incarnation: SimulatedIncarnation) -> TraceHeader:
-    named = header(incarnation)
-    return TraceHeader(**{**named, "schema": SCHEMA, "initial_data": in_base64(named["initial_data"])})
-
-
 class MemoryRecorder:
     """A recorder that stores the traces and records of a simulated run in memory for the checker."""
 
     def __init__(self, tracing: bool) -> None:
         self.tracing = tracing
-        self._traces: dict[int, Trace] = {}
+        self._traces = TraceCollection()
         self._maker = ExportMaker()
         self._kept: dict[int, Export] = {}
         self._injected = RogueTraffic()
@@ -138,19 +132,14 @@ class MemoryRecorder:
         """The changes of the network and the faults, as `network.jsonl` contains them."""
 
     def begin(self, incarnation: SimulatedIncarnation) -> None:
-        if not self.tracing:
-            return
-        trace = self._traces.get(incarnation.agent.agent_id)
-        if trace is None:
-            self._traces[incarnation.agent.agent_id] = Trace(_header(incarnation))
-        else:
-            trace.starts.append(len(trace.runs))
+        if self.tracing:
+            self._traces.begin(incarnation)
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
         """Do nothing, because the block contains the event."""
 
     def write(self, agent_id: int, entries: list[Entry]) -> None:
-        self._traces[agent_id].extend(entries)
+        self._traces.write(agent_id, entries)
 
     def changed(self, record: dict[str, Any]) -> None:
         if self.tracing:
@@ -192,7 +181,7 @@ class MemoryRecorder:
         )
         return Evidence(
             self._exports(simulation.now(), simulation.exporting()),
-            self._traces,
+            self._traces.by_agent,
             record,
             [],
             self._kept,

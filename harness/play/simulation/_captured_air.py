@@ -66,7 +66,7 @@ class CapturedAir(VirtualAir):
         for scheduled in inputs:
             at, _, number, what = scheduled
             if isinstance(what, MessageInFlight):
-                frame = _frame(what.sender, what.sequence, what.message, what.sealed)
+                frame = _frame(what.sender, what.sequence, what.message, what.encoded)
                 self._capture.record(at, number, frame, outbound=False)
             elif isinstance(what, StrayDatagram):
                 frame = udp_broadcast(what.source, PORT, what.datagram)
@@ -85,12 +85,12 @@ class CapturedAir(VirtualAir):
         message: Message,
         data_bytes: int,
         datagram: RecordedBytes | None = None,
-        sealed: bytes | None = None,
+        encoded: bytes | None = None,
     ) -> None:
-        self._capture.record(now, number, _frame(self._roster[number], sequence, message, sealed), outbound=True)
-        super().broadcast(now, number, sequence, message, data_bytes, datagram, sealed)
+        self._capture.record(now, number, _frame(self._roster[number], sequence, message, encoded), outbound=True)
+        super().broadcast(now, number, sequence, message, data_bytes, datagram, encoded)
 
 
 @lru_cache(FRAMES_KEPT)
-def _frame(sender: int, sequence: int, message: Message, sealed: bytes | None) -> bytes:
-    return udp_broadcast(sender, PORT, sealed or encode(sender, sequence, message))
+def _frame(sender: int, sequence: int, message: Message, encoded: bytes | None) -> bytes:
+    return udp_broadcast(sender, PORT, encoded or encode(sender, sequence, message))

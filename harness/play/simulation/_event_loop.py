@@ -31,7 +31,7 @@ from harness.scenario.fates import Fate
 from netem.medium import AT_ONCE, LATENCY, Medium
 from ucp.events import LoggableEvent, RandomEvents
 from ucp.interest import ONLY_COUNTED
-from ucp.messages import Message, datagram_bytes
+from ucp.messages import Message, datagram_bytes, encode
 from ucp.quirks import wrong_handlers
 from ucp.store import StoredState
 from ucp.trace import HandlerRun
@@ -58,6 +58,9 @@ class EventLoop:
     traces. Every message is delivered if an agent has quirks, is not the harness's own, or has an edited core
     (`harness.play.core_version`), because such an agent might not ignore it. The same is true of a secured mission in
     which messages can be dropped: a second copy is a replay even if the first one had no effect.
+
+    Receivers share one decoded message. If an agent has quirks or an edited core, it might change this object, so each
+    receiver then decodes the datagram itself, and traces contain the bytes as they were sent.
 
     `interactive`: a user may request injections during the run. `fate_script` creates the object that applies scripted
     fates. `air` creates the network. `programs` are the programs that play foreign agents.
@@ -88,7 +91,10 @@ class EventLoop:
         if self._keys is not None:
             self._initial_data = self._keys.mission.add_depot_key(initial_data)
         all_messages_count = self._has_unknown_agents or (self._keys is not None and not self._keys.nothing_is_dropped)
-        all_messages_count = all_messages_count or bool(edited_files()) or variant_in_use() is not None
+        has_other_core = bool(edited_files()) or variant_in_use() is not None
+        self._receivers_decode = scenario.has_wrong_agents or has_other_core
+        """True if each receiver of a message decodes its datagram."""
+        all_messages_count = all_messages_count or has_other_core
         self._deliver_all = deliver_all = deliver_all or all_messages_count
         self._answers_wait = scenario.settings.answer_spread_s > 0
         """True if an agent sends an answer some time after the query."""
@@ -249,10 +255,10 @@ class EventLoop:
                 self._schedule_timer(number, incarnation)  # no other correct handler of a message changes a timer
 
     def _give_message(self, agent: VirtualAgent, flight: MessageInFlight, now: float) -> None:
-        if flight.sealed is None:
+        if flight.encoded is None:
             agent.receive_message(flight.sender, flight.sequence, flight.message, now, flight.datagram)
         else:
-            agent.receive_datagram(flight.sealed, now)
+            agent.receive_datagram(flight.encoded, now)
 
     def _handle_other_input(
         self, number: int, incarnation: SimulatedIncarnation, what: DueEvent | StrayDatagram | None
@@ -272,7 +278,7 @@ class EventLoop:
             if timestamp_us is None:
                 timestamp_us = incarnation.timestamp_us(self._now)
             event = LoggableEvent(timestamp_us, event_id, data)
-            if event.encoded_bytes <= self.scenario.settings_of(agent.agent_id).max_event_bytes:
+            if event.encoded_bytes <= agent.settings.max_event_bytes:
                 self._recorder.logged(self._now, agent.agent_id, len(data))
                 agent.add_event(event, incarnation.local_s(self._now))
             self._schedule_event(number, incarnation)
@@ -339,7 +345,10 @@ class EventLoop:
                 continue
             data_bytes = datagram_bytes(message)
             incarnation.bytes_sent += data_bytes
-            self._air.broadcast(self._now, number, sequence, message, data_bytes, datagram)
+            encoded = encode(incarnation.agent.agent_id, sequence, message) if self._receivers_decode else None
+            if encoded is not None and datagram is not None:
+                datagram.keep_only_text()
+            self._air.broadcast(self._now, number, sequence, message, data_bytes, datagram, encoded)
             if self._rogue is not None:
                 self._rogue.receive_message(incarnation.agent.agent_id, sequence, message, self._now)
             elif self._recent_messages is not None:

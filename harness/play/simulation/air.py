@@ -53,8 +53,8 @@ class MessageInFlight:
     draws: RandomDraws
     datagram: RecordedBytes | None
     """The datagram in the form that traces record. None if no code has encoded it yet."""
-    sealed: bytes | None = None
-    """The encrypted datagram. None if the mission is not secured."""
+    encoded: bytes | None = None
+    """The datagram as bytes, which each receiver decodes itself. None if the receivers share `message`."""
 
     def __lt__(self, other: object) -> bool:
         return False  # two copies with equal time, rank and receiver are equal
@@ -250,14 +250,17 @@ class VirtualAir:
         message: Message,
         data_bytes: int,
         datagram: RecordedBytes | None = None,
-        sealed: bytes | None = None,
+        encoded: bytes | None = None,
     ) -> None:
-        """Broadcast a message of the agent, in a datagram with `data_bytes` bytes of data."""
+        """Broadcast a message of the agent, in a datagram with `data_bytes` bytes of data.
+
+        If `encoded` is None, the receivers share the object `message`. Otherwise each receiver decodes these bytes.
+        """
         self._rank += 1
         channel, kind = self._channel, type(message)
         draws = self._medium.draw(number, now, data_bytes) if channel is None else _UNKNOWN
         flight = MessageInFlight(
-            self._roster[number], sequence, message, MATTERS[kind], now, self._rank, draws, datagram, sealed
+            self._roster[number], sequence, message, MATTERS[kind], now, self._rank, draws, datagram, encoded
         )
         answered = None if self._deliver_all else ANSWERED.get(kind)
         if answered is None and kind in ASKED and (self._answer_logs or not self._deliver_all):

@@ -10,14 +10,36 @@ from typing import Any, Protocol
 from harness.archive.directory import RunDirectory
 from harness.archive.packed_parts import pack_parts
 from harness.archive.trace_files import PACKED_FROM_BYTES, packable_traces
+from harness.archive.traces import Trace, TraceHeader
 from harness.play.simulation.incarnations import SimulatedIncarnation
 from netem.radio import Place
 from ucp.agent_files import TraceFile, write_json_atomically
-from ucp.trace import Entry, header_line
+from ucp.trace import SCHEMA, Entry, header_line, in_base64
+
+
+class TraceCollection:
+    """The traces of a simulated run as objects, by agent. The checker reads them instead of files."""
+
+    def __init__(self) -> None:
+        self.by_agent: dict[int, Trace] = {}
+
+    def begin(self, incarnation: SimulatedIncarnation) -> None:
+        """Begin the trace of an agent, or a new incarnation in it."""
+        trace = self.by_agent.get(incarnation.agent.agent_id)
+        if trace is None:
+            named = header(incarnation)
+            named |= {"schema": SCHEMA, "initial_data": in_base64(named["initial_data"])}
+            named["secured"] = named["secured"] or None  # as in the file, which omits false
+            self.by_agent[incarnation.agent.agent_id] = Trace(TraceHeader(**named))
+        else:
+            trace.starts.append(len(trace.runs))
+
+    def write(self, agent_id: int, entries: list[Entry]) -> None:
+        self.by_agent[agent_id].extend(entries)
 
 
 class DiskRecorder:
-    """A `Recorder` that writes the files of a run directory."""
+    """A `Recorder` that writes the files of a run directory, and also collects the traces for the checker."""
 
     tracing = True
 
@@ -29,18 +51,28 @@ class DiskRecorder:
         self._written_bytes = 0
         """Size of all traces since parts of them were last packed."""
         self._traces: dict[int, TraceFile] = {}
+        self._collected = TraceCollection()
+
+    @property
+    def traces(self) -> dict[int, Trace] | None:
+        """The traces by agent. None if a trace file lacks a part of the trace."""
+        return None if self.problems() else dict(sorted(self._collected.by_agent.items()))
 
     def begin(self, incarnation: SimulatedIncarnation) -> None:
         agent_id = incarnation.agent.agent_id
         if agent_id not in self._traces:
             self._traces[agent_id] = TraceFile(self._rundir.agents / f"{agent_id}.trace.jsonl")
         self._append(agent_id, header_line(**header(incarnation)))
+        self._collected.begin(incarnation)
 
     def logged(self, at_s: float, agent_id: int, data_bytes: int) -> None:
         """Do nothing, because the file with the agent's blocks also contains the logged events."""
 
     def write(self, agent_id: int, entries: list[Entry]) -> None:
         self._append(agent_id, "".join([entry.to_line() for entry in entries]))
+        for entry in entries:
+            entry.t = round(entry.t, 6)  # as in the file
+        self._collected.write(agent_id, entries)
 
     def _append(self, agent_id: int, lines: str) -> None:
         trace = self._traces[agent_id]

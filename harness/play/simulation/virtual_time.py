@@ -126,6 +126,7 @@ class SimulationBackend(Backend):
                 await _compare_again(simulation, on_progress)
             for agent_id, problem in files.problems().items():
                 simulation.played.agents[str(agent_id)].trace_problem = problem
+            simulation.played.traces = files.traces
             for agent_id, names in programs.close().items() if programs else ():
                 simulation.played.agents[str(agent_id)].left_behind = names
 

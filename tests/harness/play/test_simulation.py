@@ -16,6 +16,7 @@ from harness.archive.archive import RunArchive
 from harness.archive.exports import read_export
 from harness.errors import MachineError, ScenarioError
 from harness.play.progress import SilentProgress
+from harness.play.simulation import _event_loop
 from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
@@ -23,6 +24,8 @@ from tests.harness.command import Running, sentences, write_scenario
 from tests.harness.scenario.test_scenarios import LIVELOCKS
 from tests.harness.virtual import scenario
 from tests.machine import require, unavailable
+from ucp.agent import HANDLERS
+from ucp.block import HASH_BYTES
 from ucp.messages import BlockAddRequest, datagram_bytes
 from ucp.trace import HandlerRun
 
@@ -175,6 +178,21 @@ def test_quirk_affects_only_the_named_agents() -> None:
     assert digest(simulate(switched_off, 1, tracing=True)) == digest(simulate(right, 1, tracing=True))
 
 
+def test_agent_that_changes_a_received_message_damages_no_other_agent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Receivers share one object for each message, except if an agent may be wrong."""
+    right = HANDLERS["receive_request_add_block"]
+
+    def run(core: Any, sender: int, message: BlockAddRequest) -> str:
+        message.block_hash = bytes(HASH_BYTES)
+        return right.run(core, sender, message)
+
+    monkeypatch.setattr(_event_loop, "wrong_handlers", lambda quirks, rng: [replace(right, run=run)])
+    one = scenario(quirks={"vote_while_reconciling": {"agents": [2]}})
+    steps = simulate(one, 1, tracing=True).result.beside["steps"]
+    assert steps.verdict == "deviates"
+    assert {finding.agent_id for finding in steps.evidence} == {2}
+
+
 def test_omitted_deliveries_change_no_agent_during_flight() -> None:
     one = load_scenario(SCENARIOS / "split_rejoin.yaml")
     fast, all_ = simulate(one, 1, tracing=True), simulate(one, 1, tracing=True, deliver_all=True)
@@ -281,6 +299,17 @@ def test_run_directory_equals_the_simulation_in_memory(tmp_path: Path) -> None:
     assert (record["backend"], record["outcome"], record["settled"]) == ("sim", "completed", True)
     network = [json.loads(line) for line in (tmp_path / "run" / "network.jsonl").read_text().splitlines()]
     assert [change["what"] for change in network] == ["start", "final reconcile"]
+
+
+@pytest.mark.parametrize("name", ["attrition.yaml", "rogue.yaml"])
+def test_judged_traces_equal_the_trace_files(name: str, tmp_path: Path) -> None:
+    judged = run(load_scenario(SCENARIOS / name), 1, tmp_path / "run", SilentProgress(), "sim").played.traces
+    assert judged is not None
+    files = RunArchive(tmp_path / "run").traces
+    assert [*files] == [*judged]
+    for agent_id, trace in files.items():
+        assert trace.header.model_dump() == judged[agent_id].header.model_dump()
+        assert replace(trace, header=judged[agent_id].header) == judged[agent_id]
 
 
 @pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*[!x].yaml")), ids=lambda path: path.stem)
