@@ -399,11 +399,6 @@ class Scenario(StrictModel):
                     f"agent {agent} is in `remote.agents`, so its command is that of its own computer: leave it out of "
                     "`agent_command`"
                 )
-        if self.security is not None:
-            raise ValueError(
-                "`remote` and `security` do not work together, because the connection to another computer would reveal "
-                "the keys: leave out one of them"
-            )
         if self.vehicles.kind != "none" and self.events.source == "mavlink":
             raise ValueError(
                 "an agent in `remote.agents` cannot read the telemetry of its vehicle: add `events: {source: random}`"

@@ -70,8 +70,12 @@ class TwoComputers:
 
     def start(self, computer: str, *arguments: object, **settings: Any) -> subprocess.Popen[str]:
         """Start `ucp-harness` on a computer."""
+        return self.run(computer, *COMMAND, *map(str, arguments), **settings)
+
+    def run(self, computer: str, *argv: str, **settings: Any) -> subprocess.Popen[str]:
+        """Start a program on a computer."""
         process = subprocess.Popen(
-            [*self._inside(computer), *COMMAND, *map(str, arguments)],
+            [*self._inside(computer), *argv],
             cwd=self.directory,
             env={**os.environ, "TMPDIR": str(self.directory)},
             stdout=subprocess.PIPE,

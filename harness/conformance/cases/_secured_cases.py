@@ -123,7 +123,10 @@ async def _secured(bench: CaseBench) -> AsyncIterator[tuple[SecuredPeers, "KeySe
         from ucp.secure.bundle import KeySet, write_bundle
     except ModuleNotFoundError as error:
         raise CannotJudgeError(f"{error.name} is not installed here: run `pip install 'ucp-harness[secure]'`") from None
-    bench.require_own_machine("the keys")
+    if bench.lab.remote is not None and not bench.lab.remote.is_encrypted:
+        raise CannotJudgeError(
+            "the connection to the agent is not encrypted: run `pip install 'ucp-harness[secure]'` on its computer"
+        )
     keys = KeySet.derived(os.urandom(32), ROSTER)
 
     def prepare(directory: Path) -> None:

@@ -44,6 +44,10 @@ class Connection(asyncio.Protocol):
             self._transport.write(b"".join(self._channel.encode(kind, payload) for kind, payload in messages))
 
     @property
+    def is_encrypted(self) -> bool:
+        return self._channel.is_encrypted
+
+    @property
     def unsent(self) -> int:
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 

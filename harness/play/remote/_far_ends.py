@@ -104,14 +104,15 @@ class Host(Protocol):
 class FarEnds:
     """The listening sockets of a host, and the tasks that serve them."""
 
-    def __init__(self, host: Host, name: str, places: int = 1, *, agents: int = 1) -> None:
+    def __init__(self, host: Host, name: str, *, places: int = 1, agents: int = 1, has_keys: bool = False) -> None:
         """Create the object without listening. `name` describes the run to the user of the other computer.
 
         `places` is the number of incarnations that each far end runs at the same time, and `agents` the number of
-        agents that may join at the same time.
+        agents that may join at the same time. If `has_keys` is true, the agents get keys, and only encrypted
+        connections are accepted.
         """
         self._max_handshakes = MAX_HANDSHAKES + agents
-        self._host, self._name, self._places = host, name, places
+        self._host, self._name, self._places, self._has_keys = host, name, places, has_keys
         self._run = secrets.token_hex(8)
         self._tasks: set[asyncio.Task[None]] = set()
         self._stand_ins: set[socket.socket] = set()
@@ -199,6 +200,11 @@ class FarEnds:
         agent_id, session, command = words.get("agent"), words.get("session"), words.get("command")
         if type(agent_id) is not int or not isinstance(session, str) or not isinstance(command, list):
             return "its hello lacks the agent, the session or the command"
+        if self._has_keys and not hello.is_encrypted:
+            return (
+                "this mission has keys, which must travel encrypted: run `pip install 'ucp-harness[secure]'` on the "
+                "agent's computer"
+            )
         return self._host.refusal(agent_id, session, host)
 
     def _complain(self, sentence: str) -> None:

@@ -4,8 +4,10 @@
     agent -> harness    length || hello || nonce of the agent || HMAC(secret, "UCP hello" || both nonces || hello)
     harness -> agent    length || welcome || HMAC(secret, "UCP welcome" || both nonces || hello || welcome)
 
-`hello` and `welcome` are JSON objects. A refusal is a `welcome` with the key `refused`, one sentence. The keys of the
-connection follow from the secret and both nonces. All parts have a maximum size, and the handshake has a time limit.
+`hello` and `welcome` are JSON objects. A refusal is a `welcome` with the key `refused`, one sentence. The key `share`
+has a public key (`_key_exchange`). The keys of the connection follow from the secret, both nonces and the key
+exchange. If both ends sent a public key, the connection is encrypted. An attacker cannot remove a public key, because
+the tags cover `hello` and `welcome`. All parts have a maximum size, and the handshake has a time limit.
 The hash is HMAC-SHA256. The secret has 256 random bits, so a recorded handshake does not reveal it.
 """
 
@@ -20,6 +22,7 @@ import struct
 from dataclasses import dataclass
 from typing import Any
 
+from harness.play.remote._key_exchange import KeyExchange
 from harness.play.remote._wire import Channel
 from ucp.plain_file import parse_json
 
@@ -44,22 +47,28 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True)
 class Hello:
-    """A far end that knows the secret. `words` is its JSON object."""
+    """A far end that knows the secret. `words` is its JSON object without the public key."""
 
     words: dict[str, Any]
     connection: socket.socket
     _secret: bytes
     _nonces: bytes
     _hello: bytes
+    _exchange: KeyExchange
+    _shared: bytes | None
+
+    @property
+    def is_encrypted(self) -> bool:
+        return self._shared is not None
 
     async def answer(self, welcome: dict[str, Any]) -> Channel:
         """Send the last message of the handshake. Return the channel of the connection. Raises OSError."""
-        data = json.dumps(welcome).encode()
+        data = json.dumps({**welcome, "share": self._exchange.share}).encode()
         tag = _mac(self._secret, b"UCP welcome", self._nonces, self._hello, data)
         loop = asyncio.get_running_loop()
         await loop.sock_sendall(self.connection, _LENGTH.pack(len(data)) + data + tag)
-        to_agent, to_lab = _keys(self._secret, self._nonces)
-        return Channel(to_agent, to_lab)
+        to_agent, to_lab = _keys(self._secret, self._nonces, self._shared)
+        return Channel(to_agent, to_lab, is_encrypted=self.is_encrypted)
 
 
 async def receive_hello(connection: socket.socket, secret: bytes) -> Hello:
@@ -75,7 +84,8 @@ async def receive_hello(connection: socket.socket, secret: bytes) -> Hello:
             data = json.dumps({"refused": "the secret is wrong"}).encode()
             await loop.sock_sendall(connection, _LENGTH.pack(len(data)) + data + bytes(_TAG_BYTES))
             raise HandshakeError("has another secret")
-    return Hello(_parsed(hello), connection, secret, nonces, hello)
+    words, exchange = _parsed(hello), KeyExchange()
+    return Hello(words, connection, secret, nonces, hello, exchange, _shared(exchange, words))
 
 
 async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, Any]) -> tuple[Channel, dict[str, Any]]:
@@ -88,7 +98,8 @@ async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, A
         challenge = await _exactly(connection, len(_CHALLENGE) + _NONCE_BYTES)
         if not challenge.startswith(_CHALLENGE):
             raise HandshakeError("is not a harness of this version")
-        own, words = secrets.token_bytes(_NONCE_BYTES), json.dumps(hello).encode()
+        own, exchange = secrets.token_bytes(_NONCE_BYTES), KeyExchange()
+        words = json.dumps({**hello, "share": exchange.share}).encode()
         nonces = challenge[len(_CHALLENGE) :] + own
         tag = _mac(secret, b"UCP hello", nonces, words)
         await loop.sock_sendall(connection, _LENGTH.pack(len(words)) + words + own + tag)
@@ -99,8 +110,17 @@ async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, A
     welcome = _parsed(data)
     if "refused" in welcome:
         raise RefusedError(str(welcome["refused"]))
-    to_agent, to_lab = _keys(secret, nonces)
-    return Channel(to_lab, to_agent), welcome
+    shared = _shared(exchange, welcome)
+    to_agent, to_lab = _keys(secret, nonces, shared)
+    return Channel(to_lab, to_agent, is_encrypted=shared is not None), welcome
+
+
+def _shared(exchange: KeyExchange, words: dict[str, Any]) -> bytes | None:
+    """Return the result of the key exchange, and remove the public key from `words`. Raises HandshakeError."""
+    try:
+        return exchange.shared(words.pop("share", None))
+    except ValueError:
+        raise HandshakeError("sent a wrong public key") from None
 
 
 def _mac(secret: bytes, *parts: bytes) -> bytes:
@@ -110,8 +130,10 @@ def _mac(secret: bytes, *parts: bytes) -> bytes:
     return hmac.digest(secret, b"".join(struct.pack("!I", len(part)) + part for part in parts), "sha256")
 
 
-def _keys(secret: bytes, nonces: bytes) -> tuple[bytes, bytes]:
-    return _mac(secret, b"UCP to agent", nonces), _mac(secret, b"UCP to lab", nonces)
+def _keys(secret: bytes, nonces: bytes, shared: bytes | None) -> tuple[bytes, bytes]:
+    """Return the keys of both directions: to the agent, and to the lab."""
+    parts = nonces, shared or b""
+    return _mac(secret, b"UCP to agent", *parts), _mac(secret, b"UCP to lab", *parts)
 
 
 def _parsed(data: bytes) -> dict[str, Any]:

@@ -109,7 +109,8 @@ class RemoteAgents:
             yield
             return
         secret, listeners = self._meeting_point()
-        far_ends = FarEnds(self, self._scenario.name, agents=len(self._vehicles))
+        has_keys = self._scenario.security is not None
+        far_ends = FarEnds(self, self._scenario.name, agents=len(self._vehicles), has_keys=has_keys)
         async with far_ends.opened(listeners, secret, self._rundir.path):
             if self._hosts is not None:
                 self._hosts.start()

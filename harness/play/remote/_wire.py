@@ -1,8 +1,12 @@
 """Encode and decode the messages between a stand-in and the far end.
 
-Each message has its own authentication tag (HMAC-SHA256, 16 bytes). The tag covers the number of the message in its
-direction, so a message that is changed, repeated, left out or moved ends the connection. The messages are not
-encrypted. Both directions have their own key, which is valid for one connection.
+Each message has its own authentication tag of 16 bytes. The tag covers the number of the message in its direction, so a
+message that is changed, repeated, left out or moved ends the connection. Both directions have their own key, which is
+valid for one connection.
+
+If both ends have the package cryptography, messages are encrypted with ChaCha20-Poly1305 (RFC 8439), whose nonce is the
+number of the message. Without this package, messages are in the clear, and their tag is an HMAC-SHA256. The keys of a
+mission travel only encrypted.
 """
 
 from __future__ import annotations
@@ -51,6 +55,7 @@ class Kind(IntEnum):
     STORE = 14
     LAG = 15
     EXIT = 16
+    BUNDLE = 17
 
 
 @dataclass(frozen=True)
@@ -74,16 +79,22 @@ class Message:
 class Channel:
     """The state of one connection: keys, numbers of messages, and bytes of an incomplete message."""
 
-    def __init__(self, send_key: bytes, receive_key: bytes, sent: int = 0, received: int = 0) -> None:
-        self._send_key, self._receive_key = send_key, receive_key
+    def __init__(
+        self, send_key: bytes, receive_key: bytes, sent: int = 0, received: int = 0, *, is_encrypted: bool = False
+    ) -> None:
+        self._keys = send_key, receive_key
+        self.is_encrypted = is_encrypted
+        protection: type[_Encryption | _Authentication] = _Encryption if is_encrypted else _Authentication
+        self._sender, self._receiver = protection(send_key), protection(receive_key)
         self._sent, self._received = sent, received
         self._unread = bytearray()
 
     def encode(self, kind: Kind, payload: bytes = b"") -> bytes:
         """Return the bytes of the next message."""
-        tag = _tag(self._send_key, self._sent, kind, payload)
+        header = _HEADER.pack(len(payload), kind)
+        body = self._sender.protect(self._sent, header, payload)
         self._sent += 1
-        return _HEADER.pack(len(payload), kind) + payload + tag
+        return header + body
 
     def encode_json(self, kind: Kind, document: dict[str, Any]) -> bytes:
         return self.encode(kind, json.dumps(document).encode())
@@ -99,10 +110,8 @@ class Channel:
             end = _HEADER.size + length + TAG_BYTES
             if len(self._unread) < end:
                 break
-            payload = bytes(self._unread[_HEADER.size : _HEADER.size + length])
-            tag = bytes(self._unread[end - TAG_BYTES : end])
-            if not hmac.compare_digest(tag, _tag(self._receive_key, self._received, number, payload)):
-                raise WireError("a message is not authentic")
+            header, body = bytes(self._unread[: _HEADER.size]), bytes(self._unread[_HEADER.size : end])
+            payload = self._receiver.open(self._received, header, body)
             self._received += 1
             del self._unread[:end]
             try:
@@ -117,20 +126,61 @@ class Channel:
         """
         assert not self._unread, "a message is incomplete"
         return {
-            "send_key": self._send_key.hex(),
-            "receive_key": self._receive_key.hex(),
+            "send_key": self._keys[0].hex(),
+            "receive_key": self._keys[1].hex(),
             "sent": self._sent,
             "received": self._received,
+            "is_encrypted": self.is_encrypted,
         }
 
     @classmethod
     def from_json(cls, state: dict[str, Any]) -> Channel:
         keys = bytes.fromhex(state["send_key"]), bytes.fromhex(state["receive_key"])
-        return cls(*keys, state["sent"], state["received"])
+        return cls(*keys, state["sent"], state["received"], is_encrypted=state["is_encrypted"])
 
 
-def _tag(key: bytes, number: int, kind: int, payload: bytes) -> bytes:
-    return hmac.digest(key, _NUMBER.pack(number) + bytes([kind]) + payload, "sha256")[:TAG_BYTES]
+class _Authentication:
+    """The messages of one direction, in the clear with a tag."""
+
+    def __init__(self, key: bytes) -> None:
+        self._key = key
+
+    def protect(self, number: int, header: bytes, payload: bytes) -> bytes:
+        """Return the bytes of a message after its header."""
+        return payload + hmac.digest(self._key, _NUMBER.pack(number) + header + payload, "sha256")[:TAG_BYTES]
+
+    def open(self, number: int, header: bytes, body: bytes) -> bytes:
+        """Return the payload of a message. Raises WireError."""
+        payload = body[:-TAG_BYTES]
+        if not hmac.compare_digest(body, self.protect(number, header, payload)):
+            raise WireError("a message is not authentic")
+        return payload
+
+
+class _Encryption:
+    """The messages of one direction, encrypted."""
+
+    def __init__(self, key: bytes) -> None:
+        from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+
+        self._cipher = ChaCha20Poly1305(key)
+
+    def protect(self, number: int, header: bytes, payload: bytes) -> bytes:
+        """Return the bytes of a message after its header."""
+        return self._cipher.encrypt(_nonce(number), payload, header)
+
+    def open(self, number: int, header: bytes, body: bytes) -> bytes:
+        """Return the payload of a message. Raises WireError."""
+        from cryptography.exceptions import InvalidTag
+
+        try:
+            return self._cipher.decrypt(_nonce(number), body, header)
+        except InvalidTag:
+            raise WireError("a message is not authentic") from None
+
+
+def _nonce(number: int) -> bytes:
+    return bytes(4) + _NUMBER.pack(number)
 
 
 ADDRESS_BYTES = 4
@@ -154,6 +204,8 @@ def prepare(connection: socket.socket) -> None:
 
 
 HANDED_OVER_BYTES = 4096
+KEYS = "keys"
+"""Name of the link to the directory in memory, in the directory of a far end."""
 
 
 def bind_path(outside: socket.socket, path: Path) -> None:

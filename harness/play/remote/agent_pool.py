@@ -48,6 +48,8 @@ class AgentPool:
     _waiting: deque[socket.socket] = field(default_factory=deque)
     """The stand-ins that wait for a connection."""
     _incarnations: list[RemoteIncarnation] = field(default_factory=list)
+    is_encrypted: bool = False
+    """True if the keys of a test can travel to the far end."""
     _joined: asyncio.Event = field(default_factory=asyncio.Event)
     _lost: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -55,7 +57,8 @@ class AgentPool:
     async def opened(self, directory: Path) -> AsyncIterator[None]:
         """Listen inside this context. Raises MachineError if the address cannot be used."""
         self._directory = directory
-        async with FarEnds(self, "a conformance test", PLACES).opened([listening(self.listen)], self.secret, directory):
+        far_ends = FarEnds(self, "a conformance test", places=PLACES)
+        async with far_ends.opened([listening(self.listen)], self.secret, directory):
             try:
                 yield
             finally:
@@ -105,6 +108,7 @@ class AgentPool:
     async def receive(self, far_end: FarEnd) -> None:
         self._session, self.host, self.command = far_end.session, far_end.host, far_end.command
         if not self._joined.is_set():
+            self.is_encrypted = far_end.channel.is_encrypted
             self.delay_s = await far_end.measured_delay()
             self._joined.set()
         await far_end.keep()

@@ -2,6 +2,8 @@
 
 The program is the first process of a private network (see `netem.far_network`), so its end also ends each process that
 the agent started. The process outside (`harness.play.remote.join`) sends it connected sockets through the socket FD.
+The link `keys` in DIRECTORY leads to a directory in memory, for the keys of a secured mission.
+
 The program waits for the message `begin`, runs one incarnation of the agent, and ends. If the connection is lost
 meanwhile, the agent goes on. The program then asks the process outside for another connection by sending `lost`, and
 continues where it was.
@@ -15,6 +17,7 @@ import contextlib
 import json
 import os
 import resource
+import shutil
 import signal
 import socket
 import sys
@@ -28,6 +31,7 @@ from harness.play.remote._connection import Connection
 from harness.play.remote._far_clock import pong
 from harness.play.remote._wire import (
     ADDRESS_BYTES,
+    KEYS,
     MAX_MESSAGE_BYTES,
     NUMBER_BYTES,
     SILENT_S,
@@ -105,6 +109,8 @@ class FarWorker:
         self._speedup = 1.0
         self._measures_lag = False
         self._store: Path | None = None
+        self._bundle: Path | None = None
+        """The file with the agent's keys, in a secured mission."""
         self._tails: dict[Kind, FileTail] = {}
         self._ended: dict[str, Any] | None = None
         """How the agent ended."""
@@ -113,6 +119,8 @@ class FarWorker:
         """Run until the incarnation has ended. When this process ends, the kernel ends the agent."""
         self._loop.add_reader(self._outside, self._take_over)
         await self._over.wait()
+        if self._bundle is not None:
+            shutil.rmtree(self._bundle.parent, ignore_errors=True)
 
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = self._loop.create_task(coroutine)
@@ -207,6 +215,8 @@ class FarWorker:
             disks.mkdir(exist_ok=True)
             self._store = disks / _name(order["store"])
             mission["store"] = os.path.relpath(self._store, self._home)
+        if mission is not None and "bundle" in order:
+            mission["security"]["bundle"] = str(self._write_bundle(base64.b64decode(order["bundle"])))
         path = self._home / f"{self._agent_id}.mission.json"
         if mission is None:
             path.write_bytes(base64.b64decode(order["text"]))
@@ -244,6 +254,16 @@ class FarWorker:
             self._send(Kind.READY)
             if mission is not None and type(mission.get("epoch_us")) is int:
                 await self._measure_lag(mission["epoch_us"])
+
+    def _write_bundle(self, bundle: bytes) -> Path:
+        """Write the file with the agent's keys. Its memory does not appear in a core file either."""
+        from ucp.secure.keyfile import write_key_file  # only an encrypted connection carries keys
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        self._bundle = self._directory / KEYS / str(self._incarnation) / f"{self._agent_id}.bundle.json"
+        self._bundle.parent.mkdir()
+        write_key_file(self._bundle, json.loads(bundle), secret=True)
+        return self._bundle
 
     async def _connect_control(self, process: asyncio.subprocess.Process) -> None:
         """Connect to the control socket of the agent as soon as it exists."""
@@ -314,6 +334,8 @@ class FarWorker:
             self._send_file(Kind.EXPORT, self._home / f"{self._agent_id}.chain.json")
             if self._store is not None:
                 self._send_file(Kind.STORE, self._store)
+            if self._bundle is not None:
+                self._send_file(Kind.BUNDLE, self._bundle)
             self._send(Kind.EXIT, json.dumps(how).encode())
 
     # Datagrams and files

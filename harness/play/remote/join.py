@@ -26,8 +26,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from harness.errors import HarnessError, MachineError
+from harness.play.memory_directory import KEYS_PREFIX, memory_directory
 from harness.play.remote._handshake import PROTOCOL, HandshakeError, RefusedError, introduce
-from harness.play.remote._wire import Channel, hand_over, prepare
+from harness.play.remote._wire import KEYS, Channel, hand_over, prepare
 from harness.scenario import Scenario
 from netem import far_network
 from netem.errors import LabUnavailable
@@ -131,7 +132,12 @@ def directory_of_agents() -> Iterator[Path]:
             if time.time() - path.lstat().st_ctime > NEW_S:
                 with _locked(path):
                     shutil.rmtree(path)
-    with tempfile.TemporaryDirectory(prefix=DIRECTORY) as name, _locked(Path(name)):
+    with (
+        tempfile.TemporaryDirectory(prefix=DIRECTORY) as name,
+        _locked(Path(name)),
+        memory_directory(KEYS_PREFIX) as keys,
+    ):
+        (Path(name) / KEYS).symlink_to(keys)
         yield Path(name)
 
 

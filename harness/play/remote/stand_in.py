@@ -45,7 +45,7 @@ from netem import addresses
 from ucp.agent_files import write_atomically
 from ucp.clock import MICROSECONDS
 from ucp.mission import MAX_MISSION_BYTES
-from ucp.plain_file import parse_json, read_plain_file
+from ucp.plain_file import parse_json, read_json, read_plain_file
 
 PINGS_BEFORE_START = 8
 PING_EVERY_S = 0.5
@@ -58,6 +58,7 @@ MAX_REQUEST_BYTES = 65_536
 MAX_DATAGRAM_BYTES = 65_536
 DATAGRAMS_PER_TURN = 64
 MAX_UNSENT_BYTES = 4 << 20
+MAX_BUNDLE_BYTES = 1 << 20
 FAILED = 1
 
 
@@ -70,6 +71,8 @@ class StandIn:
         self._outside, self._task, self._directory = outside, task, directory
         self._mission = mission
         self._store: Path | None = None
+        self._bundle: Path | None = None
+        """The file with the agent's keys, in a secured mission."""
         self._address = addresses.address(task.vehicle)
         self._agent_id = task.agent_id
         self._incarnation = secrets.token_hex(8)
@@ -195,6 +198,8 @@ class StandIn:
                 if self._store is not None:
                     with contextlib.suppress(OSError):
                         self._store.write_bytes(message.payload)
+            case Kind.BUNDLE if self._bundle is not None:
+                _write_bundle(self._bundle, message.document())
             case Kind.EXIT:
                 self._exit(message.document())
             case _:
@@ -231,12 +236,27 @@ class StandIn:
                 self._store = (self._directory / mission["store"]).resolve()
                 # The far end names the disk after its path here, because a reboot names the same path.
                 order["store"] = hashlib.sha256(str(self._store).encode()).hexdigest()[:16]
+            if (bundle := self._bundle_path(mission)) is not None:
+                if not connection.is_encrypted:
+                    self._end(FAILED, "the connection is not encrypted, so the keys of the mission stay in the lab")
+                    return
+                order["bundle"] = base64.b64encode(read_plain_file(bundle, MAX_BUNDLE_BYTES)).decode("ascii")
+                self._bundle = bundle
+                # Later incarnations must know that an agent has used the keys, also if its own note never arrives.
+                _write_bundle(bundle, {"started_us": 0, **read_json(bundle, MAX_BUNDLE_BYTES)})
             order["mission"] = mission
         else:
             order["text"] = base64.b64encode(self._mission).decode("ascii")
         most_bytes = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
         order["max_file_bytes"] = None if most_bytes < 0 else most_bytes
         connection.send(Kind.BEGIN, json.dumps(order).encode())
+
+    def _bundle_path(self, mission: dict[str, Any]) -> Path | None:
+        """Return the file with the agent's keys. Return None if there is no such file."""
+        security = mission.get("security")
+        name = security.get("bundle") if isinstance(security, dict) else None
+        path = self._directory / name if isinstance(name, str) else None
+        return path if path is not None and path.is_file() else None
 
     def _far_us(self, epoch_us: int) -> int:
         """Return the time that the far clock shows at this time of the harness's clock."""
@@ -460,6 +480,13 @@ class StandIn:
             self._connection.send(Kind.IDLE)  # the far end may end
         self._tell({"left_behind": how["left_behind"]})
         self._end(int(how["status"]))
+
+
+def _write_bundle(path: Path, document: dict[str, Any]) -> None:
+    """Replace the file with the agent's keys."""
+    from ucp.secure.keyfile import write_key_file  # most missions have no keys
+
+    write_key_file(path, document, secret=True)
 
 
 def main() -> None:

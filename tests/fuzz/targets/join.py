@@ -13,6 +13,7 @@ from harness.archive.directory import RunDirectory
 from harness.play.remote._far_clock import FarClock, ping, pong
 from harness.play.remote._far_ends import FarEnds
 from harness.play.remote._handshake import PROTOCOL, HandshakeError, Hello, RefusedError, introduce, receive_hello
+from harness.play.remote._key_exchange import KeyExchange
 from harness.play.remote._remote_agents import RemoteAgents
 from harness.play.remote._wire import Channel, Kind, WireError
 from harness.scenario.load import parse
@@ -63,7 +64,7 @@ def _hello(data: bytes) -> None:
     if not isinstance(words, dict):
         return
     with socket.socket() as connection:
-        hello = Hello(words, connection, SECRET, b"", b"")
+        hello = Hello(words, connection, SECRET, b"", b"", KeyExchange(), None)
         refused = FarEnds(_agents(), "join").refusal(hello, "192.168.7.2")
     require("\n" not in refused and len(refused) < 500, "an error that is no sentence")
     require(bool(refused) or words["agent"] == 2, "another vehicle")

@@ -32,6 +32,7 @@ PLAYED = {
     "a killed agent restarts with its chain, and proposes the waiting block",
     "the first line of the trace describes the mission",
     "status, chain export and trace agree",
+    "with keys, blocks are signed in messages and in the export",
 }
 NOT_VISIBLE = {
     "two simultaneous clients of the control socket are both answered",

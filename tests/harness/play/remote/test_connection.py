@@ -5,16 +5,32 @@ import json
 import os
 import socket
 import struct
+import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
+from harness.archive.directory import RunDirectory
 from harness.play.remote import _far_clock, join
 from harness.play.remote._far_clock import FarClock, ping, pong
-from harness.play.remote._handshake import MAX_TEXT_BYTES, HandshakeError, RefusedError, introduce, receive_hello
+from harness.play.remote._far_ends import FarEnds
+from harness.play.remote._handshake import (
+    MAX_TEXT_BYTES,
+    PROTOCOL,
+    HandshakeError,
+    Hello,
+    RefusedError,
+    _shared,
+    introduce,
+    receive_hello,
+)
+from harness.play.remote._key_exchange import KeyExchange
+from harness.play.remote._remote_agents import RemoteAgents
 from harness.play.remote._wire import MAX_MESSAGE_BYTES, Channel, Kind, Message, WireError
 from harness.play.remote.secret_file import SecretError, create_secret, read_secret
+from harness.scenario.load import parse
+from ucp.features import CONTRACT
 
 KEY, OTHER_KEY = b"a" * 32, b"b" * 32
 SECRET = b"s" * 32
@@ -243,3 +259,102 @@ def test_unusable_secret_files_are_refused_with_a_way_out(tmp_path: Path) -> Non
     os.mkfifo(path, 0o600)
     with pytest.raises(SecretError, match="is not a file"):
         read_secret(path)
+
+
+# Encryption
+
+
+def test_messages_on_the_connection_are_encrypted() -> None:
+    (_, near), (far, _) = shake(SECRET, SECRET, {})
+    assert near.is_encrypted and far.is_encrypted
+    sent = near.encode(Kind.BEGIN, b"the keys of the mission")
+    assert b"keys" not in sent
+    assert far.decode(sent) == [Message(Kind.BEGIN, b"the keys of the mission")]
+
+
+@pytest.mark.parametrize("position", [0, 4, 5, 12, -1])
+def test_changed_encrypted_message_is_refused(position: int) -> None:
+    (_, near), (far, _) = shake(SECRET, SECRET, {})
+    data = bytearray(near.encode(Kind.REQUEST, b"1234 request"))
+    data[position] ^= 1
+    with pytest.raises(WireError):
+        far.decode(bytes(data) + bytes(256))
+
+
+def test_repeated_encrypted_message_is_refused() -> None:
+    (_, near), (far, _) = shake(SECRET, SECRET, {})
+    data = near.encode(Kind.IDLE)
+    far.decode(data)
+    with pytest.raises(WireError, match="not authentic"):
+        far.decode(data)
+
+
+def test_another_process_continues_an_encrypted_channel() -> None:
+    (_, near), (far, _) = shake(SECRET, SECRET, {})
+    far.decode(near.encode(Kind.IDLE))
+    continued = Channel.from_json(json.loads(json.dumps(near.to_json())))
+    assert far.decode(continued.encode(Kind.IDLE)) == [Message(Kind.IDLE, b"")]
+
+
+def test_end_without_cryptography_has_no_encryption(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cryptography.hazmat.primitives.asymmetric.x25519", None)
+    (_, near), (far, _) = shake(SECRET, SECRET, {})
+    assert not near.is_encrypted and not far.is_encrypted
+    assert far.decode(near.encode(Kind.IDLE)) == [Message(Kind.IDLE, b"")]
+
+
+def test_removed_public_key_ends_the_handshake() -> None:
+    """An attacker between the ends replaces the public key in the hello by null."""
+
+    async def relay(lab: socket.socket, far: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        await loop.sock_sendall(far, await loop.sock_recv(lab, 4096))
+        hello = await loop.sock_recv(far, 4096)
+        (length,) = struct.unpack_from("!H", hello)
+        words = json.loads(hello[2 : 2 + length])
+        assert words["share"] is not None
+        text = json.dumps({**words, "share": None}).encode()
+        await loop.sock_sendall(lab, struct.pack("!H", len(text)) + text + hello[2 + length :])
+
+    async def both() -> Any:
+        lab, lab_side = socket.socketpair()
+        far, far_side = socket.socketpair()
+        with lab, lab_side, far, far_side:
+            for end in (lab, lab_side, far, far_side):
+                end.setblocking(False)
+            relaying = asyncio.create_task(relay(lab_side, far_side))
+            asked = asyncio.create_task(introduce(far, SECRET, {"agent": 7}))
+            try:
+                await receive_hello(lab, SECRET)
+            finally:
+                asked.cancel()
+                await asyncio.gather(asked, relaying, return_exceptions=True)
+
+    with pytest.raises(HandshakeError, match="another secret"):
+        asyncio.run(both())
+
+
+def test_wrong_public_key_ends_the_handshake() -> None:
+    for share in ("00" * 32, "ff", 7):  # the first has small order, so the result would be known to everybody
+        with pytest.raises(HandshakeError, match="wrong public key"):
+            _shared(KeyExchange(), {"share": share})
+
+
+def test_far_end_without_encryption_gets_no_keys() -> None:
+    scenario = parse(
+        {
+            "name": "keys",
+            "agents": 2,
+            "vehicles": {"kind": "none"},
+            "remote": {"agents": [2], "secret_file": "none"},
+            "security": {"keys": "fresh"},
+        }
+    )
+    host = RemoteAgents(scenario, cast("RunDirectory", None), lambda: 0.0)
+    words = {"protocol": PROTOCOL, "contract": CONTRACT, "agent": 2, "session": "1", "command": ["a"]}
+    with socket.socket() as connection:
+        hello = Hello(words, connection, SECRET, b"", b"", KeyExchange(), None)
+        refused = FarEnds(host, "keys", has_keys=True).refusal(hello, "192.168.7.2")
+        assert "this mission has keys, which must travel encrypted" in refused
+        sealed = Hello(words, connection, SECRET, b"", b"", KeyExchange(), bytes(32))
+        assert FarEnds(host, "keys", has_keys=True).refusal(sealed, "192.168.7.2") == ""

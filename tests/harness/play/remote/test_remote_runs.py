@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -126,6 +127,38 @@ def test_lost_connection_cuts_the_vehicle_off_until_it_returns(computers: TwoCom
     assert record["remote"]["2"]["joins"] > 1
     assert f"agent 2 was cut off from {first['from_s']:.0f} s to {first['until_s']:.0f} s" in output
     assert "2" not in record["datagrams"]  # its stand-in read datagrams that it did not get
+
+
+RECORD = """
+import socket, sys
+with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3)) as cable, open("cable", "wb", 0) as file:
+    cable.bind(("eth0", 0))
+    while True:
+        file.write(cable.recv(65536))
+"""
+
+
+def test_keys_of_a_secured_mission_travel_encrypted(computers: TwoComputers) -> None:
+    """The agent reboots with its keys, and starts again with others after a kill."""
+    path = scenario(
+        computers.directory,
+        duration_s=240,
+        security={"keys": "fresh"},
+        timeline=[
+            {"at_s": 90, "reboot": [2], "down_s": 20, "disk": "kept"},
+            {"at_s": 150, "kill": [2]},
+            {"at_s": 170, "restart": [2]},
+        ],
+    )
+    computers.run("far", sys.executable, "-c", RECORD)
+    wait_until((computers.directory / "cable").exists, "the cable is recorded")
+    record, output = play(computers, path)
+    assert (verdicts(record), record["status"]) == (GOOD, 0), output
+    assert record["agents"]["2"]["reboots"] == record["agents"]["2"]["restarts"] == 1
+    recorded = (computers.directory / "cable").read_bytes()
+    assert b"UCPJOIN1" in recorded
+    for word in (b"ucp-mission", b"bundle", b"private_key", b"epoch_us", b"handler"):
+        assert word not in recorded
 
 
 def test_far_computer_that_stays_away_is_named(computers: TwoComputers) -> None:

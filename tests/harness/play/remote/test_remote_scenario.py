@@ -32,7 +32,6 @@ def scenario(**keys: Any) -> Scenario:
         ({"remote": {**REMOTE, "agents": [2, 2]}}, "names an agent twice"),
         ({"remote": {**REMOTE, "listen": "14700"}}, "must be ADDRESS:PORT"),
         ({"agent_command": {2: ["true"]}}, "leave it out of `agent_command`"),
-        ({"security": {"keys": "fresh"}}, "leave out one of them"),
         ({"vehicles": {"kind": "embedded"}}, "source: random"),
     ],
 )
