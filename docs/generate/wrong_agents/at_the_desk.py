@@ -96,7 +96,7 @@ def row(quirk: str, brought: AtTheDesk) -> str:
             f"{rightly} of {len(brought.named)}",
             f"{first.t / 60:.1f}",
             str(brought.runs),
-            shorten(first.difference, SHOWN, placeholder=" …").replace("|", "\\|"),
+            f"`{shorten(first.difference, SHOWN, placeholder=' …')}`".replace("|", "\\|"),
         ]
     return f"| {' | '.join(cells)} |\n"
 

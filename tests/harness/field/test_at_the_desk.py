@@ -19,6 +19,6 @@ def test_row_has_the_first_difference_and_counts_correct_handlers() -> None:
     late = Named(120.0, "vote_timer_expiration", "it sent nothing; it should have sent Commit Block about block 2.1")
     early = Named(60.0, "receive_commit_block", "it took the branch 'a|b'")
     assert row("hide_commits", AtTheDesk(2, 5, (late, early))) == (
-        "| `hide_commits` | 5 | `receive_commit_block` | 1 of 2 | 1.0 | 2 | it took the branch 'a\\|b' |\n"
+        "| `hide_commits` | 5 | `receive_commit_block` | 1 of 2 | 1.0 | 2 | `it took the branch 'a\\|b'` |\n"
     )
     assert "no difference" in row("hide_commits", AtTheDesk(8, 5, ()))
