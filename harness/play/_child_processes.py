@@ -21,8 +21,8 @@ GRACE_S = 0.5
 """Seconds of wall time that a child process has to end after its agent."""
 RETRY_S = 0.02
 MAX_ROUNDS = 20
-"""Maximum number of times that the harness ends child processes. The harness repeats this, because a child process may
-start further processes in the meantime.
+"""Maximum number of rounds in which the harness ends child processes. Several rounds are needed if a child process
+starts further processes.
 """
 _PASSED_ON = {
     *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "TERM", "TMPDIR", "TZ", "LANG", "LANGUAGE", "VIRTUAL_ENV"),
@@ -32,11 +32,10 @@ _PASSED_ON_PREFIXES = ("LC_", "LD_", "PYTHON", "UCP_", "XDG_", "ROS_", "RMW_", "
 
 
 def passed_on(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return those environment variables that the harness passes to the programs of a run, because the programs need
-    them to start.
+    """Return the environment variables that the harness passes to the programs of a run.
 
-    The harness passes no other variables, because the user's environment may contain secrets, such as tokens, and an
-    agent may be a program of another author.
+    The programs need these variables to start. The harness passes no other variables, because the user's environment
+    may contain secrets, such as tokens, and an agent may be a program of another author.
     """
     return {
         name: value for name, value in environ.items() if name in _PASSED_ON or name.startswith(_PASSED_ON_PREFIXES)
@@ -67,7 +66,7 @@ class ChildProcesses:
             return False
 
     def end_left_behind(self) -> list[str]:
-        """End the processes that still run after the agent ended, and return their names."""
+        """End the processes that still run after the end of the agent. Return their names."""
         deadline = time.monotonic() + GRACE_S
         while (left := self.pids()) and time.monotonic() < deadline:
             time.sleep(RETRY_S)

@@ -7,7 +7,9 @@ from sitl.vehicle import VehicleError
 
 
 def refuse_unreachable_ground_station(scenario: Scenario) -> None:
-    """Raise ScenarioError if the ground station cannot be reached, or if the scenario has no vehicles for it."""
+    """Raise ScenarioError if the ground station cannot be reached, or if the scenario has no vehicles that the ground
+    station could show.
+    """
     if scenario.gcs is None:
         return
     if scenario.vehicles.kind == "none":

@@ -10,17 +10,16 @@ from contextlib import contextmanager
 TICK_S = 0.05
 """Seconds of wall time between two checks of the clock."""
 CATCH_UP_S = 1.0
-"""Maximum lateness of a simulation, in seconds of wall time, that the simulation tries to make up. If it is later, it
-continues from the current time at the requested speed.
+"""Maximum lateness of a simulation, in seconds of wall time, for which the simulation speeds up afterwards. If it is
+later, it continues at the requested speed.
 """
 NEXT_RUN = math.inf
-"""Length of a step that ends with the next handler run of any agent."""
+"""A value for the length of a step: the step ends with the next handler run of any agent."""
 
 
 class VirtualTimePace:
-    """The speed of virtual time in one run. Only the event loop of the run may use this object.
-
-    Before virtual time advances, the simulation calls `allowed_until` for the time that it may reach.
+    """The speed of virtual time in one run. Before virtual time advances, the simulation calls `allowed_until`. This
+    method returns the time up to which virtual time may advance. Only the event loop of the run may use this object.
     """
 
     def __init__(self, factor: float | None = None, *, paused: bool = False) -> None:
@@ -59,9 +58,8 @@ class VirtualTimePace:
         self._change()
 
     def step(self, to_s: float, done: "Future[float]") -> None:
-        """Continue until mission second `to_s`, or with `NEXT_RUN` until the next handler run, and then pause.
-
-        `done` receives the mission second at the end of the step. `done` must be in the state "running".
+        """Advance virtual time to mission second `to_s`, and then pause. With `NEXT_RUN`, advance to the next handler
+        run. `done` is a future in the state "running", which receives the mission second at the end of the step.
         """
         self.paused = True
         self._change()
@@ -69,8 +67,8 @@ class VirtualTimePace:
 
     @contextmanager
     def unlimited(self) -> Iterator[None]:
-        """Lift all speed limits inside the context. The run uses this context to apply an event that the user causes by
-        hand, because the event takes no mission time.
+        """Remove all speed limits inside the context. The run uses this context to apply an event that the user causes
+        by hand, because such an event takes no mission time.
         """
         self._limited = False
         try:
@@ -90,9 +88,8 @@ class VirtualTimePace:
         self.end_step()
 
     async def allowed_until(self, now_s: float) -> float | None:
-        """Return the mission second up to which virtual time may advance now. Infinity means that there is no limit.
-
-        If time may not advance now, wait for a short time and return None.
+        """Return the mission second up to which virtual time may advance now. Infinity means no limit. If virtual time
+        may not advance now, wait for a short time, and return None.
         """
         self._now_s = now_s
         if not self._limited:

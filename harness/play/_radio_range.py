@@ -1,7 +1,7 @@
 """Compute the network conditions from the timeline of the scenario and from the radio losses at the vehicles'
 positions.
 
-All backends use this module, so the same flight gives the same network. Without a radio in the scenario, the places
+All backends use this module, so the same flight gives the same network. Without a radio in the scenario, the positions
 have no effect.
 """
 
@@ -33,8 +33,8 @@ class RadioRange:
         self._cut_off: frozenset[int] = frozenset()
 
     def change_timeline(self, change: NetworkChange) -> NetworkChange:
-        """Return the network change of a timeline entry, combined with the radio losses at the vehicles' current
-        positions.
+        """Return the change of the network that a timeline entry causes, combined with the radio losses at the current
+        positions of the vehicles.
         """
         self._requested = change.conditions
         if change.clears_all:
@@ -42,8 +42,8 @@ class RadioRange:
         return replace(change, losses=self._set_losses({}) if change.clears_all else {}, conditions=self._conditions())
 
     def move(self, at_s: float, places: Mapping[int, Place]) -> NetworkChange | None:
-        """Move the vehicles to these positions. Return the network change that follows, or None if the network stays
-        the same.
+        """Move the vehicles to these positions. Return the resulting change of the network, or None if the network
+        stays the same.
         """
         if self._radio is None:
             return None
@@ -58,8 +58,8 @@ class RadioRange:
         )
 
     def cut_off(self, at_s: float, vehicles: frozenset[int]) -> NetworkChange:
-        """Cut off these vehicles from the network, and connect the vehicles that were cut off before. Return the
-        network change.
+        """Cut off these vehicles from the network. Connect vehicles that were cut off before and are not in the list.
+        Return the change of the network.
         """
         radio_losses = {pair: loss for pair, loss in self._losses.items() if not pair & self._cut_off}
         self._cut_off = vehicles
@@ -86,9 +86,8 @@ def groups_text(components: Iterable[Iterable[int]]) -> str:
 
 
 def tracks_of(scenario: Scenario) -> dict[int, VehicleTrack]:
-    """Return the flight path of each vehicle in virtual time.
-
-    The result is empty if no part of the scenario needs positions (flight, radio, channel or ground station).
+    """Return the flight path of each vehicle in virtual time. The result is empty if no key of the scenario (flight,
+    radio, channel or ground station) needs positions.
     """
     if not (scenario.flight or scenario.network.radio or scenario.network.channel or scenario.gcs):
         return {}

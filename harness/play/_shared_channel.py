@@ -1,8 +1,8 @@
 """Simulate a radio channel that all agents share, in virtual time and in real time.
 
-A message waits for the processing time of its agent, then in the queue of its radio. If it arrives, it arrives when its
-frame ends. `ChannelTraffic` records which frame carries which message, and counts the results. It reads no clock: the
-caller passes the times.
+A message waits for the processing time of its agent, and then in the queue of its radio. It arrives at the end of its
+radio frame, if it arrives at all. `ChannelTraffic` records which frame carries which message, and counts the results.
+It reads no clock: the caller passes the times.
 """
 
 from collections import Counter
@@ -29,7 +29,9 @@ _WORD_BITS = 32
 class _SentFrame(Protocol):
     @property
     def sequence(self) -> int | None:
-        """The sequence number of the message in the frame. None if the frame does not contain a message of an agent."""
+        """The sequence number of the message in the frame. None if the frame contains data that are not a message of an
+        agent.
+        """
 
 
 Message = TypeVar("Message", bound=_SentFrame)
@@ -53,10 +55,12 @@ class ChannelTraffic(Generic[Message]):
         self._processed_at = [0.0] * len(roster)
         self._order = 0
         self._queued: dict[int, Message] = {}
-        """Frame number -> the message in the frame."""
+        """Frame number -> the message that the frame carries."""
 
     def send(self, now: float, sender: int, message: Message, data_bytes: int) -> None:
-        """Send a message on the channel as soon as the radio is free. The messages of one agent keep their order."""
+        """Send a message on the channel as soon as the radio of the agent is free. The messages of one agent keep their
+        order.
+        """
         at = now + self._draws[sender].getrandbits(_WORD_BITS) * self._processing_s
         at = self._processed_at[sender] = max(at, self._processed_at[sender])
         self._order += 1
@@ -164,8 +168,8 @@ class ChannelTotals:
 
 
 class BitCounter:
-    """A counter for sets of small numbers. For each number, it counts the sets that contain the number. A set is given
-    as an integer with a bit for each member.
+    """A counter for sets of small numbers. For each number, the counter stores how many of the added sets contain the
+    number. A set is given as an integer with a bit for each member.
 
     The counts are stored as binary digits. One integer holds the same digit of all counts. A set is added to all counts
     at once by a ripple-carry addition, which takes two steps on average, regardless of the number of counts.
@@ -173,7 +177,7 @@ class BitCounter:
 
     def __init__(self) -> None:
         self._digits: list[int] = []
-        """The binary digits of all counts. The lowest digit is the first."""
+        """The binary digits of all counts. The first element holds the lowest digit of each count."""
 
     def add(self, bits: int) -> None:
         for place, digit in enumerate(self._digits):

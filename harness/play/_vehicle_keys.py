@@ -1,7 +1,7 @@
 """Provide the keys of the vehicles of a secured mission, as objects and as files for agent programs.
 
-Keys are fresh, or come from a directory. Agent programs find their keys in temporary directories, which exist only
-during the run. The run directory contains no secret.
+The keys are made for the run, or come from a directory. Agent programs find their keys in temporary directories, which
+exist only during the run. The run directory contains no secret.
 """
 
 import os
@@ -26,7 +26,9 @@ FRESH_BYTES = 32
 
 @dataclass(frozen=True)
 class MissionKeys:
-    """The keys of a secured mission: the secret keys of each vehicle, and the authority that can exclude vehicles."""
+    """The keys of a secured mission: the secret keys of each vehicle, and the authority that can revoke the keys of a
+    vehicle.
+    """
 
     bundles: Mapping[int, "Bundle"]
     authority: "RevocationAuthority"
@@ -38,13 +40,13 @@ class MissionKeys:
         return next(iter(self.bundles.values())).public
 
     def add_depot_key(self, initial_data: bytes) -> bytes:
-        """Add the public key of the depot to the data of the inception block, if event data are encrypted. Return the
-        data.
+        """Return the data of the inception block. If event data are encrypted, append the public key of the depot to
+        the data.
         """
         return seal_to(initial_data, self.public.depot) if self.seals and self.public.depot else initial_data
 
     def revoke(self, agent_id: int) -> bytes:
-        """Return the signed message body that excludes this vehicle from the mission."""
+        """Return the body of the signed message that revokes the keys of this vehicle."""
         return self.authority.revoke(agent_id)
 
 
@@ -86,8 +88,8 @@ def require_key_packages(scenario: Scenario) -> None:
 
 
 def refuse_revocations(scenario: Scenario) -> None:
-    """Raise ScenarioError if the scenario excludes a vehicle but this machine lacks the key that must sign the
-    exclusion.
+    """Raise ScenarioError if the scenario revokes the keys of a vehicle, but this machine lacks the key that must sign
+    the revocation.
     """
     mission_keys(scenario, bytes(FRESH_BYTES))
 
@@ -119,8 +121,8 @@ def _bundles_in(directory: Path, roster: Sequence[int]) -> dict[int, "Bundle"]:
 
 
 def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Scenario) -> "RevocationAuthority":
-    """Return the authority that can exclude vehicles, from its key file in the directory. Raises ScenarioError if the
-    file is missing.
+    """Return the authority that can revoke keys, from its key file in the directory. Raises ScenarioError if the file
+    is missing.
     """
     from harness.play.keyring.key_directory import REVOCATION_NAME, KeyDirectory, KeysError, RevocationAuthority, listed
 
@@ -139,7 +141,9 @@ def _authority_in(directory: Path, bundles: Mapping[int, "Bundle"], scenario: Sc
 
 
 class KeyDirectories:
-    """A separate directory with the secret keys of each vehicle. `keys` is None if the mission is not secured."""
+    """Directories with the secret keys of the vehicles, one for each vehicle. `keys` is None if the mission is not
+    secured.
+    """
 
     def __init__(self, keys: MissionKeys | None, directory: Path) -> None:
         self.keys = keys

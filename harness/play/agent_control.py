@@ -26,9 +26,8 @@ FIRST_LINE_BYTES = 256
 
 
 def resolve_command(command: Sequence[str], what: str) -> list[str]:
-    """Return the command with absolute paths, so that it works from any directory.
-
-    Raises ScenarioError, which starts with `what`, if the program does not exist.
+    """Return the command with absolute paths, so that it works from any directory. Raises ScenarioError if the program
+    does not exist. The error message starts with `what`.
     """
     program, *arguments = command
     path = shutil.which(program)
@@ -41,7 +40,9 @@ def resolve_command(command: Sequence[str], what: str) -> list[str]:
 
 
 def _interpreter(program: Path) -> Path | None:
-    """Return the interpreter that the first line of a script names. Return None if the file is no readable script."""
+    """Return the interpreter that the first line of a script names. Return None if the file is not a readable
+    script.
+    """
     try:
         with program.open("rb") as file:
             line = file.readline(FIRST_LINE_BYTES)
@@ -97,7 +98,9 @@ VERSION_CHARACTERS = 80
 
 
 def _version_line(version: Any) -> str | None:
-    """Return the version that an agent reports, as one printable line. Return None if the version is not text."""
+    """Return the version that an agent reports, as one line of printable text. Return None if the version is
+    not text.
+    """
     if not isinstance(version, str):
         return None
     return " ".join("".join(filter(str.isprintable, word)) for word in version.split())[:VERSION_CHARACTERS] or None
@@ -143,9 +146,8 @@ class AgentUnsupportedError(AgentRefusedError):
 
 
 class AgentControl:
-    """The connection to the control socket of an agent. After a failure, the next command opens a new connection.
-
-    One command is sent at a time.
+    """The connection to the control socket of an agent. After a failure, the next command opens a new connection. The
+    connection handles one command at a time.
     """
 
     def __init__(self, socket_path: Path) -> None:

@@ -27,7 +27,7 @@ class Backend(ABC):
     telemetry.
     """
     plays_in_memory: ClassVar[bool] = False
-    """True if `harness.run.simulate` can play the same run in memory, for sweeps over thousands of runs."""
+    """True if `harness.run.simulate` can carry out the same run in memory, which makes runs of many seeds fast."""
 
     not_in_uml: ClassVar[str | None] = None
     """The reason why this backend cannot run inside User Mode Linux, with a solution. None if the backend can run
@@ -70,8 +70,8 @@ class Backend(ABC):
 
 
 def agent_seed(seed: int, agent_id: int, incarnation: int = 1) -> int:
-    """Return the seed for the events and deliberate errors of an agent. The agent gets a different seed at each
-    restart.
+    """Return the seed for the random events and the deliberate errors of an agent. The agent gets a different seed at
+    each restart.
     """
     again = f" life {incarnation}" if incarnation > 1 else ""
     return Random(f"{seed}/agent {agent_id}{again}").getrandbits(63)

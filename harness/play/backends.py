@@ -14,5 +14,5 @@ BACKENDS: dict[BackendName, Backend] = {
 
 
 def in_virtual_time(name: Any) -> bool:
-    """Return true if this is the name of a backend that uses virtual time, and false for an unknown name."""
+    """Return true if the backend with this name uses virtual time. Return false for an unknown name."""
     return any(backend.name == name and backend.virtual_time for backend in BACKENDS.values())

@@ -1,9 +1,9 @@
 """Find out whether the agent core in use is the released core or was edited.
 
 The core is the code of `ucp` that determines how an agent behaves. An engineer who develops the protocol edits this
-code in place. Two things depend on an edit. A run records which core its agents had. And virtual time omits messages
-that the released core would ignore (`ucp.interest`) only if the released core is in use. An edited core might not
-ignore them.
+code in place. The difference has two effects. First, a run records which core its agents had. Second, virtual time
+omits messages that the released core would ignore (`ucp.interest`). With an edited core, it delivers them, because an
+edited core might not ignore them.
 
 `released_core.sha256` has the digests of the released files, in the format of sha256sum(1). After a reviewed change:
 
@@ -41,7 +41,7 @@ FILES = (
     "trigger",
     "wire",
 )
-"""The modules of the agent core: those that `ucp.agent` and `ucp.interest` import."""
+"""The modules of the agent core, which are the modules that `ucp.agent` and `ucp.interest` import."""
 RELEASED = Path(__file__).with_name("released_core.sha256")
 
 
@@ -50,7 +50,7 @@ CORE = Path(ucp.__file__).parent
 
 @cache
 def edited_files(core: Path = CORE) -> tuple[str, ...]:
-    """Return the files of the agent core that differ from the released ones, such as "ucp/commit.py"."""
+    """Return the files of the agent core that differ from the released files, such as "ucp/commit.py"."""
     released: dict[str, str] = {}
     for line in RELEASED.read_text("ascii").splitlines():
         digest, name = line.split()
@@ -59,7 +59,9 @@ def edited_files(core: Path = CORE) -> tuple[str, ...]:
 
 
 def core_version() -> str:
-    """Return "released" or "edited", then a digest of the agent core and the names of edited files."""
+    """Return the version of the agent core: "released" or "edited", a digest of the core, and the names of edited
+    files.
+    """
     digest = hashlib.sha256("".join(_digests().values()).encode("ascii")).hexdigest()[:12]
     edited = edited_files()
     return f"edited {digest} ({', '.join(edited)})" if edited else f"released {digest}"
@@ -74,7 +76,7 @@ def _digests(core: Path = CORE) -> dict[str, str]:
 
 
 def record() -> None:
-    """Record the current agent core as the released one: store its digests."""
+    """Record the current agent core as the released core, by storing the digests of its files."""
     RELEASED.write_text("".join(f"{digest}  {name}\n" for name, digest in _digests().items()), "ascii")
 
 

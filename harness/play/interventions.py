@@ -40,22 +40,22 @@ from harness.scenario.network_states import changed_values
 from harness.scenario.timeline import TimelineEntry
 
 INSTANT_S = 0.001
-"""Mission seconds between two requests that arrive at the same moment."""
+"""Mission seconds between two requests of the user that arrive at the same moment."""
 
 _NAMED = re.compile(r"(?P<list>timeline|fates)\.(?P<number>\d+)(?P<rest>\.|: )?")
 
 
 class GrowingTimeline:
-    """The timeline of an active mission. Entries can be added while it is being played."""
+    """The timeline of an active mission. A user can add entries to the timeline during the mission."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         """The scenario with all entries that were added so far."""
         self._played_s = 0.0
-        """Mission second up to which the timeline has been played."""
+        """Mission second up to which the mission has been carried out."""
 
     def next_instant(self, swarm: Swarm) -> float:
-        """Return the mission second for an entry that is added now, in whole milliseconds."""
+        """Return the mission second for a new entry of the timeline, in whole milliseconds."""
         return math.ceil(max(swarm.now(), self._played_s + INSTANT_S) * 1000) / 1000
 
     def replace_scenario(self, document: dict[str, Any]) -> None:
@@ -66,7 +66,7 @@ class GrowingTimeline:
             raise ScenarioError(_error_of_last_entry(str(error), document["timeline"])) from None
 
     async def until(self, swarm: Swarm, mission_s: float) -> None:
-        """Play the mission up to `mission_s`, and apply the changes of the timeline that are due."""
+        """Run the mission up to `mission_s`, and apply the changes of the timeline that are due."""
         for change in [change for change in timeline_of(self.scenario) if self._played_s < change.at_s <= mission_s]:
             await swarm.until(change.at_s)
             await swarm.apply(self.with_origin(change))
@@ -74,12 +74,12 @@ class GrowingTimeline:
         await swarm.until(mission_s)
 
     def with_origin(self, change: Change) -> Change:
-        """Return the change. If a user requested it, add the mark `by_hand`."""
+        """Return the change. If a user requested the change, add the mark `by_hand`."""
         return change
 
 
 def _error_of_last_entry(problem: str, timeline: list[dict[str, Any]]) -> str:
-    """Return an error message about the last entry of the timeline, for the user who added it."""
+    """Return an error message about the last entry of the timeline, for the user who added this entry."""
     last = len(timeline) - 1
 
     def name(named: re.Match[str]) -> str:
@@ -92,7 +92,7 @@ def _error_of_last_entry(problem: str, timeline: list[dict[str, Any]]) -> str:
 
 
 MAX_WAITING = 100
-"""Maximum number of requests that may wait. Further requests are refused."""
+"""Maximum number of user requests that may wait at the same time. Further requests are refused."""
 
 MAX_FACTOR = 1e6
 MAX_STEP_S = 31 * 86400.0
@@ -114,7 +114,7 @@ class Interventions(GrowingTimeline):
         self.pace = VirtualTimePace(factor, paused=paused) if virtual_time else None
         """The speed of virtual time, which the backend reads. None in real time."""
         self.on_entry_added: Callable[[], None] = lambda: None
-        """A function that the thread of the run calls whenever an entry was added."""
+        """A function that the thread of the run calls each time an entry was added."""
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         """The event loop of the run. None before its start and after its end."""
@@ -230,7 +230,7 @@ class Interventions(GrowingTimeline):
     # For the thread of the run. `story` is a harness.play.mission.Story
 
     async def story(self, swarm: Swarm, scenario: Scenario) -> None:
-        """Play the mission like `harness.play.mission.play`, and execute the user's requests meanwhile."""
+        """Run the mission like `harness.play.mission.play`, and also execute the user's requests."""
         try:
             first, *_ = timeline_of(self.scenario)
             await swarm.begin(first)
@@ -276,10 +276,8 @@ class Interventions(GrowingTimeline):
         return [change for change in timeline_of(self.scenario) if change.at_s > self._played_s]
 
     async def _play_until(self, swarm: Swarm, mission_s: float) -> bool:
-        """Play until `mission_s` or until a request arrives. Return true if `mission_s` was reached.
-
-        The method may also return early without a new request, because the signal of an earlier request can arrive
-        late.
+        """Run the mission until `mission_s` or until a request arrives. Return true if `mission_s` was reached. The
+        method may also return early without a new request, because the signal of an earlier request can arrive late.
         """
         if self._requests:
             return False
@@ -342,9 +340,8 @@ class Interventions(GrowingTimeline):
                 timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
 
     def _refuse_unprepared(self, entry: TimelineEntry) -> None:
-        """Raise ScenarioError if the agents would have needed a preparation at the start of the run for this entry.
-
-        Also raise it for a revocation that this machine cannot sign.
+        """Raise ScenarioError if the entry needs a preparation of the agents at the start of the run, which did not
+        take place. Also raise ScenarioError for a revocation that this machine cannot sign.
         """
         if entry.fault is not None and entry.fault.needs_keys:
             refuse_revocations(self.scenario)

@@ -1,4 +1,4 @@
-"""Keep secrets in a directory in memory. The directory is removed even if this process is killed.
+"""Store secrets in a directory that is in memory. The directory is removed even if this process is killed.
 
 A file in `/tmp` may reach a disk, and stays after SIGKILL. The directory is therefore in `/dev/shm`. A guard process
 reads a pipe whose other end only this process holds. When this process ends, the kernel closes the pipe, and the guard

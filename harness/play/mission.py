@@ -1,7 +1,7 @@
-"""Play a mission with any backend. The class `Swarm` is the interface of a backend.
+"""Carry out a mission with any backend.
 
-A mission plays the timeline, stops the events, lets the agents settle, and ends with a final reconcile if the scenario
-asks for it.
+The class `Swarm` is the interface of a backend. A mission applies the timeline, stops the events, and waits until the
+agents are idle. If the scenario asks for a final reconcile, the mission ends with it.
 """
 
 from collections.abc import Awaitable, Callable, Mapping
@@ -37,7 +37,7 @@ Outcome = Literal["completed", "interrupted", "failed", "not supported"]
 
 @dataclass
 class RunOutcome:
-    """The result of a played scenario, before the checker judges it."""
+    """The result of a scenario after its mission, before the checker judges it."""
 
     outcome: Outcome = "completed"
     outcome_detail: str | None = None
@@ -69,8 +69,8 @@ class RunOutcome:
         self.exit_status = error.exit_status
 
     def record(self, change: Mapping[str, object]) -> None:
-        """Record a network change, a fault or an injection, which has the format of `network.jsonl`. A movement of
-        vehicles is recorded only if it changes which of them can receive each other.
+        """Record a network change, a fault or an injection. The record has the format of a line of `network.jsonl`. A
+        movement of vehicles is recorded only if it changes which vehicles can receive each other.
         """
         if "fully_connected" in change:
             state = NetworkState.model_validate(change)
@@ -83,11 +83,13 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class SoughtRun:
-    """A handler run for which a caller waits. If `branch` or `agent` is None, any branch or agent matches."""
+    """A handler run for which a caller waits."""
 
     handler: str
     branch: str | None = None
+    """The branch of the handler run. None matches any branch."""
     agent: int | None = None
+    """The ID of the agent. None matches any agent."""
 
     def matches(self, agent_id: int, run: HandlerRun) -> bool:
         """Return true if the handler run matches this description."""
@@ -106,7 +108,7 @@ class Swarm(Protocol):
     def now(self) -> float: ...
 
     def enter(self, stage: str) -> None:
-        """Show the user the current stage of the mission."""
+        """Show the current stage of the mission to the user."""
 
     async def begin(self, first: Change) -> None:
         """Apply the initial conditions, start all agents, and start the clock of the mission."""
@@ -114,11 +116,10 @@ class Swarm(Protocol):
     async def until(self, mission_s: float) -> None: ...
 
     async def until_run(self, sought: SoughtRun, mission_s: float) -> int | None:
-        """Wait until an agent runs this handler, at most until `mission_s`. Return the ID of the agent, or None if no
-        agent ran the handler.
+        """Wait until an agent runs this handler, but at most until `mission_s`.
 
-        Handler runs that the last change caused also count. With processes, all handler runs since the last call of
-        `until` count.
+        Return the ID of the agent. Return None if no agent ran the handler. The method also counts handler runs that
+        the last change caused. With processes, it counts all handler runs since the last call of `until`.
         """
 
     async def apply(self, change: Change) -> None:
@@ -130,8 +131,8 @@ class Swarm(Protocol):
         """
 
     async def release(self, number: int, fate: Fate) -> None:
-        """End the hold with this number. Messages that are sent before `fate.until_s` arrive at `fate.hold_until_s` or
-        later.
+        """End the hold with this number. Messages of the hold that are sent before `fate.until_s` arrive at
+        `fate.hold_until_s` or later.
         """
 
     async def stop_events(self) -> None: ...
@@ -142,7 +143,7 @@ class Swarm(Protocol):
         """
 
     async def keep_chains(self) -> None:
-        """Export all chains before the final reconcile."""
+        """Export all chains, before the final reconcile changes them."""
 
     async def reconcile(self, agent_id: int) -> None:
         """Let the agent begin a reconcile."""
@@ -151,18 +152,18 @@ class Swarm(Protocol):
         """Return the top chain hash of each living agent."""
 
     async def completed(self) -> dict[int, int]:
-        """Return the number of completed blocks of each agent that is neither dead nor paused."""
+        """Return the number of completed blocks of each agent. Dead and paused agents are omitted."""
 
     async def snapshot(self) -> RunOutcome:
         """Return the result of an active run so far, with exports and traces, so that the checker can judge it."""
 
 
 Story = Callable[[Swarm, Scenario], Awaitable[None]]
-"""A function that plays a mission with a swarm from start to end."""
+"""A function that carries out a mission with a swarm, from start to end."""
 
 
 async def play(swarm: Swarm, scenario: Scenario) -> None:
-    """Play the mission on the agents of `swarm`. Afterwards `swarm.played` contains the result."""
+    """Carry out the mission with the agents of `swarm`. Afterwards, `swarm.played` contains the result."""
     first, *changes = timeline_of(scenario)
     await swarm.begin(first)
     swarm.enter("mission")
@@ -174,14 +175,16 @@ async def play(swarm: Swarm, scenario: Scenario) -> None:
 
 
 async def play_on(opening: AbstractAsyncContextManager[Swarm], scenario: Scenario, story: Story = play) -> RunOutcome:
-    """Start the agents, play the mission with the function `story`, and return the result."""
+    """Start the agents, carry out the mission with the function `story`, and return the result."""
     async with opening as swarm:
         await story(swarm, scenario)
     return swarm.played
 
 
 async def settle(swarm: Swarm, scenario: Scenario) -> None:
-    """End a mission: stop the events, wait until the agents are idle, and play a final reconcile if requested."""
+    """End a mission: stop the events, wait until the agents are idle, and carry out a final reconcile if the scenario
+    asks for it.
+    """
     swarm.enter("settling")
     await swarm.stop_events()
     swarm.played.settled = await swarm.until_idle(scenario.settle.limit_s)

@@ -37,7 +37,7 @@ class ProgressDisplay(Protocol):
 
     def show(self, snapshot: SwarmSnapshot) -> None: ...
     def show_judging(self, step: str) -> None:
-        """Show the current step of the checker after the mission, such as "reading trace 3 of 50"."""
+        """Show which step the checker is performing after the mission, such as "reading trace 3 of 50"."""
 
     def close(self) -> None: ...
 

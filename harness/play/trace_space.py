@@ -29,7 +29,9 @@ MESSAGES_PER_MINUTE = ((2, 4), (5, 38), (10, 229), (15, 885), (20, 2010), (30, 6
 """Messages per minute for some numbers of agents, if each agent logs an event every 30 s (docs/appendix/growth.md)."""
 BYTES_PER_LINE = 800
 LINES_WITHOUT_IDLE_RECEIPTS = 2
-"""Number of trace lines per message in virtual time, which delivers only messages that can affect their receivers."""
+"""Number of trace lines for each message in virtual time. Virtual time delivers only messages that can affect their
+receivers.
+"""
 
 
 def trace_quota(scenario: Scenario, directory: Path) -> int:
@@ -71,7 +73,7 @@ def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) 
 
 
 def _source(scenario: Scenario, quota: int) -> str:
-    """Return the reason for the quota of all traces together."""
+    """Return the reason for the quota, for the size of all traces together."""
     if quota == LEAST_BYTES_PER_AGENT * len(scenario.roster):
         return "the least for each agent"
     if quota == MAX_TRACE_BYTES * len(scenario.roster):

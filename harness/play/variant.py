@@ -44,8 +44,8 @@ class VariantError(HarnessError):
 
 @dataclass(frozen=True)
 class CoreChange:
-    """A variant's new handler for one algorithm of the agents. The fields after `run` add to the declarations of the
-    original handler.
+    """The new handler of a variant for one algorithm of the agents. The fields after `run` are additions to the
+    declarations of the original handler.
     """
 
     algorithm: int
@@ -68,7 +68,7 @@ class CoreChange:
 
 @dataclass(frozen=True)
 class ReferenceChange:
-    """A variant's new function for one algorithm of the reference implementation."""
+    """The new function of a variant for one algorithm of the reference implementation."""
 
     algorithm: int
     run: Callable[..., str]

@@ -1,4 +1,4 @@
-"""The Docker backend: it plays vehicles and agents in containers, on the same network as the process backend.
+"""The Docker backend, which runs vehicles and agents in containers, on the same network as the process backend.
 
 Docker does not build the network. For each vehicle, a small container holds a network namespace with nothing but `lo`.
 `netem` moves the end of the vehicle's cable into this namespace before the first program starts. The vehicle, its agent

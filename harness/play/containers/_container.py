@@ -30,15 +30,15 @@ _NO_SUCH_PROGRAM = 127
 
 
 class ContainerOutput:
-    """A copier that writes the output of a container, from the stream of `docker attach`, to two files.
+    """A copier that writes the output of a container to two files.
 
-    The stream consists of frames: number of the output, 3 unused bytes, length (u32, big-endian), content (Docker
-    Engine API, "Attach to a container", stream format).
+    The output comes from the stream of `docker attach`. The stream consists of frames: number of the output, 3 unused
+    bytes, length (u32, big-endian), content (Docker Engine API, "Attach to a container", stream format).
     """
 
     def __init__(self, stream: Any, stdout: Path, stderr: Path) -> None:
-        """Open the files and start to copy. `stream` comes from the Docker SDK. Raises OSError if a file cannot be
-        opened.
+        """Open the files, and start to copy the output. `stream` comes from the Docker SDK. Raises OSError if a file
+        cannot be opened.
         """
         self._stream = stream  # a reference keeps the HTTP response, which owns the socket, alive
         self._socket: socket.socket = stream._sock
@@ -185,7 +185,7 @@ def _is_signal(number: int) -> bool:
 
 MEBIBYTE = 1 << 20
 INIT = 1
-"""Number of additional processes in a container: docker-init, which forwards signals."""
+"""Number of additional processes in a container. The additional process is docker-init, which forwards signals."""
 
 
 def recipe(

@@ -1,6 +1,5 @@
-"""The Docker backend. It equals the process backend, except that each vehicle and each agent has its own container.
-
-The docker SDK is imported only when containers are played, because the import is slow.
+"""The Docker backend. It equals the process backend, except that each vehicle and each agent runs in its own container.
+The module imports the docker SDK only if a run needs containers, because the import is slow.
 """
 
 from collections.abc import Callable
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class DockerBackend(ProcessBackend):
-    """The backend that plays each vehicle and each agent in a container of its own."""
+    """The backend that runs each vehicle and each agent in a container of its own."""
 
     name: ClassVar[BackendName] = "docker"
     not_in_uml = (

@@ -169,8 +169,8 @@ class ContainerLab:
     ) -> Container:
         """Start a program in its own container, in the network of a vehicle.
 
-        `max_file_bytes` limits the size of files, but only for programs in an image of the harness. At the limit, the
-        kernel sends a signal that might end another program.
+        `max_file_bytes` limits the size of files that the program writes. The limit applies only to programs in an
+        image of the harness. At the limit, the kernel sends a signal, which might end other programs.
         """
         holder = next(identity for identity, held in self._holders.items() if held == vehicle)
         image = self._named if role == "agent" and vehicle in self._in_named else self._ours

@@ -11,7 +11,7 @@ from harness.scenario import Scenario
 
 
 def check_docker(scenario: Scenario) -> None:
-    """Raise DockerError if Docker cannot be used here, or if the requested image is missing."""
+    """Raise DockerError if this machine cannot use Docker, or if the requested image is missing."""
     engine = DockerEngine.connect()
     try:
         require_root()
@@ -28,10 +28,8 @@ def refuse_variants() -> None:
 
 
 def check_debuggers(scenario: Scenario) -> None:
-    """Raise DockerError if the debugger that a vehicle needs is missing in its image.
-
-    The project's image has no debuggers. An image with the programs of this machine has the debuggers in its shared
-    directories.
+    """Raise DockerError if a vehicle needs a debugger that its image does not contain. The project's image has no
+    debuggers. An image with the programs of this machine has the debuggers of this machine.
     """
     setups = (scenario.vehicles.setup_of(vehicle) for vehicle in scenario.roster)
     for debugger in sorted({setup.debugger for setup in setups if setup.debugger is not None}):

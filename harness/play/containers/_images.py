@@ -34,15 +34,13 @@ INSTEAD = "use this machine's files (--image-from-host, `docker.image_from_host`
 
 @dataclass(frozen=True)
 class ContainerImage:
-    """A Docker image. `python` is its Python interpreter. `mounted` lists the directories of this machine that its
-    containers can read.
-
-    No directory is mounted into a `foreign` image, because the paths in its commands refer to files in the image.
-    """
+    """A Docker image."""
 
     name: str
     python: str
+    """The Python interpreter in the image."""
     mounted: tuple[Path, ...] = ()
+    """The directories of this machine that containers of this image can read."""
     foreign: bool = False
 
     def command(self, argv: Sequence[str]) -> list[str]:
@@ -50,9 +48,8 @@ class ContainerImage:
         return [self.python if word == sys.executable else word for word in argv]
 
     def environment(self, env: Mapping[str, str]) -> dict[str, str]:
-        """Return the environment variables for a program inside the container.
-
-        Without shared directories, the result has only the variables that differ from those of this process.
+        """Return the environment variables for a program inside the container. If the container shares no directories
+        with this machine, the result has only the variables that differ from the variables of this process.
         """
         return {key: value for key, value in env.items() if self.mounted or os.environ.get(key) != value}
 
@@ -86,7 +83,7 @@ def host_image() -> ContainerImage:
 
 
 def is_shared(program: Path) -> bool:
-    """Return true if the program is in a directory that containers with this machine's programs share."""
+    """Return true if containers with this machine's programs share the directory of this program."""
     mounted = host_image().mounted
     return all(any(path.is_relative_to(outer) for outer in mounted) for path in (program, program.resolve()))
 
@@ -100,7 +97,7 @@ def named(engine: DockerEngine, name: str) -> ContainerImage:
 
 def agents_in_named(scenario: Scenario) -> Iterable[int]:
     """Return the agents that run in the image that the scenario names. If the key `agent_command` lists commands by
-    agent, these are the agents with a command. Otherwise these are all agents.
+    agent, the result is the agents with a command. Otherwise it is all agents.
     """
     if scenario.docker.image is None:
         return ()
@@ -108,7 +105,9 @@ def agents_in_named(scenario: Scenario) -> Iterable[int]:
 
 
 def project(engine: DockerEngine, say: Callable[[str], object]) -> ContainerImage:
-    """Return the image of this project. If it is missing, build it and report each step. Raises DockerError."""
+    """Return the image of this project. If the image does not exist, build it and report each step. Raises
+    DockerError.
+    """
     name = project_name()
     if not _exists(engine, name):
         say("building the image")
@@ -123,8 +122,8 @@ def project_name() -> str:
 
 
 def build_arguments() -> dict[str, str]:
-    """Return the versions of the packages to install in the Docker image. They are the versions installed on this
-    machine.
+    """Return the versions of the packages to install in the Docker image. These versions are installed on
+    this machine.
     """
     arguments = {"PYMAVLINK": version("pymavlink")}
     with suppress(PackageNotFoundError):  # optional: needed only for secure missions
@@ -178,8 +177,8 @@ def _tar(files: Mapping[str, bytes]) -> bytes:
 
 
 def _with_environment(program: Path) -> Path:
-    """Return the directory of the program's virtual environment. If the program is in no virtual environment, return
-    the program.
+    """Return the directory of the program's virtual environment. If the program does not belong to a virtual
+    environment, return the program.
     """
     environment = program.parent.parent
     return environment if (environment / "pyvenv.cfg").is_file() else program
@@ -218,7 +217,7 @@ def outermost(paths: Iterable[Path]) -> list[Path]:
 
 
 def idle_command() -> list[str]:
-    """Return a command that sleeps forever. Raises DockerError if this machine has none."""
+    """Return a command that sleeps forever. Raises DockerError if this machine has no such command."""
     sleep = shutil.which("sleep")
     if sleep is None:
         raise DockerError("sleep(1) is not on PATH, and containers that hold a network run it: install coreutils")

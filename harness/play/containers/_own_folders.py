@@ -24,7 +24,7 @@ class OwnFolders:
         self._folders: dict[int, Path] = {}
 
     def mounts(self, agent_id: int, directory: Path) -> Iterator[Mount]:
-        """Yield the mounts for a container in which the agent runs in this directory. Raises OSError."""
+        """Yield the mounts for a container whose agent runs in this directory. Raises OSError."""
         yield Mount(str(self._agents), str(self._folder(agent_id)), type="bind")
         if directory != self._agents:
             (self._folder(agent_id) / directory.name).mkdir()

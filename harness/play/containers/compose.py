@@ -26,9 +26,9 @@ from sitl.vehicle import VehicleKind
 from ucp.agent_files import write_json_atomically
 
 INSIDE = "/ucp"
-"""Path in each container at which the directory beside the compose file is mounted."""
+"""Path inside each container at which Docker mounts the directory beside the compose file."""
 SECRETS = "/run/secrets"
-"""Directory in a container in which compose places secret files."""
+"""Directory inside a container in which Docker Compose places secret files."""
 
 TOP = """\
 # {name}: {count} agents{vehicles}, to start by hand and look inside:
@@ -167,7 +167,9 @@ def _services(
 
 
 def _our_image(scenario: Scenario, folder: Path) -> tuple[ContainerImage, dict[str, Any]]:
-    """Return the settings of this project's image for the Compose file, with the section that builds it."""
+    """Return the settings of this project's image for the Compose file, with the section from which Docker builds the
+    image.
+    """
     context = folder / "image"
     context.mkdir()
     if scenario.docker.image_from_host:

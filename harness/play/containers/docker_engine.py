@@ -39,8 +39,8 @@ class DockerError(MachineError, LabError):
 
 
 class DockerEngine:
-    """The connection to Docker. Call the functions of its SDK object `api` only through the method `do`, or through
-    `ask` in asynchronous code.
+    """The connection to Docker. Call the functions of the SDK object `api` only through the method `do`, or in
+    asynchronous code through the method `ask`.
     """
 
     def __init__(self, api: docker.APIClient) -> None:
@@ -69,9 +69,8 @@ class DockerEngine:
         return cls(api)
 
     def do(self, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function of the SDK, and return its result.
-
-        `what` names the call in an error. Raises DockerError, or the SDK's APIError if Docker refuses the call.
+        """Call a function of the SDK, and return its result. `what` names the call in error messages. Raises
+        DockerError, or the SDK's APIError if Docker refuses the call.
         """
         if self._failure is not None:
             raise self._failure
@@ -97,8 +96,8 @@ class DockerEngine:
         return await self.in_thread(partial(self.do, what, call, *args, **kwargs))
 
     async def in_thread(self, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run a function in a thread. If the waiting task is cancelled, the function continues, and `settle` waits for
-        it.
+        """Run a function in a thread. If the waiting task is cancelled, the function continues in the thread, and
+        `settle` waits for it.
         """
         future = self._threads.submit(partial(call, *args, **kwargs))
         self._pending.add(future)
@@ -115,7 +114,7 @@ class DockerEngine:
 
 
 class DockerEvents:
-    """A reader of Docker's messages about all containers with a certain label, in order."""
+    """A reader for Docker's messages about all containers with a given label. The messages come in order."""
 
     def __init__(
         self,
@@ -124,7 +123,7 @@ class DockerEvents:
         on_event: Callable[[dict[str, Any]], None],
         loop: asyncio.AbstractEventLoop,
     ) -> None:
-        """Start to follow Docker's messages. The loop calls `on_event` with each message, and with an empty message
+        """Start to read Docker's messages. `on_event` is called with each message. It is called with an empty message
         when the stream ends.
         """
         filters = {"type": "container", "label": label}

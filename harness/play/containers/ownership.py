@@ -25,7 +25,7 @@ _START_TIME = 19  # index of field 22, counted after the command's name, in /pro
 
 
 def run_name(directory: Path) -> str:
-    """Return a container name for the run in this directory. The name depends only on the directory."""
+    """Return a container name for the run in this directory. The same directory always gives the same name."""
     digest = hashlib.sha256(os.fsencode(directory)).hexdigest()[:6]
     words = re.sub(r"[^A-Za-z0-9_.]+", "-", directory.name).strip("-_.")[:40]
     return f"ucp-{words}-{digest}" if words else f"ucp-{digest}"

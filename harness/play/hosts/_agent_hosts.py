@@ -29,10 +29,12 @@ END_LIMIT_S = 10.0
 
 
 class AgentHosts:
-    """The workers that play the agents of a run, and the agents of each."""
+    """The workers of a Dask cluster that run the agents of a run. Each worker runs some of the agents."""
 
     def __init__(self, client: Any, commands: Mapping[int, Sequence[str] | None]) -> None:
-        """Distribute the agents. `commands` contains the command of each agent, or None for the harness's agent."""
+        """Distribute the agents over the workers. `commands` contains the command of each agent, or None for the agent
+        of the harness.
+        """
         self._client, self._commands = client, commands
         self._placed = place([*commands], client.nthreads())
         self._worker_of = {agent: worker for worker, agents in self._placed.items() for agent in agents}
@@ -45,7 +47,7 @@ class AgentHosts:
     @classmethod
     @asynccontextmanager
     async def opened(cls, scheduler: str, commands: Mapping[int, Sequence[str] | None]) -> AsyncIterator[AgentHosts]:
-        """Connect to the scheduler for the context. Raises the errors of `connected`."""
+        """Connect to the Dask scheduler for the duration of the context. Raises the errors of `connected`."""
         connection = connected(scheduler)
         client = await asyncio.to_thread(connection.__enter__)
         try:
@@ -62,13 +64,12 @@ class AgentHosts:
         return [*self._commands]
 
     def worker_of(self, agent_id: int) -> str:
-        """Return the address of the worker that plays the agent."""
+        """Return the address of the worker that runs the agent."""
         return self._worker_of[agent_id]
 
     def listen(self) -> list[socket.socket]:
-        """Listen at each address of this machine that a worker can reach. The caller closes the sockets.
-
-        Raises MachineError if a worker cannot be reached.
+        """Listen at each address of this machine at which a worker can connect. Return the sockets, which the caller
+        must close. Raises MachineError if a worker cannot be reached.
         """
         for worker in self._placed:
             where = _own_address(worker)
@@ -77,7 +78,7 @@ class AgentHosts:
         return [*self._listeners.values()]
 
     def start(self) -> None:
-        """Let each worker play its agents. They connect to the addresses of `listen`."""
+        """Let each worker start its agents. The agents connect to the addresses of `listen`."""
         for worker, agents in self._placed.items():
             host, port = self._listeners[_own_address(worker)].getsockname()[:2]
             order = HostOrder(host, port, self.secret.hex(), {agent: _words(self._commands[agent]) for agent in agents})
@@ -86,7 +87,7 @@ class AgentHosts:
             self._tasks.append(task)
 
     def _notify(self, worker: str, task: Any) -> None:
-        """Report the end of a task, from a thread of Dask."""
+        """Report the end of a task. A thread of Dask calls this method."""
         if task.status == "error":
             problem = f"the worker at {worker} cannot play its agents: {task.exception()}"
             with contextlib.suppress(RuntimeError):  # the run is over
@@ -97,8 +98,8 @@ class AgentHosts:
             self._problem.set_result(problem)
 
     async def watch(self) -> None:
-        """Wait until a worker is lost or ends its task with an error, and raise MachineError. After the mission has
-        begun, this only cuts off the agents of the worker.
+        """Wait until a worker is lost, or ends its task with an error. Then raise MachineError. After the start of the
+        mission, the loss of a worker only cuts off its agents.
         """
         while not self._problem.done():
             present = await asyncio.to_thread(self._client.nthreads)
@@ -108,7 +109,9 @@ class AgentHosts:
         raise MachineError(self._problem.result())
 
     async def _end(self) -> None:
-        """Wait until the workers have ended their agents, which they do when the harness no longer listens."""
+        """Wait until the workers have ended their agents. The workers end them as soon as the harness no longer
+        listens.
+        """
         from distributed import wait
 
         with contextlib.suppress(Exception):  # a lost worker or scheduler, which the run has reported
@@ -120,7 +123,7 @@ def _words(command: Sequence[str] | None) -> list[str] | None:
 
 
 def _own_address(worker: str) -> str:
-    """Return the address of this machine from which packets to the worker leave. Raises MachineError."""
+    """Return the address of this machine from which it sends packets to the worker. Raises MachineError."""
     parts = urlsplit(worker)
     try:
         family, _, _, _, place = socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_DGRAM)[0]

@@ -1,4 +1,4 @@
-"""Play agents on a worker of a Dask cluster. The functions of this module run in the worker."""
+"""Run agents on a worker of a Dask cluster. The functions of this module run on the worker."""
 
 import json
 import os
@@ -17,7 +17,9 @@ from netem.errors import LabUnavailable
 
 @dataclass(frozen=True)
 class HostOrder:
-    """The agents that a worker plays, and where they join. Without a command, an agent is that of the harness."""
+    """The order to a worker: the agents that it runs, and the address at which they join the run. An agent without a
+    command is the agent of the harness.
+    """
 
     host: str
     port: int
@@ -27,7 +29,9 @@ class HostOrder:
 
 
 def why_not(programs: list[str]) -> str | None:
-    """Return a sentence if this computer cannot play agents, or lacks one of the programs. Otherwise return None."""
+    """Return a sentence if this computer cannot run agents, or if one of the agent programs is missing. Otherwise
+    return None.
+    """
     try:
         far_network.first_process([])
     except LabUnavailable as error:
@@ -37,7 +41,7 @@ def why_not(programs: list[str]) -> str | None:
 
 
 def play_agents(order: HostOrder) -> None:
-    """Let agents join a run, and wait until the run is over. Raises MachineError if they could not join.
+    """Let agents join a run, and wait until the run has ended. Raises MachineError if the agents could not join.
 
     The agents are in a process of their own, because its main thread must own the private networks. It ends when its
     standard input ends, so it does not survive this worker.

@@ -1,4 +1,4 @@
-"""Play the agents of one run that a worker was given: `python -m harness.play.hosts.far_host`.
+"""Run the agents of one run on a worker: `python -m harness.play.hosts.far_host`.
 
 The first line of standard input is an order in JSON (`harness.play.hosts._worker_task.HostOrder`). The end of standard
 input ends the program and its agents, so they end with the worker. Each agent joins the run as with `ucp-harness join`.
@@ -20,7 +20,9 @@ READ_BYTES = 4096
 
 
 async def _play(order: dict[str, Any], command: list[str], directory: Path) -> None:
-    """Play all agents until the run is over. Raises the first error, after the other agents have ended."""
+    """Run all agents until the end of the run. If an agent fails, end the other agents, and then raise the
+    first error.
+    """
     own = [sys.executable, "-P", "-m", "ucp.node"]
     playing = []
     for agent, words in order["commands"].items():
@@ -36,7 +38,7 @@ async def _play(order: dict[str, Any], command: list[str], directory: Path) -> N
 
 
 async def _until_input_ends(work: Any) -> None:
-    """Run a coroutine until it ends, standard input ends, or a signal arrives."""
+    """Run a coroutine until it ends. Stop it earlier if standard input ends or a signal arrives."""
     loop, ended = asyncio.get_running_loop(), asyncio.Event()
 
     def read() -> None:

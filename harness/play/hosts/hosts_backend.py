@@ -1,4 +1,4 @@
-"""The process backend with agents on the workers of a Dask cluster."""
+"""The process backend, with agents that run on the workers of a Dask cluster."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -17,7 +17,7 @@ from harness.scenario import Scenario
 
 
 class HostsBackend(ProcessBackend):
-    """A backend that plays vehicles and network on this machine, and agents on the workers of a cluster."""
+    """A backend that runs vehicles and the network on this machine, and agents on the workers of a Dask cluster."""
 
     def __init__(self, scheduler: str) -> None:
         """Create the backend. `scheduler` is the address of a Dask scheduler (tcp://host:port)."""

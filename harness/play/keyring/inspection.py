@@ -28,7 +28,9 @@ from ucp.secure.bundle import (
 from ucp.secure.keyfile import KeyFileError, key_in, read_any_key_file
 
 Facts = dict[str, Any]
-"""The facts about a key file as JSON: `file`, `kind`, `mission`, and further keys for some kinds."""
+"""The facts about a key file as JSON. The facts are `file`, `kind` and `mission`, and further keys for some kinds of
+files.
+"""
 
 
 def inspect(path: Path) -> list[Facts]:

@@ -1,4 +1,4 @@
-"""Read and write the directory with the keys of a mission, and sign messages that exclude vehicles from it.
+"""Read and write the directory with the keys of a mission, and sign messages that revoke the keys of vehicles.
 
 The keys of the authority and of the depot never leave the directory. They are separate files, because the person who
 opens sealed events does not need the right to revoke keys. Other users can neither enter the directory nor read the
@@ -195,7 +195,9 @@ def load_depot_key(path: Path) -> Depot:
 
 
 def load_revocation(path: Path, public: PublicKeys) -> Revocation:
-    """Read a list of revoked vehicles from a file. Raises KeysError if its signature is not valid for this mission."""
+    """Read a list of revoked vehicles from a file. Raises KeysError if the signature of the list is not valid for this
+    mission.
+    """
 
     def parse(document: dict[str, Any]) -> Revocation:
         _check_mission(document, public)
@@ -247,8 +249,8 @@ def listed(agents: Iterable[int]) -> str:
 class RevocationAuthority:
     """The authority that revokes vehicles. It signs lists of all vehicles revoked so far. `last` is the newest list.
 
-    Without a `private_key`, the authority can only return `last`. It does not store new lists, because a mission must
-    not change the directory of its keys.
+    Without a `private_key`, the authority can only return `last`. The authority does not store new lists in the key
+    directory, because a mission must not change this directory.
     """
 
     def __init__(self, public: PublicKeys, private_key: bytes | None, last: Revocation | None = None) -> None:
@@ -258,7 +260,7 @@ class RevocationAuthority:
 
     @classmethod
     def of(cls, keys: KeySet) -> "RevocationAuthority":
-        """Return the authority for newly created keys."""
+        """Return the authority that belongs to newly created keys."""
         return cls(keys.public, keys.authority)
 
     @classmethod

@@ -26,24 +26,23 @@ from sitl.vehicle import VehicleError
 
 @dataclass(frozen=True)
 class MachineRequirement:
-    """A property that this machine needs to play runs. `way_out` is the remedy for a machine that lacks it.
-
-    If a `needed` property is missing, this machine can play no run.
-    """
+    """A property that this machine needs to carry out runs."""
 
     name: str
     ok: bool
     needed: bool
+    """True if no run is possible without the property."""
     detail: str
     way_out: str | None = None
+    """The remedy for a machine without the property."""
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
 
 def examine() -> list[MachineRequirement]:
-    """Return all requirements, each with the result of its check. The check of the kernel builds and removes a small
-    virtual network.
+    """Return all requirements, each with the result of its check. To check the kernel, the function builds and removes
+    a small virtual network.
     """
     python = MachineRequirement(
         "Python", sys.version_info >= (3, 11), True, platform.python_version(), "install Python 3.11 or newer"
@@ -104,8 +103,8 @@ _SHOWN = {"": (100.0, "%"), "s": (1000.0, "ms"), "bit/s": (0.001, "kbit/s"), "pa
 
 
 def measure_engines(requirements: Iterable[MachineRequirement], say: Callable[[str], None]) -> list[EngineMeasurement]:
-    """Measure the accuracy of each network engine that works here, 10 to 30 seconds each. Raises MachineError if the
-    machine is too busy.
+    """Measure the accuracy of each network engine that works on this machine. Each measurement takes 10 to 30 seconds.
+    Raises MachineError if the machine is too busy.
     """
     working = {requirement.name for requirement in requirements if requirement.ok}
     engines = [engine for engine in get_args(EngineName) if engine in working]
@@ -116,7 +115,7 @@ def measure_engines(requirements: Iterable[MachineRequirement], say: Callable[[s
 
 
 def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -> Observer:
-    """Return an observer of measurements that also reports the measurement in progress."""
+    """Return an observer of measurements. The observer also reports which measurement is in progress."""
 
     def observe_and_report(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         asked = len(study.questions)

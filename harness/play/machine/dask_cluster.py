@@ -1,6 +1,5 @@
-"""Connect to a Dask cluster that the user started, after a check of its versions.
-
-A matrix lets the workers of the cluster play whole runs. A single run lets them play its agents.
+"""Connect to a Dask cluster that the user started, and check the versions of its packages. The workers of the cluster
+carry out either whole runs of a matrix, or the agents of a single run.
 """
 
 import asyncio
@@ -20,10 +19,10 @@ SAME_VERSIONS = ("dask", "distributed", "ucp-harness")
 
 @contextlib.contextmanager
 def connected(address: str) -> Iterator[Any]:
-    """Provide a client of the Dask scheduler at `address` (tcp://host:port).
+    """Return a client of the Dask scheduler at `address` (tcp://host:port), as a context manager.
 
-    Raises HarnessError for an invalid address. Raises MachineError if no scheduler answers, or if it has no workers or
-    different versions.
+    Raises HarnessError for an invalid address. Raises MachineError if no scheduler answers, if the cluster has no
+    workers, or if its packages have other versions.
     """
     if not re.fullmatch(r"tcp://[^/\s]+:\d+", address):
         raise HarnessError(f"--scheduler {address} is not an address such as tcp://127.0.0.1:8786")

@@ -17,7 +17,7 @@ _MISSION = re.compile(rb"(?:.*/)?([1-9][0-9]{0,4})\.mission\.json")
 
 
 def running(proc: Path = Path("/proc")) -> dict[Path, dict[int, int]]:
-    """Return the active run directories. For each directory, give one process ID for each vehicle."""
+    """Return the active run directories. For each run directory, return the ID of one process for each vehicle."""
     runs: defaultdict[Path, dict[int, int]] = defaultdict(dict)
     for entry in proc.iterdir():
         if not entry.name.isdigit():

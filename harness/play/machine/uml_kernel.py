@@ -12,7 +12,7 @@ from netem import uml, uml_shell
 from netem.errors import UmlError
 
 OUT = "--out="
-"""The option that passes the run directory to the command inside User Mode Linux."""
+"""The option with which the command passes the run directory to the command inside User Mode Linux."""
 
 
 class UmlKernel(StrEnum):
@@ -32,7 +32,7 @@ def run_inside(arguments: list[str]) -> int:
 
 
 def runs_inside() -> dict[Path, Path]:
-    """Return the run directories of active runs in User Mode Linux, with the folder of each virtual machine."""
+    """Return the directories of the active runs in User Mode Linux, each with the folder of its virtual machine."""
     runs: dict[Path, Path] = {}
     for folder in uml_shell.guests():
         with contextlib.suppress(OSError, ValueError):
@@ -56,8 +56,8 @@ def _command(arguments: list[str]) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment variables with which the command inside User Mode Linux imports the same Python packages
-    as the command outside.
+    """Return environment variables for the command inside User Mode Linux. With these variables, it imports the same
+    Python packages as the command outside.
     """
     path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path}

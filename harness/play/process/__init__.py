@@ -1,1 +1,1 @@
-"""Play vehicles and agents as real processes in a private virtual network."""
+"""Run vehicles and agents as real processes in a private virtual network."""

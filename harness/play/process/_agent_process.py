@@ -80,11 +80,11 @@ class _ProcessIncarnation:
     actions.
     """
     reboot: bool = False
-    """True if the incarnation started with the data on its disk."""
+    """True if the incarnation started with the data on the agent's disk."""
     completed_known: bool = False
     """True if the trace has shown which blocks this killed incarnation completed."""
     trace_bytes_copied: int = 0
-    """Number of bytes of this incarnation's trace that were already appended to the trace of the first incarnation."""
+    """Number of bytes of this incarnation's trace that were already appended to the complete trace of the agent."""
 
     def handler_runs(self) -> HandlerRuns | None:
         """Return the number of handler runs in the last report of the agent, and the time of this report. Return None
@@ -117,14 +117,16 @@ class AgentProcess:
         self._now = now
         self._controlled = controlled
         self.outcome = "not started"
-        """The state of the agent as one or two words. `run.json` records it after the run, together with `detail`."""
+        """The state of the agent as one or two words. After the run, `run.json` records this state, together with
+        `detail`.
+        """
         self.detail: str | None = None
         self._rundir = rundir
         self._incarnations: list[_ProcessIncarnation] = []
         self._program: ControlledProgram | None = None
         self._control_lock = asyncio.Lock()
-        """A lock that is held while the agent answers a status request. Faults wait for it before they end or pause the
-        agent.
+        """A lock that is held while the agent answers a status request. Faults wait for this lock before they end or
+        pause the agent.
         """
         self._completed_before: list[str] = []
         self._left_behind: list[str] = []
@@ -219,7 +221,9 @@ class AgentProcess:
         return self._program
 
     async def watch(self) -> None:
-        """Wait for the process to end without a request, then raise AgentFailedError or UnsupportedError."""
+        """Wait until the process ends without a request of the harness. Then raise AgentFailedError or
+        UnsupportedError.
+        """
         await self._started.process.wait()
         raise self._end_error()
 
@@ -256,7 +260,9 @@ class AgentProcess:
             self._rundir.copy_export(self.agent_id, self._incarnations[-1].directory)
 
     async def pause(self) -> None:
-        """Suspend the process. Messages wait in its socket buffer, and are lost when the buffer is full."""
+        """Suspend the process. During the pause, messages wait in the socket buffer of the process. When the buffer is
+        full, further messages are lost.
+        """
         async with self._control_lock:
             await self._started.process.pause()
             self.outcome = "paused"
@@ -328,10 +334,8 @@ class AgentProcess:
             self.outcome = "exported"
 
     def handler_runs_since(self, mission_s: float, handler: str) -> list[HandlerRun]:
-        """Return the runs of this handler in the trace that happened after `mission_s` and since the agent's last
-        start. The oldest run is first.
-
-        Lines that cannot be parsed are skipped, because the checker reports them.
+        """Return the runs of this handler that the trace shows after `mission_s` and since the agent's last start. The
+        oldest run is first. Lines that cannot be parsed are skipped, because the checker reports them.
         """
         runs: list[HandlerRun] = []
         trace = self._incarnations[-1].directory / f"{self.agent_id}{SUFFIX}"
@@ -413,8 +417,8 @@ class AgentProcess:
     def _end_error(self) -> HarnessError:
         """Return the error for an agent whose process ended without a request.
 
-        Exit status 127 before the start of the mission means that the agent lacks a feature of the mission. A shell
-        also ends with 127, if it does not find a program.
+        If the process ended with exit status 127 before the start of the mission, the agent lacks a feature of the
+        mission. A shell also ends with 127 if it does not find a program.
         """
         status, program = self._incarnations[-1].status, self._started
         words, end = program.last_line, str(program.ended())

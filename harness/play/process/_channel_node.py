@@ -47,12 +47,12 @@ from ucp.messages import (
 
 CONTROL = "channel.control"
 VALUE = "channel.value"
-"""Name of the file with a large value of a command or an answer."""
+"""Name of the file that holds a large value of a command or of an answer."""
 
 NANOSECONDS = 1e9
 KEPT_QUESTIONS = 10_000
 TYPE_AT = 3
-"""Position of the type code in a datagram."""
+"""Position of the type code in a datagram, in bytes."""
 ANSWER_TO = {
     TYPE_CODES[question]: TYPE_CODES[answer]
     for question, answer in (
@@ -66,8 +66,8 @@ ANSWER_TO = {
 
 
 class ChannelNode:
-    """The process that simulates the radio channel. It writes its log to `journal`. Raises OSError if the process may
-    not read packets.
+    """The process that simulates the radio channel. The process writes its log to `journal`. Raises OSError if the
+    process may not read packets.
     """
 
     def __init__(self, directory: Path, journal: Path, port: int) -> None:
@@ -102,7 +102,7 @@ class ChannelNode:
         self._loop.close()
 
     def _turn(self) -> None:
-        """Read the waiting broadcasts, deliver the frames that are due, and set a timer for the next event."""
+        """Read the waiting broadcasts and deliver the frames that are due. Then set a timer for the next event."""
         channel, relay, clock = self._channel, self._relay, self._clock
         if channel is None or relay is None:
             return
@@ -176,8 +176,8 @@ class ChannelNode:
         return {}
 
     def _clear(self, request: dict[str, Any]) -> dict[str, object]:
-        """End the simulation of the channel. Messages on it are lost, and the switch delivers all broadcasts from now
-        on.
+        """End the simulation of the channel. Messages on the channel are lost. From now on, the switch delivers all
+        broadcasts.
         """
         if self._relay is not None:
             self._lateness.missed = self._relay.count_missed()
@@ -202,16 +202,16 @@ class ChannelNode:
 
 
 class DeliveryLateness:
-    """A meter of the time by which the channel delivered frames late, in mission seconds."""
+    """A record of the lateness with which the channel delivered frames, in mission seconds."""
 
     def __init__(self) -> None:
         self.missed = 0
         """Number of broadcasts that the process did not receive, because its buffer was full."""
         self.unsent = 0
-        """Number of deliveries that a port did not accept."""
+        """Number of deliveries that the kernel did not accept."""
         self._all = array("f")
         self._most: list[float] = []
-        """Greatest lateness of a delivery in each interval of the load."""
+        """The greatest lateness of a delivery in each interval in which the load is measured."""
 
     def add(self, due_s: float, now: float) -> None:
         """Record the lateness of a delivery that was due at `due_s` and happened at the time `now`."""
@@ -239,10 +239,10 @@ class DeliveryLateness:
 
 
 class AnswerTimeMeter:
-    """A meter of the time from the delivery of a query to the agent's answer, in mission seconds.
+    """A record of the times between the delivery of a query and the agent's answer, in mission seconds.
 
-    In virtual time, an agent answers at once, and its radio gets the answer after `processing_s`. A real process first
-    waits for a processor. If many agents share few processors, they answer one after another, and fewer answers
+    In virtual time, an agent answers immediately, and its radio gets the answer after `processing_s`. A real process
+    first waits for a processor. If many agents share few processors, they answer one after another, so fewer answers
     collide.
     """
 
@@ -295,7 +295,9 @@ def _sequence(data: bytes, vehicle: int) -> int | None:
 
 
 def main() -> int:
-    """Run the radio channel until it is stopped. Return exit status 1 if it has no access to the network."""
+    """Run the radio channel until it is stopped. Return the exit status: 1 if the process has no access to
+    the network.
+    """
     with contextlib.suppress(OSError):  # an ordinary user may not run before all other programs
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))
     try:

@@ -43,7 +43,7 @@ class ChannelProcess:
         self._conditions = NetworkConditions()
         self._begun = False
         self._asking = asyncio.Lock()
-        """A lock for the file of values, which only one command at a time may use."""
+        """A lock for the file with large values, because only one command at a time may use this file."""
 
     async def start(self, lab: Lab) -> None:
         """Start the process and wait until it listens. Raises MachineError."""
@@ -88,7 +88,7 @@ class ChannelProcess:
 
     async def apply(self, conditions: NetworkConditions) -> None:
         """Apply these network conditions to all frames whose transmission ends after this call. Before the mission,
-        store them for its start.
+        store the conditions until the mission starts.
         """
         self._conditions = conditions
         if not self._begun:

@@ -22,8 +22,8 @@ from sitl.vehicle import Home, VehicleError, VehicleKind
 from ucp.clock import MissionClock
 
 LATE_S = 10.0
-"""Maximum lateness of the take-off of a vehicle against its computed take-off, in mission seconds. ArduPilot, or a busy
-machine, can cause this lateness.
+"""Maximum lateness of the take-off of a vehicle, compared with its computed take-off, in mission seconds. ArduPilot or
+a busy machine can cause this lateness.
 """
 AWAY_M = 5.0
 
@@ -59,9 +59,8 @@ class Fleet:
         return VehicleProcess(vehicle_id, self._sysids[vehicle_id], self._kinds[vehicle_id], self._rundir, incarnation)
 
     async def start(self, lab: MissionLab, show: Callable[[str], None]) -> None:
-        """Start all vehicles, and wait until all can be armed. `show` receives the progress as text.
-
-        Raises VehicleFailedError, and ScenarioError if the ground station cannot be reached.
+        """Start all vehicles, and wait until all vehicles can be armed. `show` receives the progress as text. Raises
+        VehicleFailedError, and ScenarioError if the ground station cannot be reached.
         """
         if not self._vehicles:
             return
@@ -149,7 +148,7 @@ class Fleet:
     # End of the run
 
     def shortfalls(self, mission_s: float) -> list[str]:
-        """Return a sentence for each vehicle that should have left its home position, but has not."""
+        """Return a sentence for each vehicle that should have left its home position, but is still there."""
         sentences = (
             vehicle.shortfall() for vehicle in self._vehicles.values() if self._should_have_left(vehicle, mission_s)
         )

@@ -11,7 +11,9 @@ END_LIMIT_S = 5.0
 
 
 class LagMeter:
-    """A measurement of this machine's delays during a mission. It ends at the latest when this process ends."""
+    """A measurement of this machine's delays during a mission. The measurement ends at the latest when this process
+    ends.
+    """
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process

@@ -96,8 +96,8 @@ def _busy_ns(thread: str) -> int:
 
 
 def measure(file: TextIO, started: float, speedup: float, counters: KernelCounters, ended: threading.Event) -> None:
-    """Measure the machine's delays until `ended` is set, and write a line for each interval. `started` is the monotonic
-    time of mission second 0.
+    """Measure the machine's delays until `ended` is set, and write a line for each interval. `started` is the time of
+    mission second 0 on the monotonic clock.
     """
     slice_s = min(MAX_SLICE_S, max(MIN_SLICE_S, SLICE_MISSION_S / speedup))
     began = awake = time.monotonic()

@@ -34,7 +34,7 @@ class FrameDelivery(NamedTuple):
 
     at_s: float
     order: int
-    """A number that orders deliveries at the same time."""
+    """A number that determines the order of deliveries at the same time."""
     vehicle: int
     frame: bytes
 
@@ -61,7 +61,7 @@ class LiveChannel:
 
     @property
     def next_s(self) -> float:
-        """The mission second of the next event, or NEVER if there is none."""
+        """The mission second of the next event, or NEVER if no further event is scheduled."""
         return min(self._traffic.next_s, self._due[0].at_s if self._due else NEVER)
 
     def send(self, at_s: float, vehicle: int, frame: bytes, data_bytes: int, sequence: int | None) -> None:
@@ -70,13 +70,13 @@ class LiveChannel:
         self._traffic.send(at_s, self._number[vehicle], _ChannelMessage(frame, sequence), data_bytes)
 
     def pass_by(self, at_s: float, vehicle: int, frame: bytes) -> None:
-        """Let a vehicle broadcast this frame without occupying the channel."""
+        """Let a vehicle broadcast this frame without using the channel."""
         sender = self._number[vehicle]
         everyone = (1 << len(self._roster)) - 1
         self._copy(at_s, self._medium.draw(sender, at_s, len(frame)), everyone, frame)
 
     def advance(self, now: float) -> list[FrameDelivery]:
-        """Play all events up to the time `now`, and return the deliveries that are due, in order."""
+        """Simulate all events up to the time `now`. Return the deliveries that are due, in order."""
         self._play(now)
         deliveries = []
         while self._due and self._due[0].at_s <= now:
@@ -109,8 +109,8 @@ class LiveChannel:
         self._played_s = max(self._played_s, now)
 
     def _copy(self, at_s: float, draws: RandomDraws, receivers: int, frame: bytes) -> None:
-        """Schedule the arrival of a frame at these receivers, after random losses and delays. `receivers` has a bit for
-        each receiver.
+        """Schedule the arrival of a frame at these receivers. Random losses and delays apply. `receivers` is a number
+        with a bit for each receiver.
         """
         for receiver in numbers(receivers):
             for delay_s in draws.copies_to(receiver):

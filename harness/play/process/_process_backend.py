@@ -1,6 +1,5 @@
-"""The process backend, which plays vehicles and agents as programs on this machine, in a private network.
-
-The modules for networks and vehicles are imported only when a run needs them, because these imports are slow.
+"""The process backend, which runs vehicles and agents as programs on this machine, in a private network. The modules
+for networks and vehicles are imported only when a run needs them, because these imports are slow.
 """
 
 import asyncio
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class ProcessBackend(Backend):
-    """The backend that plays each vehicle and each agent as a process on this machine."""
+    """The backend that runs each vehicle and each agent as a process on this machine."""
 
     name: ClassVar[BackendName] = "process"
 
@@ -36,7 +35,9 @@ class ProcessBackend(Backend):
         self.agent_commands(scenario)
 
     def agent_command(self, scenario: Scenario, agent_id: int) -> list[str]:
-        """Return the command of the agent without its mission file. Raises HarnessError if it cannot be executed."""
+        """Return the command of the agent without the name of its mission file. Raises HarnessError if the command
+        cannot be executed.
+        """
         from harness.play.process._agent_process import agent_command
 
         return agent_command(scenario, agent_id)
@@ -79,7 +80,7 @@ class ProcessBackend(Backend):
         interactive: bool,
         hosts: "AgentHosts | None" = None,
     ) -> "ProgramRun":
-        """Return the run, which is not open yet. `hosts` plays the agents if they are not in the lab."""
+        """Return the run. The run is not open yet. If the agents run on other computers, `hosts` controls them."""
         from harness.play.process._program_run import ProgramRun
         from harness.play.process.vehicle_kinds import choose_vehicles
 

@@ -1,4 +1,4 @@
-"""Play one run with real programs in a private network. The programs are processes or containers.
+"""Carry out one run with real programs in a private network. The programs are processes or containers.
 
 A run opens the lab, starts the vehicles, the agents and the mission clock, and plays the mission. Meanwhile it watches
 all programs. At the end it exports the chains, stops the programs and closes the lab. A crash, a hang or Ctrl-C ends
@@ -51,10 +51,10 @@ from ucp.clock import MICROSECONDS, MissionClock
 POLL_S = 0.25
 QUIET_POLL_S = 0.1
 PACK_S = 1.0
-"""Wall time between two searches for parts of traces to pack."""
+"""Seconds of wall time between two searches for parts of traces that can be packed."""
 START_DELAY_S = 0.05
 MIN_FOLLOW_S = 0.1
-"""Minimum wall time between two reads of the vehicles' positions."""
+"""Minimum seconds of wall time between two reads of the vehicles' positions."""
 
 
 class ProgramRun:
@@ -122,7 +122,7 @@ class ProgramRun:
         self._waited_until_s = 0.0
         """Mission second at which the last `until` or `until_run` ended."""
         self._starting: dict[int, asyncio.Task[None]] = {}
-        """Agent -> the task that restarts it, which may still be running."""
+        """Agent -> the task that restarts the agent. The task may still be running."""
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[Self]:
@@ -269,10 +269,8 @@ class ProgramRun:
         self.rundir.append_network(record)
 
     async def _strike_all(self, fault: Fault) -> None:
-        """Apply the fault to all its agents at the same time.
-
-        Raises ScenarioError if the fault is impossible for all of them. If the fault is impossible for some agents,
-        record the reasons.
+        """Apply the fault to all its agents at the same time. If the fault is impossible for some of them, record the
+        reasons. Raises ScenarioError if the fault is impossible for all of them.
         """
         strikes = [self._strike(fault, agent_id) for agent_id in fault.agents]
         problems = [problem for problem in await asyncio.gather(*strikes, return_exceptions=True) if problem]
@@ -344,7 +342,7 @@ class ProgramRun:
         await agent.kill(disk_kept=disk_kept)
 
     async def _restart_with_vehicle(self, agent: AgentProcess) -> None:
-        """Start a new vehicle program in place of the lost one, and a new agent program on it."""
+        """Start a new vehicle program in place of the lost vehicle, and a new agent program on the new vehicle."""
         await self._fleet.replace(agent.agent_id, self._lab, incarnation=agent.incarnations + 1)
         await self._start_agent(agent, self._lab)
 
@@ -459,11 +457,13 @@ class ProgramRun:
         return replace(self.played, mission_s=mission_s, agents=agents, channel=channel, remote=remote)
 
     def _awake(self) -> list[AgentProcess]:
-        """Return the agents that are neither dead, paused nor cut off from their computer."""
+        """Return the agents that are reachable: not dead, not paused, and not cut off from their computer."""
         return [agent for agent in self.agents if agent.awake and agent.agent_id not in self._remote.cut_off]
 
     async def _statuses(self) -> dict[int, AgentStatus]:
-        """Return the status of each agent that is neither dead, paused nor cut off from its computer."""
+        """Return the status of each agent that is reachable: not dead, not paused, and not cut off from its
+        computer.
+        """
         agents = [agent for agent in self.agents if agent.agent_id not in self._remote.cut_off]
         polled = await asyncio.gather(*(agent.poll() for agent in agents))
         return {agent.agent_id: status for agent, status in zip(agents, polled, strict=True) if status}
@@ -529,7 +529,7 @@ class ProgramRun:
         self.played.agents, self.played.remote = self._agent_records(), self._remote.records()
 
     def _agent_records(self) -> dict[str, AgentRecord]:
-        """Return the record of each agent. The command of a remote agent is that on its own computer."""
+        """Return the record of each agent. For a remote agent, the record contains the command on its own computer."""
         records = {str(agent.agent_id): agent.record() for agent in self.agents}
         for agent_id, remote in self._remote.records().items():
             records[agent_id].command = remote.command

@@ -1,7 +1,7 @@
-"""Run the rogue node, a sender of forged messages outside the swarm, as a process in its own network namespace.
+"""Run the rogue node (a sender of forged messages outside the swarm) as a process in its own network namespace.
 
-The harness starts it, orders injections, and stops it. The rogue node is part of the harness and not under test. If it
-fails, the run fails with a MachineError.
+The harness starts this process, sends commands for injections to it, and stops it. The rogue node is part of the
+harness and not under test. If it fails, the run fails with a MachineError.
 """
 
 import sys
@@ -19,12 +19,12 @@ from netem.lab import Lab
 
 
 class RogueProcess:
-    """The process of the rogue node. `vehicle` is its ID in the network, which no agent has."""
+    """The process of the rogue node. `vehicle` is its ID in the network. No agent has this ID."""
 
     def __init__(self, vehicle: int, scenario: Scenario, seed: int, rundir: RunDirectory) -> None:
         self.vehicle = vehicle
         self.sent: dict[int, int] = {}
-        """Number of an injection -> number of datagrams that it sent. `stop` sets these numbers."""
+        """Number of an injection -> number of datagrams that the injection sent. `stop` sets these numbers."""
         self._scenario = scenario
         self._seed = seed
         self._rundir = rundir

@@ -1,6 +1,5 @@
-"""Define the interface of a virtual network that runs the vehicles and agents of a mission.
-
-`netem.lab.Lab` implements it with processes, and `harness.play.containers._container_lab.ContainerLab` with containers.
+"""The interface of a virtual network in which the vehicles and agents of a mission run. `netem.lab.Lab` implements it
+with processes, and `harness.play.containers._container_lab.ContainerLab` with containers.
 """
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -36,7 +35,9 @@ class MissionLab(Protocol):
 
     @property
     def network(self) -> NetworkLab:
-        """The underlying network of `netem`. The harness runs its own programs in it, such as packet captures."""
+        """The underlying network of `netem`. The harness runs its own programs in this network, such as packet
+        captures.
+        """
 
     async def spawn(
         self,

@@ -37,8 +37,8 @@ class VehicleFailedError(HarnessError):
 
 
 class VehicleProcess:
-    """The program of one vehicle. `sysid` is its MAVLink system ID. `incarnation` is 1 for the first program, and
-    higher for a replacement.
+    """The program of one vehicle. `sysid` is the MAVLink system ID of the vehicle. `incarnation` is 1 for the first
+    program of the vehicle, and greater for a replacement.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class VehicleProcess:
         self.pilot.link.plays_station = False
 
     def hand_over(self) -> None:
-        """Stop the automatic flight, so that an operator can fly the vehicle."""
+        """Stop the automatic flight, so that an operator with a ground station can fly the vehicle."""
         assert self.pilot is not None
         self.pilot.hand_over()
 
@@ -126,7 +126,9 @@ class VehicleProcess:
         return Place(*field.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
 
     def prepare(self, flight: Flight | None, altitude_m: float) -> None:
-        """Set the flight of the vehicle: the given plan, or a climb to `altitude_m` metres without a plan."""
+        """Choose the flight of the vehicle. It flies the given plan. Without a plan, it climbs to
+        `altitude_m` metres.
+        """
         assert self.pilot is not None
         self._flight = self.pilot.flight(flight.to_plan(), flight.by) if flight else self.pilot.ascent(altitude_m)
 
@@ -181,7 +183,7 @@ class VehicleProcess:
             raise self._end_error(self._process)
 
     async def kill(self) -> None:
-        """Kill the process with SIGKILL. Cancel the tasks that run `watch` and `fly` first."""
+        """Kill the process with SIGKILL. Before the call, cancel the tasks that run `watch` and `fly`."""
         assert self._process is not None
         await self._process.send_signal(signal.SIGKILL)
         await self._process.wait()

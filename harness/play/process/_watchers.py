@@ -1,4 +1,4 @@
-"""Run tasks beside a mission, for example to watch programs. An error in a task ends the mission."""
+"""Run tasks during a mission, for example to watch programs. An error in a task ends the mission."""
 
 import asyncio
 from collections import defaultdict
@@ -12,9 +12,8 @@ T = TypeVar("T")
 
 
 class MissionTasks:
-    """A group of tasks that run beside a mission.
-
-    An exception in a task ends the mission. A task ends with the mission at the latest, and earlier through `stop`.
+    """A group of tasks that run during a mission. An exception in a task ends the mission. The tasks end at the end of
+    the mission, or earlier through `stop`.
     """
 
     def __init__(self) -> None:

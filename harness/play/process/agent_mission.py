@@ -66,10 +66,8 @@ def mission_file(
 
 
 def _source(events: EventOptions, with_vehicle: bool) -> str:
-    """Return the event source for the mission file. It is "none" for scripted events, because the harness sends them to
-    the agent.
-
-    An agent without a vehicle draws its events at random.
+    """Return the event source for the mission file. The source of scripted events is "none", because the harness sends
+    these events to the agent. An agent without a vehicle draws random events.
     """
     if events.source == "scripted":
         return "none"

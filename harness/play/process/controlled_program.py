@@ -1,4 +1,5 @@
-"""Drive a program in a virtual network that answers commands on a control socket: an agent, or a node of the harness.
+"""Start, stop and query a program in a virtual network that answers commands on a control socket. The program is an
+agent, or a node of the harness.
 
 The rooms that run agents judge a failure differently. A mission ends, a conformance case fails, and a bisection skips
 the program. Therefore this driver raises errors without a verdict, and its callers replace them by their own errors.
@@ -18,13 +19,13 @@ from harness.play.process.lab_program import LabProgram
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
-"""Wall time after which a program that does not answer counts as hung."""
+"""Seconds of wall time without an answer after which a program counts as hung."""
 STOP_GRACE_S = 5.0
 RETRY_S = 0.02
 END_LIMIT_S = 0.5
-"""Maximum wall time between the end of a process and the report of that end."""
+"""Maximum time between the end of a process and the report of this end, in seconds of wall time."""
 MAX_OUTPUT_BYTES = 16 * 1024 * 1024
-"""Maximum output of a program that is not ready yet."""
+"""Maximum number of bytes that a program may print before it is ready."""
 
 
 class ProgramEndedError(AgentSilentError):
@@ -32,7 +33,7 @@ class ProgramEndedError(AgentSilentError):
 
 
 class Spawn(Protocol):
-    """The method `spawn` of a virtual network, with its vehicle."""
+    """The type of the method `spawn` of a virtual network, for a certain vehicle."""
 
     async def __call__(
         self,
@@ -72,9 +73,8 @@ class ControlledProgram:
         max_file_bytes: int | None = None,
         answer_limit_s: float | None = None,
     ) -> Self:
-        """Start the program in `directory` without waiting until it is ready. Its output goes to `log`.
-
-        The time limit of an answer is ANSWER_LIMIT_S by default. Raises SpawnError, NetemError.
+        """Start the program in `directory`, without waiting until it is ready. The output of the program goes to `log`.
+        By default, the time limit of an answer is ANSWER_LIMIT_S. Raises SpawnError, NetemError.
         """
         children = ChildProcesses()
         env = children.environment(os.environ)
@@ -120,7 +120,7 @@ class ControlledProgram:
             raise
 
     async def watch(self) -> None:
-        """Wait for the program to end without a request, then raise ProgramEndedError."""
+        """Wait until the program ends without a request of the harness. Then raise ProgramEndedError."""
         await self.process.wait()
         raise self.ended()
 

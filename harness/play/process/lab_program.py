@@ -9,7 +9,9 @@ class LabProgram(Protocol):
 
     @property
     def returncode(self) -> int | None:
-        """The exit status, or the negative number of the signal that killed the program. None while it runs."""
+        """The exit status, or the negative number of the signal that killed the program. None while the
+        program runs.
+        """
 
     @property
     def end(self) -> str:
@@ -18,14 +20,14 @@ class LabProgram(Protocol):
     @property
     def left_behind(self) -> Sequence[str]:
         """The names of the processes that `terminate` ended together with the container of the program. Without a
-        container, they run on, and the list is empty.
+        container, these processes continue, and the list is empty.
         """
 
     async def wait(self) -> int:
         """Wait for the program to end and for all its output to be in its files. Return `returncode`."""
 
     async def send_signal(self, number: int) -> None:
-        """Send a signal to the program. Do nothing if it has ended."""
+        """Send a signal to the program. Do nothing if the program has ended."""
 
     async def pause(self) -> None:
         """Suspend the program until `resume`."""

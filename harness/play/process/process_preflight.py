@@ -27,7 +27,7 @@ def refuse_unplayable(scenario: Scenario) -> None:
 
 
 def refuse_virtual_time_keys(scenario: Scenario) -> None:
-    """Raise ScenarioError if the scenario contains keys that only work in virtual time. The message lists them."""
+    """Raise ScenarioError if the scenario contains keys that need virtual time. The error message lists these keys."""
     keys = [
         *(["fates"] if scenario.fates else []),
         *(["datagrams"] if scenario.datagrams else []),
@@ -51,8 +51,8 @@ def network_needs(scenario: Scenario) -> list[str]:
 
 
 def add_rogue_listener(conditions: NetworkConditions, scenario: Scenario) -> NetworkConditions:
-    """Return the network conditions. If the scenario has a rogue node, the result has additional links to it, without
-    loss and delay.
+    """Return the network conditions. If the scenario has a rogue node, add links to the rogue node, without loss and
+    delay.
     """
     return conditions.with_listener(scenario.rogue, scenario.roster) if scenario.rogue else conditions
 

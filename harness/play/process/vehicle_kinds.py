@@ -11,11 +11,11 @@ from sitl.vehicle import NoBinaryError, NoProgramError, VehicleError, VehicleKin
 
 
 def choose_vehicles(scenario: Scenario) -> dict[int, VehicleKind]:
-    """Return the program of each vehicle. The result is empty if the scenario has no vehicles.
+    """Return the program of each vehicle.
 
-    Unless the scenario names a kind, all vehicles are ArduPilot if the binaries of all of them are found. Otherwise all
-    are embedded vehicles. Raises VehicleFailedError for an unusable binary or an impossible vehicle set-up, and
-    MachineError if a required program is missing.
+    Return an empty result if the scenario has no vehicles. If the scenario does not name a kind of vehicle, all
+    vehicles are ArduPilot if all binaries exist, and otherwise all are embedded vehicles. Raises VehicleFailedError for
+    an unusable binary or an impossible vehicle set-up, and MachineError if a required program is missing.
     """
     vehicles = scenario.vehicles
     if vehicles.kind == "none":

@@ -1,4 +1,4 @@
-"""Send and receive the messages of one TCP connection in an event loop."""
+"""Send and receive messages over one TCP connection, in an event loop."""
 
 from __future__ import annotations
 

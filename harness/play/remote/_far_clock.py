@@ -18,7 +18,7 @@ from typing import Any
 from harness.play.remote._wire import WireError
 
 RECENT = 40
-"""Number of pings from which the current offset is chosen."""
+"""Number of the latest pings from which the clock offset is chosen."""
 MAX_DELAYS = 10_000
 _PING = struct.Struct("!d")
 _PONG = struct.Struct("!dddQ")
@@ -38,7 +38,9 @@ def ping() -> bytes:
 
 
 def pong(payload: bytes, datagrams: int) -> bytes:
-    """Return the answer to a ping. `datagrams` is the number of datagrams that the agent has sent. Raises WireError."""
+    """Return the answer to a ping. `datagrams` is the number of datagrams that the agent has sent so far. Raises
+    WireError.
+    """
     if len(payload) != _PING.size:
         raise WireError("a ping has a wrong length")
     (sent,) = _PING.unpack(payload)
@@ -54,7 +56,7 @@ class FarClock:
         self._delays: deque[float] = deque(maxlen=MAX_DELAYS)
 
     def receive(self, payload: bytes) -> int:
-        """Add the measurement of a pong. Return the number of datagrams in it. Raises WireError."""
+        """Add the measurement in a pong. Return the number of datagrams that the pong reports. Raises WireError."""
         if len(payload) != _PONG.size:
             raise WireError("a pong has a wrong length")
         sent, wall, monotonic, datagrams = _PONG.unpack(payload)
@@ -83,7 +85,9 @@ class FarClock:
         return self._shortest().round_trip_s / 2
 
     def drift(self) -> float | None:
-        """Return the relative error of the far clock's rate. Return None if the measurement cannot show it."""
+        """Return the relative error of the rate of the far clock. Return None if the measurements do not show this
+        error.
+        """
         last, first = self._shortest(), self._first
         if first is None or last.at_s - first.at_s < 10.0:
             return None

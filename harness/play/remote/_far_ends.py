@@ -1,8 +1,8 @@
-"""Listen for far ends and for stand-ins, and pass the connection of a far end to a stand-in.
+"""Accept the connections of other computers on which agents run (far ends), and pass each of them to a stand-in.
 
-Both kinds of agents on other computers use this module: those of a run (`_remote_agents`), and those of a conformance
-test (`agent_pool`). Each of them is a `Host`, which decides which far ends it accepts and which stand-in gets which
-connection.
+A stand-in is the local program that represents such an agent. Runs (`_remote_agents`) and conformance tests
+(`agent_pool`) use this module through the interface `Host`. The host decides which far ends it accepts, and which
+stand-in gets which connection.
 """
 
 from __future__ import annotations
@@ -28,11 +28,13 @@ from ucp.features import CONTRACT
 
 SOCKET = "join"
 JOIN_LIMIT_S = 300.0
-"""Wall seconds in which all far ends must join."""
+"""Seconds of wall time in which all far ends must connect."""
 PINGS = 20
 PING_LIMIT_S = 10.0
 MAX_HANDSHAKES = 16
-"""Maximum number of connections in their handshake, beside one of each agent. Others are closed at once."""
+"""Maximum number of connections that perform their handshake at the same time, in addition to one connection for each
+agent. Further connections are closed immediately.
+"""
 MAX_COMPLAINTS = 10
 MAX_STAND_IN_BYTES = 4096
 MAX_TEXT = 200
@@ -40,11 +42,11 @@ MAX_TEXT = 200
 
 @dataclass
 class FarEnd:
-    """A connection of another computer that knows the secret, and asks to run an agent."""
+    """A connection of another computer that knows the secret and offers to run an agent."""
 
     agent_id: int
     session: str
-    """A number that all connections of one `ucp-harness join` have in common."""
+    """A number that is the same for all connections of one `ucp-harness join`."""
     command: list[str]
     host: str
     connection: socket.socket
@@ -52,7 +54,7 @@ class FarEnd:
 
     @property
     def is_connected(self) -> bool:
-        """True if the far end has not closed the connection, which nothing else reads yet."""
+        """True if the far end has not closed the connection. No other code may read from the connection yet."""
         try:
             return self.connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) != b""
         except BlockingIOError:
@@ -61,12 +63,16 @@ class FarEnd:
             return False
 
     async def keep(self) -> None:
-        """Let the far end wait for an incarnation of its agent. It ends an earlier one. Raises OSError."""
+        """Store the connection until an incarnation of its agent starts. Close an earlier connection of the same agent.
+        Raises OSError.
+        """
         loop = asyncio.get_running_loop()
         await loop.sock_sendall(self.connection, self.channel.encode(Kind.IDLE))
 
     def hand_over(self, stand_in: socket.socket, offset_s: float | None) -> None:
-        """Pass the connection to a stand-in. `offset_s` is the offset of the far clock, if it is fixed already."""
+        """Pass the connection to a stand-in. `offset_s` is the offset of the far clock, if this offset is already
+        known.
+        """
         with contextlib.suppress(OSError):  # the stand-in has ended
             hand_over(stand_in, self.connection, {**self.channel.to_json(), "offset_s": offset_s})
 
@@ -86,23 +92,23 @@ class FarEnd:
 
 
 class Host(Protocol):
-    """The owner of the far ends: a run or a conformance test."""
+    """The owner of the connections to other computers: a run or a conformance test."""
 
     def refusal(self, agent_id: int, session: str, host: str) -> str:
         """Return a sentence that refuses a far end. It is empty if the far end is accepted."""
 
     async def receive(self, far_end: FarEnd) -> None:
-        """Take over a new connection. Raises HandshakeError, WireError or OSError if the connection fails."""
+        """Accept a new connection of a far end. Raises HandshakeError, WireError or OSError if the connection fails."""
 
     def begin(self, number: int, stand_in: socket.socket) -> None:
-        """Take over a new stand-in. `number` is that of its task."""
+        """Accept a new stand-in. `number` is the number in the task of the stand-in."""
 
     def hear(self, number: int, stand_in: socket.socket, message: dict[str, Any]) -> None:
-        """Handle a message of a stand-in. The message is empty at its end."""
+        """Handle a message of a stand-in. An empty message means that the stand-in has ended."""
 
 
 class FarEnds:
-    """The listening sockets of a host, and the tasks that serve them."""
+    """The listening sockets of a host, and the tasks that handle its connections."""
 
     def __init__(self, host: Host, name: str, *, places: int = 1, agents: int = 1, has_keys: bool = False) -> None:
         """Create the object without listening. `name` describes the run to the user of the other computer.
@@ -192,7 +198,7 @@ class FarEnds:
             self._handshakes -= 1
 
     def refusal(self, hello: Hello, host: str) -> str:
-        """Return a sentence that refuses a far end. It is empty if the far end is accepted."""
+        """Return the sentence with which the host refuses a far end. Return an empty text if the host accepts it."""
         words = hello.words
         if words.get("protocol") != PROTOCOL or words.get("contract") != CONTRACT:
             mine = f"{PROTOCOL} and version {CONTRACT} of the agent contract"

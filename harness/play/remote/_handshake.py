@@ -1,4 +1,4 @@
-"""Prove to both ends of a new connection that the other end knows the secret, before anything else happens.
+"""Perform the handshake of a new connection, in which both ends prove that they know the secret.
 
     harness -> agent    CHALLENGE || nonce of the harness
     agent -> harness    length || hello || nonce of the agent || HMAC(secret, "UCP hello" || both nonces || hello)
@@ -42,7 +42,7 @@ class HandshakeError(Exception):
 
 
 class RefusedError(Exception):
-    """An error: the harness refused the agent. The message is the harness's sentence."""
+    """An error: the harness refused the agent. The message is the sentence that the harness sent."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,9 @@ class Hello:
 
 
 async def receive_hello(connection: socket.socket, secret: bytes) -> Hello:
-    """Challenge a new connection, and return its checked hello. Raises HandshakeError or OSError."""
+    """Send a challenge over a new connection, and return the answer of the far end after checking it. Raises
+    HandshakeError or OSError.
+    """
     loop = asyncio.get_running_loop()
     own = secrets.token_bytes(_NONCE_BYTES)
     async with asyncio.timeout(HANDSHAKE_LIMIT_S):
@@ -89,8 +91,7 @@ async def receive_hello(connection: socket.socket, secret: bytes) -> Hello:
 
 
 async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, Any]) -> tuple[Channel, dict[str, Any]]:
-    """Answer the challenge of the harness. Return the channel and the welcome.
-
+    """Answer the challenge of the harness. Return the channel of the connection, and the `welcome` of the harness.
     Raises RefusedError, HandshakeError or OSError.
     """
     loop = asyncio.get_running_loop()

@@ -39,12 +39,12 @@ class _RemoteVehicle:
     command: list[str] = field(default_factory=list)
     session: str = ""
     held: FarEnd | None = None
-    """The connection that waits for a stand-in."""
+    """The connection of a far end that no stand-in uses yet."""
     stand_in: socket.socket | None = None
     offset_s: float | None = None
     epoch_us: int | None = None
     delay_s: float = 0.0
-    """Median delay of the connection in one direction, in wall seconds, before the run."""
+    """Median delay of the connection in one direction before the run, in seconds of wall time."""
     measured: dict[str, Any] = field(default_factory=dict)
     lost: int = 0
     lost_before: int = 0
@@ -57,25 +57,27 @@ class _RemoteVehicle:
 
     @property
     def is_alive(self) -> bool:
-        """True if the far end that joined before still has a connection."""
+        """True if the earlier far end of the agent is still connected."""
         if self.held is not None:
             return self.held.is_connected
         return self.stand_in is not None and not self.cut_off
 
 
 class RemoteAgents:
-    """The agents of a run that are on other computers. Without such agents, all methods do nothing."""
+    """The agents of a run that run on other computers. If the run has no such agents, all methods do nothing."""
 
     def __init__(
         self, scenario: Scenario, rundir: RunDirectory, now: Callable[[], float], hosts: AgentHosts | None = None
     ) -> None:
-        """Prepare for remote agents. `hosts` plays all agents of the run, or is None if users let agents join."""
+        """Prepare for remote agents. `hosts` are the cluster workers that run all agents of the run. None means that
+        users let agents join.
+        """
         self._scenario, self._rundir, self._now, self._hosts = scenario, rundir, now, hosts
         agents = hosts.agents if hosts else scenario.remote.agents if scenario.remote else ()
         self._vehicles = {agent: _RemoteVehicle(agent) for agent in agents}
         self._ended = False
         self.when_cut_off: Callable[[], None] = lambda: None
-        """Called when a vehicle was cut off, or came back."""
+        """A function that is called when a vehicle is cut off or connected again."""
 
     def __contains__(self, agent_id: int) -> bool:
         return agent_id in self._vehicles
@@ -90,7 +92,7 @@ class RemoteAgents:
         return agent_id in self._vehicles and bool(self._vehicles[agent_id].cuts)
 
     def end(self) -> None:
-        """Keep the vehicles cut off that are cut off now, because the mission ends."""
+        """Keep the vehicles cut off that are cut off now, because the mission has ended."""
         self._ended = True
 
     def program(self, agent_id: int, stand_in: LabProgram) -> LabProgram:
@@ -122,7 +124,7 @@ class RemoteAgents:
                         vehicle.held.connection.close()
 
     def _meeting_point(self) -> tuple[bytes, Sequence[socket.socket]]:
-        """Return the secret of the far ends, and the sockets at which they connect. Raises HarnessError."""
+        """Return the secret that far ends must know, and the sockets to which they connect. Raises HarnessError."""
         if self._hosts is not None:
             return self._hosts.secret, self._hosts.listen()
         options = self._scenario.remote
@@ -136,8 +138,8 @@ class RemoteAgents:
         return secret, [listening(options.listen)]
 
     async def wait(self, show: Callable[[str], None]) -> None:
-        """Wait until all agents have joined. Raises MachineError after `JOIN_LIMIT_S`, and ScenarioError if the
-        scenario asks for shorter delays than the connections have.
+        """Wait until all agents have joined. Raises MachineError after `JOIN_LIMIT_S`. Raises ScenarioError if the
+        scenario asks for shorter delays than the delays of the connections.
         """
         if not self._vehicles:
             return
@@ -158,7 +160,7 @@ class RemoteAgents:
                 self.compensated(change.conditions.at_speed(self._scenario.speedup))
 
     async def watch_hosts(self) -> None:
-        """Raise MachineError if a worker of a cluster is lost. Without workers, wait for ever."""
+        """Raise MachineError if a worker of a cluster is lost. Without workers, wait without end."""
         await (self._hosts.watch() if self._hosts is not None else asyncio.Event().wait())
 
     async def _wait_for_all(self, show: Callable[[str], None]) -> None:
@@ -237,7 +239,8 @@ class RemoteAgents:
     # Network conditions and records
 
     def compensated(self, conditions: NetworkConditions) -> NetworkConditions:
-        """Return network conditions in wall time, with delays that are shorter by the delay of the connections.
+        """Return network conditions in wall time. The delay of the connection is subtracted from the delay of each
+        link.
 
         Raises ScenarioError if a link must have a shorter delay than its connections have. A link for which the
         scenario asks for no delay keeps the delay of its connections, which the record shows.

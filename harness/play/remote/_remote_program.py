@@ -1,4 +1,4 @@
-"""Suspend, resume and kill the agent of a stand-in with the signals that the stand-in understands."""
+"""Suspend, resume and kill a remote agent. The stand-in of the agent receives signals for these actions."""
 
 import asyncio
 import contextlib

@@ -16,17 +16,19 @@ class StandInTask:
     """The agent for which a program stands in."""
 
     number: int
-    """The number by which the harness knows the stand-in."""
+    """The number by which the harness identifies the stand-in."""
     agent_id: int
     vehicle: int
-    """The vehicle whose network and address the agent has."""
+    """The vehicle whose network and address the agent uses."""
     port: int
     speedup: float
     measures_lag: bool
-    """The far end measures the lag of its computer."""
+    """True if the far end measures the lag of its computer."""
 
     def command(self, socket: Path) -> list[str]:
-        """Return the command of the stand-in, without the mission file. `socket` belongs to the harness."""
+        """Return the command of the stand-in, without the mission file. `socket` is a socket of the harness, to which
+        the stand-in connects.
+        """
         stand_in = [sys.executable, "-P", "-m", "harness.play.remote.stand_in"]
         return [*stand_in, str(socket), json.dumps(asdict(self))]
 

@@ -27,7 +27,7 @@ from ucp.plain_file import parse_json
 
 TAG_BYTES = 16
 MAX_MESSAGE_BYTES = 8 << 20
-"""Maximum size of a message. The largest are a mission file and a chain export."""
+"""Maximum size of a message in bytes. The largest messages are mission files and chain exports."""
 _HEADER = struct.Struct("!IB")
 _NUMBER = struct.Struct("!Q")
 
@@ -37,7 +37,9 @@ class WireError(Exception):
 
 
 class Kind(IntEnum):
-    """The kinds of messages. `begin`, `resume`, `idle`, `request` and `signal` go to the far end, and `ping` too."""
+    """The kinds of messages. The harness sends the kinds `begin`, `resume`, `idle`, `request`, `signal` and `ping` to
+    the far end.
+    """
 
     PING = 1
     PONG = 2
@@ -100,7 +102,7 @@ class Channel:
         return self.encode(kind, json.dumps(document).encode())
 
     def decode(self, data: bytes) -> list[Message]:
-        """Return the messages that these bytes complete. Raises WireError."""
+        """Return the messages that are complete after these further bytes. Raises WireError."""
         self._unread += data
         messages = []
         while len(self._unread) >= _HEADER.size:
@@ -184,17 +186,19 @@ def _nonce(number: int) -> bytes:
 
 
 ADDRESS_BYTES = 4
-"""Number of bytes of the sender's address before a datagram to the agent."""
+"""Number of bytes of the sender's address, which precedes a datagram to the agent."""
 NUMBER_BYTES = 4
-"""Number of bytes of the number before a request and its answer."""
+"""Number of bytes of the request number, which precedes each request and each answer."""
 SILENT_S = 2.0
-"""Wall seconds without a ping or pong after which a vehicle counts as cut off."""
+"""Seconds of wall time without a ping or pong after which a vehicle counts as cut off."""
 LOST_AFTER_S = 10.0
-"""Wall seconds without an acknowledgement after which the kernel gives up a connection."""
+"""Seconds of wall time without an acknowledgement after which the kernel closes a connection."""
 
 
 def prepare(connection: socket.socket) -> None:
-    """Let the kernel send without delay, and give up a dead connection after `LOST_AFTER_S`."""
+    """Configure a connection: the kernel sends data without delay, and closes a dead connection after
+    `LOST_AFTER_S`.
+    """
     connection.setblocking(False)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(LOST_AFTER_S * 1000))
@@ -222,7 +226,9 @@ def connect_path(inside: socket.socket, path: Path) -> None:
 
 @contextmanager
 def short_name(path: Path) -> Iterator[str]:
-    """Provide a short name of a directory, because the address of a socket has at most 107 bytes."""
+    """Provide a short name for a directory inside the context, because the address of a Unix socket has at most 107
+    bytes.
+    """
     descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
     try:
         yield f"/proc/self/fd/{descriptor}"

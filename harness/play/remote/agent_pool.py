@@ -1,7 +1,8 @@
 """Run the agents of a conformance test on another computer.
 
-A conformance test starts many incarnations of one agent, several at the same time. The far end holds a connection for
-each of its places. A stand-in gets any connection that waits, and the far end replaces the connection afterwards.
+A conformance test starts many incarnations of one agent, and several of them run at the same time. The far end keeps
+one connection for each of these. A stand-in gets any connection that waits, and the far end replaces the connection
+afterwards.
 
 A lost connection ends the test, because the inputs of the agent during the gap are unknown.
 """
@@ -24,20 +25,24 @@ from harness.play.remote._remote_program import RemoteProgram
 from harness.play.remote._stand_in_task import StandInTask
 
 PLACES = 12
-"""Number of incarnations at the same time. A small computer has less memory and fewer cores than the lab."""
+"""Maximum number of incarnations that run at the same time. A small computer has less memory and fewer cores than the
+computer of the harness.
+"""
 WAIT_LIMIT_S = 10.0
-"""Wall seconds for which a stand-in waits for a connection. Then the far end has ended."""
+"""Seconds of wall time for which a stand-in waits for a connection. After this time, the far end counts as ended."""
 MAX_DELAY_S = 0.02
-"""Maximum delay of the connection in one direction, in wall seconds. Some timers of a test end after 0.2 s."""
+"""Maximum delay of the connection in one direction, in seconds of wall time. It is small because some timers of a test
+expire after 0.2 s.
+"""
 
 
 @dataclass
 class AgentPool:
-    """The agents of a test on another computer. Open it with `opened`."""
+    """The agents of a conformance test that run on another computer. Use the context manager `opened`."""
 
     agent_id: int
     listen: str
-    """ADDRESS:PORT at which the far end connects."""
+    """The address ADDRESS:PORT to which the far end connects."""
     secret: bytes
     host: str = ""
     command: list[str] = field(default_factory=list)
@@ -46,7 +51,7 @@ class AgentPool:
     _session: str = ""
     _held: deque[FarEnd] = field(default_factory=deque)
     _waiting: deque[socket.socket] = field(default_factory=deque)
-    """The stand-ins that wait for a connection."""
+    """The stand-ins that are waiting for a connection."""
     _incarnations: list[RemoteIncarnation] = field(default_factory=list)
     is_encrypted: bool = False
     """True if the keys of a test can travel to the far end."""
@@ -66,7 +71,9 @@ class AgentPool:
                     far_end.connection.close()
 
     async def wait(self) -> None:
-        """Wait until the far end has joined. Raises MachineError if it does not, or if its connection is slow."""
+        """Wait until the far end has joined. Raises MachineError if it does not join, or if its connection is
+        too slow.
+        """
         try:
             await asyncio.wait_for(self._joined.wait(), JOIN_LIMIT_S)
         except TimeoutError:
@@ -153,9 +160,9 @@ class RemoteIncarnation:
         self.stand_in_command = task.command(pool.socket_path)
         """The command of the stand-in, without the mission file."""
         self.epoch_us = 0
-        """The start of the mission in the time of the far clock."""
+        """The start of the mission on the far clock, in microseconds since the Unix epoch."""
         self.left_behind: tuple[str, ...] = ()
 
     def controlled(self, stand_in: LabProgram) -> LabProgram:
-        """Return the program that the test controls in place of the stand-in."""
+        """Return the program that the test controls. This program represents the stand-in."""
         return RemoteProgram(stand_in, lambda: self.left_behind)

@@ -47,19 +47,23 @@ from ucp.agent_files import write_json_atomically
 from ucp.plain_file import open_plain_file, read_plain_file
 
 POLL_S = 0.05
-"""Wall seconds between two reads of the agent's files, in addition to the reads before each datagram and answer."""
+"""Seconds of wall time between two reads of the agent's files. The program also reads the files before each datagram
+and answer.
+"""
 READY_POLL_S = 0.02
 END_LIMIT_S = 5.0
 FRAMES_PER_TURN = 64
 MAX_READ_BYTES = 1 << 20
 MAX_ANSWER_BYTES = 2 << 20
 MAX_UNSENT_BYTES = 4 << 20
-"""Maximum number of bytes that wait for a slow connection. Further datagrams are lost, and the trace waits."""
+"""Maximum number of bytes that wait for a slow connection. At this number, further datagrams are lost, and lines of the
+trace wait.
+"""
 LAG_PROBE = Path(__file__).parents[1] / "process" / "_lag_probe.py"
 
 
 class FileTail:
-    """A file of the agent that grows, and the number of its bytes that were read."""
+    """A growing file of the agent, and the number of bytes that were read from it."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -104,7 +108,7 @@ class FarWorker:
         self._process: asyncio.subprocess.Process | None = None
         self._control: asyncio.StreamWriter | None = None
         self._asked: deque[bytes] = deque()
-        """The numbers of the requests that the agent has not answered, oldest first."""
+        """The numbers of the requests that the agent has not answered yet. The oldest number is first."""
         self._lag: asyncio.subprocess.Process | None = None
         self._speedup = 1.0
         self._measures_lag = False
@@ -292,7 +296,7 @@ class FarWorker:
                 self._start(self._measure_lag(request["epoch_us"]))
 
     async def _forward_answers(self, reader: asyncio.StreamReader) -> None:
-        """Send each answer of the agent, after the lines of the trace and the export that belong to it."""
+        """Send each answer of the agent. First send the trace lines and the export that belong to the answer."""
         with contextlib.suppress(OSError, ValueError):  # the agent closed the socket, or sent an endless line
             while (line := await reader.readline()).endswith(b"\n") and self._asked:
                 self._send_new_lines()
@@ -356,7 +360,9 @@ class FarWorker:
             self._connection.send_together(messages)
 
     def _arrive(self, payload: bytes) -> None:
-        """Let a datagram from the lab arrive: the sender's address of 4 bytes, and the data."""
+        """Deliver a datagram from the lab to the agent. The message starts with the address of the sender (4 bytes),
+        followed by the data of the datagram.
+        """
         sender = vehicle_at(socket.inet_ntoa(payload[:ADDRESS_BYTES]))
         if self._network is not None and sender is not None:
             with contextlib.suppress(OSError):
@@ -383,7 +389,7 @@ class FarWorker:
             self._send(kind, read_plain_file(path, MAX_MESSAGE_BYTES - 1))
 
     async def _measure_lag(self, epoch_us: int) -> None:
-        """Measure the delays of this computer, as the harness does on its own machine."""
+        """Measure the delays of this computer in the same way as the harness measures its own machine."""
         if not self._measures_lag or self._lag is not None:
             return
         network = Path("/proc/self/ns/net").stat().st_ino
@@ -399,7 +405,7 @@ class FarWorker:
 
 
 def _name(text: object) -> str:
-    """Return the name of a file or directory that the harness chose. Raises WireError for a path."""
+    """Return the name of a file or directory that the harness chose. Raises WireError if the name is a path."""
     if not isinstance(text, str) or not text.isalnum():
         raise WireError("a name has other characters than letters and digits")
     return text

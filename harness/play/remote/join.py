@@ -38,11 +38,11 @@ from ucp.features import CONTRACT
 CONNECT_LIMIT_S = 5.0
 RETRY_S = 1.0
 REJOIN_LIMIT_S = 60.0
-"""Wall seconds after which a lost connection ends the incarnation of the agent."""
+"""Seconds of wall time without a connection after which the incarnation of the agent ends."""
 MAX_PLACES = 32
 DIRECTORY = "ucp-join-"
 NEW_S = 60.0
-"""Wall seconds after which a directory without a lock belongs to a killed process."""
+"""Age in seconds of wall time from which a directory without a lock belongs to a killed process."""
 
 
 class JoinError(HarnessError):
@@ -59,7 +59,7 @@ class JoinRequest:
     secret: bytes
     command: Sequence[str]
     service: bool
-    """Join every run, until the user ends the program."""
+    """True to join every run until the user ends the program."""
 
     @property
     def address(self) -> str:
@@ -75,11 +75,11 @@ class _Connected:
     run: str
     name: str
     places: int
-    """Number of incarnations of the agent that the harness needs at the same time."""
+    """Number of incarnations of the agent that the harness runs at the same time."""
 
 
 def join_commands(scenario: Scenario) -> list[str]:
-    """Return the commands that let the remote agents of a scenario join."""
+    """Return the commands with which users let the remote agents of a scenario join."""
     remote = scenario.remote
     if remote is None or remote.listen is None:
         return []
@@ -87,7 +87,7 @@ def join_commands(scenario: Scenario) -> list[str]:
 
 
 def join_command(listen: str, agent_id: int) -> str:
-    """Return the command that lets an agent join a harness that listens at this address."""
+    """Return the command with which a user lets an agent join a harness at this address."""
     address = ListenAddress.parse(listen)
     host = "ADDRESS-OF-THIS-COMPUTER" if address.host in ("0.0.0.0", "::") else address.host  # noqa: S104
     where = str(ListenAddress(host, address.port))
@@ -99,15 +99,15 @@ class _RunOverError(Exception):
 
 
 def join(request: JoinRequest, say: Callable[[str], None]) -> None:
-    """Play incarnations of the agent until the run has ended, or without end as a service. Raises MachineError without
-    private networks. Raises JoinError if no harness listens, or if the harness refuses the agent.
+    """Run incarnations of the agent until the run has ended, or without end as a service. Raises MachineError if this
+    machine has no private networks. Raises JoinError if no harness listens, or if the harness refuses the agent.
     """
     asyncio.run(_Joining(request, first_process(), say).run())
 
 
 def first_process() -> list[str]:
-    """Return the command of a process in a private network that runs an agent. Raises MachineError without private
-    networks.
+    """Return the command of a process in a private network that runs an agent. Raises MachineError if this machine has
+    no private networks.
     """
     try:
         return far_network.first_process([sys.executable, "-P", "-m", "harness.play.remote.far_worker"])
@@ -118,7 +118,9 @@ def first_process() -> list[str]:
 async def play_incarnations(
     request: JoinRequest, first_process: Sequence[str], say: Callable[[str], None], directory: Path
 ) -> None:
-    """Play incarnations of one of several agents of this process, with its files in `directory`. See `join`."""
+    """Run the incarnations of one agent. Other agents may run in the same process. The files of the agent are in
+    `directory`. See `join`.
+    """
     await _Joining(request, first_process, say).play(directory)
 
 
@@ -153,7 +155,7 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 class _Joining:
-    """A far end that plays one incarnation of its agent after another."""
+    """A far end that runs one incarnation of its agent after another."""
 
     def __init__(self, request: JoinRequest, first_process: Sequence[str], say: Callable[[str], None]) -> None:
         self._request, self._first_process, self._say = request, first_process, say
@@ -175,7 +177,7 @@ class _Joining:
                 await playing
 
     async def play(self, directory: Path) -> None:
-        """Play until the run is over, or for ever as a service. Raises JoinError."""
+        """Run the agent until the run has ended, or without end as a service. Raises JoinError."""
         joined = False
         while True:
             try:
@@ -201,7 +203,7 @@ class _Joining:
             await self._play_run(connected, directory)
 
     async def _play_run(self, first: _Connected, directory: Path) -> None:
-        """Play incarnations until the harness accepts no further connection."""
+        """Run incarnations until the harness accepts no further connection."""
         places = [
             self._play_place(connected, first.run, directory) for connected in (first, *[None] * (first.places - 1))
         ]
@@ -211,7 +213,7 @@ class _Joining:
                 raise error
 
     async def _play_place(self, connected: _Connected | None, run: str, directory: Path) -> NoReturn:
-        """Play one incarnation after another. Raises JoinError or _RunOverError when the run is over."""
+        """Run one incarnation after another. Raises _RunOverError when the run has ended, and JoinError."""
         while True:
             if connected is not None:
                 await self._play_incarnation(connected, directory)
@@ -226,8 +228,8 @@ class _Joining:
             self._say(sentence)
 
     async def _play_incarnation(self, connected: _Connected, directory: Path) -> None:
-        """Run a worker with this connection until the worker ends. If the worker asks for another connection, provide
-        one.
+        """Run a worker process with this connection until the worker ends. If the worker asks for another connection,
+        provide one.
         """
         own_end, inside = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with own_end:
@@ -271,7 +273,9 @@ class _Joining:
         return bool(asking.result())
 
     async def _reconnect(self, run: str, ended: asyncio.Task[int]) -> _Connected | None:
-        """Connect again. Return None if the incarnation is over: after `REJOIN_LIMIT_S`, or without its run."""
+        """Connect again. Return None if the incarnation must end, because `REJOIN_LIMIT_S` has passed or the run has
+        ended.
+        """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + REJOIN_LIMIT_S
         while loop.time() < deadline and not ended.done():
@@ -289,7 +293,7 @@ class _Joining:
         return None
 
     async def _connect(self) -> _Connected:
-        """Connect to the harness. Raises _RunOverError if none listens, and JoinError for any other problem."""
+        """Connect to the harness. Raises _RunOverError if no harness listens, and JoinError for any other problem."""
         request, loop = self._request, asyncio.get_running_loop()
         where = f"the harness at {request.address}"
         hello: dict[str, Any] = {

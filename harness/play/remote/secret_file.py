@@ -33,7 +33,7 @@ def create_secret(path: Path) -> None:
 
 
 def read_secret(path: Path) -> bytes:
-    """Return the secret in a file. Raises SecretError with the way out."""
+    """Return the secret in a file. Raises SecretError, whose message names a solution."""
     make = f"make one with `ucp-harness join --new-secret {path}`"
     try:
         with open_plain_file(path) as file:

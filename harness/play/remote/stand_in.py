@@ -51,9 +51,11 @@ PINGS_BEFORE_START = 8
 PING_EVERY_S = 0.5
 KILL_LIMIT_S = 2.0
 ANSWER_LIMIT_S = 9.0
-"""Wall seconds for an answer of the agent. The harness waits for 10 s."""
+"""Maximum seconds of wall time for an answer of the agent. The harness itself waits for 10 s."""
 STEP_LIMIT_S = 0.05
-"""Greatest step of the far clock between two incarnations. All incarnations have the same mission second 0."""
+"""Maximum jump of the far clock between two incarnations, in seconds. All incarnations must have the same mission
+second 0.
+"""
 MAX_REQUEST_BYTES = 65_536
 MAX_DATAGRAM_BYTES = 65_536
 DATAGRAMS_PER_TURN = 64
@@ -63,10 +65,10 @@ FAILED = 1
 
 
 class StandIn:
-    """One incarnation of an agent on another computer, as the lab sees it."""
+    """One incarnation of an agent on another computer, represented in the lab."""
 
     def __init__(self, outside: socket.socket, task: StandInTask, mission: bytes, directory: Path) -> None:
-        """Create the object. `mission` is the content of the mission file, which may be wrong."""
+        """Create the object. `mission` is the content of the mission file, which may be invalid."""
         self._loop = asyncio.get_running_loop()
         self._outside, self._task, self._directory = outside, task, directory
         self._mission = mission
@@ -84,7 +86,9 @@ class StandIn:
         self._ponged_s = self._loop.time()
         self._begun = False
         self._offset_s: float | None = None
-        """Seconds by which the far clock is ahead, for mission second 0. The first incarnation sets it."""
+        """Seconds by which the far clock is ahead of the clock of this machine. The value for mission second 0 is fixed
+        by the first incarnation.
+        """
         self._cut_off = False
         self._server: asyncio.Server | None = None
         self._udp: socket.socket | None = None
@@ -127,7 +131,7 @@ class StandIn:
             self._over.set_result(status)
 
     def _tell(self, what: dict[str, Any]) -> None:
-        """Send a message to the harness. Without the harness, the lab ends too."""
+        """Send a message to the harness. If the harness has ended, the lab ends too."""
         with contextlib.suppress(OSError):
             self._outside.send(json.dumps(what).encode())
 
@@ -222,7 +226,7 @@ class StandIn:
             self._return()
 
     def _begin(self, connection: Connection) -> None:
-        """Send the mission to the far end, with its beginning in the time of the far clock."""
+        """Send the mission to the far end. The start of the mission is converted to the time of the far clock."""
         self._begun = True
         order: dict[str, Any] = {"incarnation": self._incarnation, **asdict(self._task)}
         try:
@@ -259,7 +263,7 @@ class StandIn:
         return path if path is not None and path.is_file() else None
 
     def _far_us(self, epoch_us: int) -> int:
-        """Return the time that the far clock shows at this time of the harness's clock."""
+        """Return the time on the far clock that corresponds to this time on the harness's clock."""
         now_s = self._clock.offset_s
         if self._offset_s is None:
             self._offset_s = now_s
@@ -277,7 +281,9 @@ class StandIn:
     # Cut off
 
     def _cut(self) -> None:
-        """Note that the far computer is silent. Requests get answers without the agent from now on."""
+        """Record that the far computer does not respond. From now on, this program answers requests in place of the
+        agent.
+        """
         if self._cut_off or not self._begun:
             return
         self._cut_off = True
@@ -299,7 +305,7 @@ class StandIn:
     # Datagrams
 
     def _open(self) -> None:
-        """Open the mission's port and the control socket. The agent is ready."""
+        """Open the mission's UDP port and the control socket. Afterwards, the agent counts as ready."""
         if self._udp is not None:
             return
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -310,7 +316,7 @@ class StandIn:
         self._opening = self._loop.create_task(self._serve())
 
     def _arrive(self) -> None:
-        """Send the datagrams that arrived at the vehicle to the agent."""
+        """Send the datagrams that arrived at the vehicle to the remote agent."""
         assert self._udp is not None
         for _ in range(DATAGRAMS_PER_TURN):
             try:
@@ -323,7 +329,7 @@ class StandIn:
                 self._connection.send(Kind.DATAGRAM, socket.inet_aton(address) + data)
 
     def _release(self, data: bytes) -> None:
-        """Broadcast a datagram of the agent in the lab."""
+        """Broadcast a datagram of the remote agent in the lab."""
         self._released += 1
         if self._udp is not None:
             with contextlib.suppress(OSError):
@@ -370,7 +376,7 @@ class StandIn:
         writer.close()
 
     async def _handle(self, line: bytes) -> bytes:
-        """Return the answer to a request. Empty if the agent closed its control socket."""
+        """Return the answer to a request. Return an empty text if the agent closed its control socket."""
         try:
             request = parse_json(line)
         except ValueError:
@@ -408,7 +414,7 @@ class StandIn:
             future.set_result(payload[NUMBER_BYTES:])
 
     def _edited(self, command: str, answer: bytes) -> bytes:
-        """Return the answer with the numbers and paths that hold in the lab."""
+        """Return the answer of the agent, with numbers and paths that are valid in the lab."""
         try:
             document = parse_json(answer)
         except ValueError:
@@ -426,7 +432,7 @@ class StandIn:
         return json.dumps(document).encode() + b"\n"
 
     def _handle_alone(self, command: object) -> bytes:
-        """Return an answer while the vehicle is cut off."""
+        """Return an answer to a request while the vehicle is cut off."""
         if command == "status" and self._status is not None:
             answer = self._status
         elif command == "stop_events":

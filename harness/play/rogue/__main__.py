@@ -83,7 +83,7 @@ class RogueNode:
         self._send()
 
     def _send(self) -> None:
-        """Send all datagrams that are due, and set a timer for the next ones."""
+        """Send all datagrams that are due. Then set a timer for the next datagrams."""
         assert self._rogue is not None, "no messages to send before the start"
         for injected in self._rogue.to_send():
             now = self._clock.now()
@@ -137,7 +137,7 @@ def _load_keys(path: Path) -> "CapturedKeys":
 
 
 def main() -> int:
-    """Run the rogue node until it is stopped. Return exit status 1 if it has no access to the network."""
+    """Run the rogue node until it is stopped. Return the exit status: 1 if the process has no access to the network."""
     try:
         RogueNode(Path.cwd()).run()
     except OSError as error:

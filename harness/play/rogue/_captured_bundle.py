@@ -19,8 +19,7 @@ from ucp.secure.session import Session
 
 class CapturedKeys:
     """The keys of a captured vehicle. `random_bytes` returns 8 random bytes for each forged restart of a vehicle.
-
-    Times are mission seconds. `now_us` is the time in microseconds UTC.
+    `now_us` is the time in microseconds UTC. Other times are mission seconds.
     """
 
     def __init__(self, bundle: Bundle, random_bytes: Callable[[], bytes]) -> None:
@@ -51,8 +50,8 @@ class CapturedKeys:
     def sealed(
         self, sender: int, sequence: int, message: Message, request: AnsweredRequest | None, now: float, now_us: int
     ) -> bytes:
-        """Return an encrypted datagram in the name of `sender`, as genuine as these keys allow. Use each sequence
-        number once.
+        """Return an encrypted datagram in the name of `sender`. The datagram is as genuine as these keys allow. Use
+        each sequence number once.
         """
         session = self._sessions.get(sender)
         if session is None:

@@ -44,13 +44,13 @@ if TYPE_CHECKING:
 MAX_REMEMBERED = 10_000
 """Maximum number of received datagrams that the rogue node keeps for replays."""
 MAX_WAITING = 100_000
-"""Maximum number of datagrams that wait to be sent. At this number, the rogue node makes no further datagrams."""
+"""Maximum number of datagrams that wait to be sent. At this number, the rogue node creates no further datagrams."""
 FLOOD_BATCH = 64
 """Maximum number of messages of a flood in a row, before the rogue node handles other work."""
 
 
 QUERY_OF_ANSWER = {NAMES[answer]: NAMES[query] for answer, query in REQUEST_OF.items()}
-"""Type of an answer -> type of its query or request, by name."""
+"""Name of an answer -> name of the query or request to which it belongs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,9 +151,8 @@ class RogueLogic:
                 self._react(window, _ReceivedDatagram(sender, name, message, request, datagram), now)
 
     def _read(self, datagram: bytes, now: float) -> tuple[int, str, Message | None, "AnsweredRequest | None"]:
-        """Return the sender and the type of a datagram, with its message and identification if it can be decrypted.
-
-        Raises MalformedDatagramError.
+        """Return the sender and the type of a datagram. If the datagram can be decrypted, also return its message and
+        its identification. Raises MalformedDatagramError.
         """
         if datagram[2:3] != bytes([SECURED]):
             sender, _, message = decode(datagram)
@@ -164,8 +163,8 @@ class RogueLogic:
         return clear.sender, NAMES.get(clear.type, ""), *(opened or (None, None))
 
     def begin(self, number: int, injection: Injection, now: float) -> None:
-        """Begin injection number `number`, counted from 1. A replay, a `lie`, or a forgery without duration also ends
-        in this call.
+        """Begin injection number `number`, counted from 1. An injection without a duration (a replay, a `lie` or some
+        forgeries) also ends in this call.
         """
         self.sent[number] += 0
         if isinstance(injection, Replay):

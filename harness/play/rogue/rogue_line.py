@@ -40,7 +40,9 @@ def _secured(datagram: bytes) -> dict[str, object]:
 FORGED_FROM = 1 << 31
 """First sequence number of forged datagrams. Agents never reach it."""
 _EACH = 1 << 17
-"""Number of sequence numbers for each injection. It is more than the number of datagrams in a flood."""
+"""Number of sequence numbers that are reserved for each injection. The number is greater than the number of datagrams
+in a flood.
+"""
 
 
 def forged_sequence(injection: int, count: int) -> int:

@@ -35,7 +35,7 @@ class VirtualCapture:
             self._open = opened.pop_all()
 
     def air(self, *arguments: Any, deliver_all: bool) -> "CapturedAir":
-        """Return a simulated network that writes all frames to these files."""
+        """Return a simulated network that writes all frames to these capture files."""
         return CapturedAir(self, *arguments, deliver_all=deliver_all)
 
     def record(self, mission_s: float, number: int, frame: bytes, *, outbound: bool) -> None:
@@ -43,7 +43,7 @@ class VirtualCapture:
         self._files[number].packet(round(mission_s * NANOSECONDS), frame, outbound=outbound)
 
     def end(self, mission_s: float) -> dict[str, dict[str, int]]:
-        """Finish the files, and return their numbers of frames for run.json."""
+        """Finish the capture files, and return the number of frames in each file, for run.json."""
         counted = {}
         with self._open:
             for vehicle, file in zip(self._roster, self._files, strict=True):

@@ -52,7 +52,7 @@ class RecordedSignatures:
         return RecordingSigner(private_key, self._made)
 
     def verified(self, claim: UnverifiedSignature) -> bool:
-        """Return true if the signature is valid. The result is the same as that of `ucp.secure.crypto_suite.verify`."""
+        """Return true if the signature is valid, as `ucp.secure.crypto_suite.verify` does."""
         made_here = self._made.get(claim.signature) == (claim.public_key, claim.signed)
         return (made_here and next(self._number) % VERIFIED_EVERY != 0) or verify(claim)
 

@@ -97,7 +97,7 @@ class EventLoop:
         all_messages_count = all_messages_count or has_other_core
         self._deliver_all = deliver_all = deliver_all or all_messages_count
         self._answers_wait = scenario.settings.answer_spread_s > 0
-        """True if an agent sends an answer some time after the query."""
+        """True if agents send answers some time after the query, and not immediately."""
         self._now = 0.0
         self._generating = True
         self._number = {agent_id: number for number, agent_id in enumerate(self.roster)}
@@ -131,9 +131,9 @@ class EventLoop:
         remain.
         """
         self._recent_runs: list[tuple[int, HandlerRun]] | None = None
-        """Handler runs that the last change of the timeline caused. `run` sets it to None."""
+        """Handler runs that the last change of the timeline caused. The method `run` sets this list to None."""
         self._recurrence: RecurrenceSearch | None = None
-        """The search for a cycle, while the swarm settles."""
+        """The search for an endless cycle, while the swarm becomes idle."""
 
     def _shared_channel(self) -> ChannelTraffic[MessageInFlight | StrayDatagram] | None:
         asked = self.scenario.network.channel
@@ -184,7 +184,7 @@ class EventLoop:
     # Inputs
 
     def run(self, until: float) -> None:
-        """Play all inputs up to the time `until`. Stop earlier at a handler run for which a caller waits."""
+        """Simulate all inputs up to the time `until`. Stop earlier at a handler run for which a caller waits."""
         self._recent_runs = None
         with gc_paused():
             self._play(until)
@@ -198,7 +198,7 @@ class EventLoop:
             self.fail(failure)
 
     def _play_to_failure(self, inputs: Iterator[ScheduledInput]) -> AgentFailedError | None:
-        """Play the inputs until an agent crashes or hangs, and return the failure of this agent. Return None if no
+        """Simulate the inputs until an agent crashes or hangs, and return the failure of this agent. Return None if no
         agent fails.
         """
         alive = self._alive
@@ -236,7 +236,7 @@ class EventLoop:
             self.fail(failure)
 
     def fail(self, error: AgentFailedError) -> None:
-        """Record that an agent crashed or hung, and end the records of this agent. The other agents continue."""
+        """Record that an agent crashed or hung, and close the records of this agent. The other agents continue."""
         raise NotImplementedError
 
     def _handle_message(self, number: int, incarnation: SimulatedIncarnation, flight: MessageInFlight) -> None:
@@ -386,7 +386,7 @@ class EventLoop:
         """Return the next mission second at which a timer of the agent expires, or at which the agent must send a
         delayed answer.
 
-        `soonest` is this time on the agent's clock, for the case that none of its timers is late.
+        `soonest` is the same time on the agent's clock, without the lateness of timers.
         """
         if number not in self._late:
             return incarnation.mission_s(soonest)
@@ -485,8 +485,8 @@ class EventLoop:
         """Let the agent handle the inputs that waited during a pause, in the same order as a real process: first
         datagrams, then timers, then events.
 
-        Datagrams are handled in the order of their arrival. If the agent sends a query while it handles them, a later
-        datagram of the pause can be an answer to this query.
+        The agent handles datagrams in the order of their arrival. While it handles them, it may send a query. A later
+        datagram can then be an answer to this query.
         """
         incarnation.waiting, incarnation.resumed_at = None, self._now
         position = self._air.position

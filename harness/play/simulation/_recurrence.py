@@ -31,16 +31,16 @@ time.
 """
 SAME_INSTANT_S = 1e-6
 MAX_STEPS = 1000
-"""Maximum number of recorded steps of a cycle."""
+"""Maximum number of steps of a cycle that are recorded."""
 
 
 @dataclass(frozen=True, slots=True)
 class AgentAtRest:
-    """The state of an agent at a moment without messages in transit."""
+    """The state of an agent at a moment at which no message is in transit."""
 
     state: AgentState
     local_s: float
-    """Time on this agent's clock at the next timer expiry of the whole swarm."""
+    """The time on this agent's clock at the next timer expiry of the whole swarm."""
     wakes_s: float | None
     """Mission second at which this agent's next timer expires. None if no timer runs."""
 
@@ -122,7 +122,7 @@ class RecurrenceSearch:
         self._state_after_timers = _changeable_by_messages(swarm)
 
     def cycle(self, swarm: Sequence[AgentAtRest]) -> Cycle:
-        """Return the cycle that the last call of `check` has found."""
+        """Return the cycle that the last call of `check` found."""
         agents = {agent.state.agent_id for agent in swarm}
         acted = {step.agent_id for step in self._steps}
         return Cycle(
@@ -140,7 +140,7 @@ class RecurrenceSearch:
 
 
 def _changeable_by_messages(swarm: Sequence[AgentAtRest]) -> list[object]:
-    """Return the parts of the agents' states that messages can change, except the counts of answers."""
+    """Return the parts of the agents' states that messages can change. The counts of answers are omitted."""
     return [
         (
             state.chain.top_chain_hash,

@@ -67,7 +67,7 @@ class VirtualAgent(Protocol):
     def silent_until(self) -> float | None: ...
 
     def outgoing(self) -> Sequence[AgentOutput]:
-        """Return the outputs of the agent since the previous call, in order."""
+        """Return the outputs that the agent created since the previous call, in order."""
 
     def trace(self) -> list[Entry]: ...
 

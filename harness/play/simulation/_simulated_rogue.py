@@ -21,7 +21,7 @@ MOMENT_S = LATENCY.mean_s
 
 
 class VirtualRogue:
-    """The rogue node on a simulated network. Its `number` is the next one after the numbers of the agents."""
+    """The rogue node on a simulated network. Its number follows the numbers of the agents."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class VirtualRogue:
         self._send(now)
 
     def wake(self, now: float) -> None:
-        """Handle the timer for which the rogue node waited."""
+        """Handle the timer for which the rogue node has waited."""
         self._wakes_at = None
         self._rogue.handle_timer(now)
         self._send(now)

@@ -43,8 +43,8 @@ class _StationConnection:
 
 
 class StationTracks:
-    """The connections between a simulated run and its ground station. Use them in one event loop, and close them after
-    the run.
+    """The connections between a simulated run and its ground station. All of them must be used in one event loop, and
+    closed after the run.
     """
 
     def __init__(self, station: GroundStation) -> None:
@@ -55,7 +55,7 @@ class StationTracks:
 
     @classmethod
     async def open(cls, scenario: Scenario, tracks: Mapping[int, VehicleTrack], now: Callable[[], float]) -> Self:
-        """Connect all vehicles to the ground station. Raises ScenarioError if it cannot be reached."""
+        """Connect all vehicles to the ground station. Raises ScenarioError if the ground station cannot be reached."""
         assert scenario.gcs is not None
         try:
             station = await GroundStation.open(ListenAddress.parse(scenario.gcs), now, lambda vehicles: None)
@@ -72,7 +72,7 @@ class StationTracks:
         return shown
 
     def show(self, mission_s: float, lost: set[int]) -> None:
-        """Send the positions of all vehicles except the `lost` ones to the ground station. Do nothing if the last
+        """Send the positions of all vehicles except the `lost` vehicles to the ground station. Do nothing if the last
         update was less than `SHOW_S` ago.
         """
         if (at := time.monotonic()) - self._shown_at < SHOW_S:

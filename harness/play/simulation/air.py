@@ -61,7 +61,7 @@ class MessageInFlight:
 
 
 QueryKind = Literal["vote", "reconcile"]
-"""The two kinds of queries. An agent has at most one open query of each kind."""
+"""The two kinds of queries: an agent has at most one open query of each kind."""
 
 
 @dataclass(slots=True, eq=False)
@@ -71,7 +71,7 @@ class _AnswerLog:
     answers: dict[int, list[MessageInFlight]] = field(default_factory=dict)
     """Sender -> its answers to the query, in the order of sending."""
     askers: set[int] = field(default_factory=set)
-    """Numbers of the agents whose query is open."""
+    """Numbers of the agents whose query for these answers is open."""
     answer_count: int = 0
     """Number of all answers to the query."""
     quiet_at: float = 0.0
@@ -80,17 +80,18 @@ class _AnswerLog:
 
 @dataclass(slots=True, eq=False)
 class _OpenQuery:
-    """A query to which an agent still accepts answers. `since` is its position in the order of all inputs."""
+    """A query to which an agent still accepts answers."""
 
     question: Question
     log: _AnswerLog
     since: "ScheduledInput"
+    """The position of the query in the order of all inputs."""
     answered_by: set[int] = field(default_factory=set)
     """Senders whose answers to the query the agent has received."""
     answers_seen: int = 0
-    """Number of answers that existed at the last call of `take_answers`."""
+    """Number of answers to the query that existed at the last call of `take_answers`."""
     next_at: float = 0.0
-    """Time at which the next of the stored answers arrives."""
+    """Time at which the next of the stored answers to the query arrives."""
     first: tuple[float, int] = (NEVER, 0)
     """Time and rank of the first answer to the query, if the agent uses only one answer."""
 
@@ -112,7 +113,7 @@ class StrayDatagram:
 
 
 class _BroadcastCopies:
-    """The copies of a broadcast that reach receivers. Each is a pair of receiver number and delay in seconds."""
+    """The copies of a broadcast that reach receivers. Each copy is a pair of receiver number and delay in seconds."""
 
     def __init__(self, copies: list[tuple[int, float]]) -> None:
         self._copies = copies
@@ -166,7 +167,7 @@ class VirtualAir:
         self.open_queries: list[dict[QueryKind, _OpenQuery]] = [{} for _ in roster]
         """Agent number -> its open queries."""
         self._quiet_at = 0.0
-        """Arrival time of the last copy of any message, except messages on a shared channel."""
+        """Arrival time of the last copy of all messages, except messages on a shared channel."""
         self.position: ScheduledInput = (0.0, 0, 0, None)
         """Current position in the order of inputs."""
         self._roster = roster
@@ -217,7 +218,7 @@ class VirtualAir:
         self.position = (mission_s, self._rank, 0, None)
 
     def schedule(self, at: float, number: int, what: DueEvent | None) -> None:
-        """Schedule an event that the agent logs. If `what` is None, schedule the expiry of a timer instead."""
+        """Schedule an event that the agent logs. If `what` is None, schedule the expiry of a timer."""
         self._rank += 1
         heappush(self._queue, (at, self._rank, number, what))
 
@@ -394,8 +395,8 @@ class VirtualAir:
         self.busy_until[number] = 0.0
 
     def _open_query(self, number: int, question: Question) -> None:
-        """Mark a query of an agent as open. Answers that arrive later count for it, even if they answer the same query
-        of another agent.
+        """Mark a query of an agent as open. All answers that arrive later count for this query, even if they answer the
+        same query of another agent.
         """
         open_queries = self.open_queries[number]
         about: QueryKind = "vote" if question[0] is BlockAddResponse else "reconcile"
@@ -504,5 +505,5 @@ class VirtualAir:
         heappush(self._queue, (at, flight.rank, receiver, flight))
 
     def unmatched_fates(self) -> list[str]:
-        """Return a sentence for each scripted delivery rule that had no effect."""
+        """Return a sentence for each scripted delivery rule without an effect."""
         return self._script.unmatched(self._waiting)

@@ -28,7 +28,7 @@ class _ScriptedFate:
     matches: int = 0
     decided: int = 0
     arrivals: dict[int, list[float]] = field(default_factory=dict)
-    """Number of a matching datagram that has not been sent yet -> mission seconds at which it arrives."""
+    """Mission seconds at which matching datagrams arrive, by the number of a datagram that has not been sent yet."""
     holds: bool = False
     """True while the fate holds messages and the end of the hold is unknown."""
 
@@ -39,8 +39,8 @@ class _ScriptedFate:
 
 @dataclass(slots=True)
 class DecidedDelivery:
-    """The arrival times of one message that scripted rules decided. Times are mission seconds, and receivers are
-    numbers.
+    """The arrival times of the copies of one message, as scripted rules decided them. Times are mission seconds.
+    Receivers are identified by numbers.
     """
 
     arrivals: list[tuple[int, float]] = field(default_factory=list)
@@ -56,9 +56,8 @@ class DecidedDelivery:
 
 
 class FateScript:
-    """The scripted delivery rules (fates) of a run. `name_of` returns the name of the block with a given hash.
-
-    The number of a receiver is its index in `roster`.
+    """The scripted delivery rules (fates) of a run. `name_of` is a function that returns the name of a block from its
+    hash. Receivers are numbered by their index in `roster`.
     """
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf) -> None:
@@ -142,9 +141,8 @@ class FateScript:
         return tuple(min(part.matches, max(part.fate.counts or (0,))) for part in self._parts)
 
     def unmatched(self, waiting: Collection[str]) -> list[str]:
-        """Return a sentence for each rule that had no effect, because its author expects an effect.
-
-        `waiting` contains the names of rules whose message has not arrived, although other messages wait for it.
+        """Return a sentence for each rule that had no effect, because the author of the rule expects an effect.
+        `waiting` contains the names of rules for whose message other messages wait, but which did not match a message.
         """
         sentences = []
         for part in self._parts:
@@ -180,7 +178,7 @@ class FateScript:
 
 
 class RunningTimer(NamedTuple):
-    """A running timer of an agent. The timers that the agent starts are numbered from 0."""
+    """A running timer of an agent. All timers that the agent starts are numbered, from 0."""
 
     name: str
     number: int
@@ -190,8 +188,8 @@ class RunningTimer(NamedTuple):
 
 
 class LateTimers:
-    """The timers of one agent, some of which expire late. They are counted across restarts. `text` is the agent's
-    `lateness` in the scenario.
+    """The timers of one agent, some of which expire late. The timers are counted across restarts of the agent. `text`
+    is the key `lateness` of the scenario for this agent.
     """
 
     def __init__(self, text: str = "") -> None:
@@ -201,7 +199,7 @@ class LateTimers:
         self._started = 0
 
     def update(self, state: AgentState) -> None:
-        """Update the list of running timers after an input. New timers are numbered in the order of `state.timers`."""
+        """Update the list of running timers after an input. New timers get numbers in the order of `state.timers`."""
         for timer in state.timers:
             known, deadline = self.running.get(timer.name), timer.deadline
             if deadline is None:
@@ -212,7 +210,7 @@ class LateTimers:
 
     @property
     def late_ones_have_ended(self) -> bool:
-        """True if all timers that the scenario delays have expired. From then on, all timers expire on time."""
+        """True if all timers that the scenario delays have expired. After this, all timers expire on time."""
         late = self._late_by_s.keys()
         running = {timer.number for timer in self.running.values()}
         return self._started > max(late, default=-1) and running.isdisjoint(late)

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 
 class KeyedAgent(Protocol):
-    """An agent that signs and encrypts its messages. It runs in this process or as a separate program."""
+    """An agent that signs and encrypts its messages. The agent runs in this process or as a separate program."""
 
     def sealed_to_send(self) -> "Iterable[OutgoingDatagram]":
         """Return the datagrams that the agent sent since the previous call, in order."""
 
     def revoke(self, body: bytes, now: float) -> object:
-        """Handle a signed list of vehicles that are excluded from the mission."""
+        """Handle a signed list of vehicles whose keys are revoked."""
 
 
 @dataclass(slots=True)
@@ -33,7 +33,7 @@ class SimulatedIncarnation:
     agent: VirtualAgent
     source: RandomEvents
     clock: AgentClock | None
-    """The clock of the agent. None if it shows mission time."""
+    """The clock of the agent. None if the agent's clock shows mission time."""
     started_at: float
     state: AgentState | None = None
     """The protocol state of the agent. None for a foreign agent, whose state the harness cannot read."""
@@ -69,7 +69,9 @@ class SimulatedIncarnation:
         return self.agent.status().top_chain_hash if self.state is None else self.state.chain.top_chain_hash.hex()
 
     def drop_unfinished_input(self) -> None:
-        """Drop the blocks that the agent completed in an input whose handlers did not finish. No record has them."""
+        """Drop the blocks that the agent completed in an input whose handlers did not finish. No record contains these
+        blocks.
+        """
         if self.state is not None:
             del self.state.completed[self.completed :]
 

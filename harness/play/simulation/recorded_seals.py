@@ -28,7 +28,9 @@ class RecordedSeals:
 
 
 def recorded_seals(script: Iterable[ScriptedEvent], agent_id: int) -> RecordedSeals | None:
-    """Return the encrypted event data of this agent from a script of events. Return None if the script has none."""
+    """Return the encrypted event data of this agent from a script of events. Return None if the script has no encrypted
+    data.
+    """
     sealed = {
         event.logged.encode(): base64.b64decode(event.sealed)
         for event in script

@@ -14,8 +14,9 @@ from ucp.store import StoredState
 class RestoredSwarm(Simulation):
     """A simulated swarm whose agents start with stored states. An agent without a stored state does not start.
 
-    Agents boot without their deques, and `give_deque` adds them one by one. If all agents proposed blocks at once, they
-    would all be in a reconcile and answer no query, possibly forever.
+    Agents start without the blocks in their deques. The method `give_deque` adds these blocks for one agent after
+    another. If all agents proposed blocks at once, all of them could be in a reconcile and answer no query, possibly
+    forever.
     """
 
     def __init__(
@@ -27,9 +28,7 @@ class RestoredSwarm(Simulation):
         self._generating = False
 
     async def give_deque(self, agent_id: int) -> None:
-        """Restart the agent with its current state, and add the blocks of its stored deque that the agent does not
-        hold.
-        """
+        """Restart the agent with its current state. Add the blocks of its stored deque that the agent does not hold."""
         incarnation = self._alive[self._number[agent_id]]
         assert incarnation is not None and incarnation.state is not None, "the agent has booted"
         state = incarnation.state

@@ -44,12 +44,12 @@ class DiskRecorder:
     tracing = True
 
     def __init__(self, rundir: RunDirectory, trace_quota: int) -> None:
-        """`trace_quota` is the maximum size of each trace, in bytes."""
+        """Create the recorder. `trace_quota` is the maximum size of each trace in bytes."""
         self._rundir = rundir
         self._left = defaultdict[int, int](lambda: trace_quota)
         """Agent -> number of bytes by which its trace may still grow."""
         self._written_bytes = 0
-        """Size of all traces since parts of them were last packed."""
+        """Total size of all traces when parts of them were last packed, in bytes."""
         self._traces: dict[int, TraceFile] = {}
         self._collected = TraceCollection()
 
@@ -119,7 +119,9 @@ class DiskRecorder:
 
 
 def header(incarnation: SimulatedIncarnation) -> dict[str, Any]:
-    """Return the content of a trace header for this incarnation, as keyword arguments of `ucp.trace.header_line`."""
+    """Return the content of a trace header for this incarnation. The result can be passed to `ucp.trace.header_line` as
+    keyword arguments.
+    """
     agent = incarnation.agent
     clock = {"epoch_us": 0, "speedup": 1, **(incarnation.clock.model_dump() if incarnation.clock else {})}
     return {
@@ -153,7 +155,9 @@ class Recorder(Protocol):
         """Record a datagram of the rogue node in the format of `harness.play.rogue._journal`."""
 
     def transmitted(self, record: dict[str, Any]) -> None:
-        """Record a message that left the shared channel, or that a radio dropped. Only called if traces are written."""
+        """Record a message that left the shared channel, or that a radio dropped. The simulation calls this method only
+        if it writes traces.
+        """
 
     def moved(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Record the positions of the vehicles."""

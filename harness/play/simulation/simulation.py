@@ -1,9 +1,9 @@
 """Simulate a swarm in virtual time, with the same agent code that `ucp.node` runs.
 
-The simulation does not wait, and does not depend on the machine. The same scenario and seed give the same run to the
-last bit. The events of each agent, the network effects on each sender and the quirks of each agent use separate random
-streams. Another fault in the scenario therefore does not change the random numbers of other agents. Vehicles are only
-flight paths without telemetry, so agents log random events (Algorithm 21).
+The simulation never waits for real time, and its result does not depend on the machine. The same scenario and seed give
+the same run to the last bit. The events of each agent, the network effects on each sender and the quirks of each agent
+use separate random streams. Another fault in the scenario therefore does not change the random numbers of other agents.
+Vehicles are only flight paths without telemetry, so agents log random events (Algorithm 21).
 """
 
 import base64
@@ -58,7 +58,7 @@ ANY_RUN = _AnyHandlerRun("any")
 
 
 class Simulation(EventLoop):
-    """A swarm in virtual time. It implements the interface `harness.play.mission.Swarm`."""
+    """The simulation of a swarm in virtual time. It implements the interface `harness.play.mission.Swarm`."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class Simulation(EventLoop):
     ) -> None:
         """Create a swarm whose mission has not begun.
 
-        - `on_progress`: awaited every `PROGRESS_S` mission seconds.
+        - `on_progress`: a function that is awaited every `PROGRESS_S` mission seconds.
         - `pace`: limits the speed of virtual time.
 
         `EventLoop` describes the other options.
@@ -106,12 +106,14 @@ class Simulation(EventLoop):
         self.failures: list[AgentFailedError] = []
         """The failures of agents that crashed or hung, in the order of time."""
         self._failed_incarnations: list[list[AgentFailure]] = [[] for _ in self.roster]
-        """Records of the failures of each agent."""
+        """The records of the failures of each agent."""
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S
         self._all_rest_from_s = NEVER
-        """The time after which no vehicle moves any more. It is set only if just the channel needs positions."""
+        """The time after which no vehicle moves any more. The time is known only if the shared channel is the only part
+        of the scenario that needs positions.
+        """
         if self._channel and not (scenario.flight or scenario.gcs):
             self._all_rest_from_s = max(track.course.rests_from_s for track in self._tracks.values())
         self._moves_at = NEVER
@@ -169,7 +171,7 @@ class Simulation(EventLoop):
                 await self._breathe(self)
 
     async def _run_at(self, pace: "VirtualTimePace", furthest: float) -> None:
-        """Play the simulation like `run`, but at most up to the mission second that the requested speed allows now."""
+        """Run the simulation like `run`, but only up to the mission second that the requested speed allows now."""
         allowed_s = await pace.allowed_until(self._now)
         if allowed_s is None:
             return
@@ -358,7 +360,9 @@ class Simulation(EventLoop):
         return self.survive(self._outcome_so_far)
 
     def survive(self, query: Callable[[], Returned]) -> Returned:
-        """Return the result of a query to the living agents. If an agent crashes or hangs, query the others again."""
+        """Return the result of a query to the living agents. If an agent crashes or hangs, query the other agents
+        again.
+        """
         while True:
             try:
                 return query()
@@ -503,7 +507,7 @@ class Simulation(EventLoop):
         self._air.remove_agent(number)
 
     def _disk_after_death(self, number: int) -> DiskContents | None:
-        """Return the content of the disk of an agent that died by itself. Return None if it stored nothing."""
+        """Return the content of the disk of an agent that crashed. Return None if the agent stored no data."""
         if not self._incarnations[number]:
             return None
         dead = self._incarnations[number][-1]
@@ -583,8 +587,8 @@ def _rounded(seconds: float | None) -> float | None:
 
 
 def _disconnected_until(at_s: float, network: Sequence[NetworkState]) -> list[NetworkState]:
-    """Return the records of network changes. While scripted deliveries are active, until `at_s`, they are marked as not
-    fully connected.
+    """Return the records of network changes. While scripted deliveries are active (until `at_s`), the records say that
+    the network is not fully connected.
     """
     since = round(at_s + 0.001, 3)  # include messages of the same instant
     before = [state.model_copy(update={"fully_connected": False}) for state in network if state.at_s < since]

@@ -1,4 +1,6 @@
-"""The simulation backend. It plays a swarm in virtual time, and writes a run directory like the other backends."""
+"""The simulation backend, which simulates a swarm in virtual time, and writes a run directory like the other
+backends.
+"""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class SimulationBackend(Backend):
-    """The backend that plays a swarm in virtual time, in this process."""
+    """The backend that simulates a swarm in virtual time, in this process."""
 
     name = "sim"
     virtual_time = True
@@ -132,7 +134,7 @@ class SimulationBackend(Backend):
 
 
 def _of_real_vehicles(scenario: Scenario) -> list[str]:
-    """Return the keys of the scenario that need real vehicle programs."""
+    """Return the keys of the scenario that work only with real vehicle programs."""
     asked = (scenario.vehicles, *scenario.vehicles.each.values())
     keys = ("frame", "parameters", "wind", "arguments", "debugger")
     return [key for key in keys if any(getattr(vehicles, key) for vehicles in asked)]
@@ -156,7 +158,9 @@ def _export(simulation: Simulation, files: DiskRecorder) -> None:
 
 
 async def _compare_again(simulation: Simulation, on_progress: Callable[[Simulation], Awaitable[None]]) -> None:
-    """Check that foreign agents are deterministic: give them their inputs a second time, and compare the answers."""
+    """Check that foreign agents are deterministic. Each agent gets its inputs a second time, and its answers are
+    compared with the first answers.
+    """
     from harness.play.simulation.foreign.determinism import DeterminismCheck, NondeterminismError
 
     simulation.enter("the same again")
@@ -173,8 +177,8 @@ async def _compare_again(simulation: Simulation, on_progress: Callable[[Simulati
 
 @contextmanager
 def _programs(scenario: Scenario, rundir: RunDirectory) -> Iterator["ProgramPool | None"]:
-    """Yield a pool of programs for the foreign agents, with logs in the run directory. Yield None without foreign
-    agents.
+    """Yield a pool of programs for the foreign agents, with log files in the run directory. Yield None if the scenario
+    has no foreign agents.
     """
     if not scenario.foreign:
         yield None

@@ -1,4 +1,5 @@
-"""Run agents in any language in virtual time. They are programs that read inputs and write answers as lines of text.
+"""Run agents in any language in virtual time. Such agents are programs that read inputs and write answers as lines of
+text.
 
 `line_program` starts a program and exchanges lines with it, within a limit of wall time. `_program_pool` keeps started
 programs for later missions. `_answer` parses an answer. `_foreign_agent` lets the simulation drive one incarnation as

@@ -45,7 +45,7 @@ class ForeignAnswer:
     """Time on the agent's clock at which its next timer expires."""
     trace: list[Entry] = field(default_factory=list)
     command_answer: Any = None
-    """The answer to a command. The parser does not check it."""
+    """The answer to a command. The parser does not check the content of this answer."""
 
 
 def read_answer(line: bytes, *, tracing: bool) -> ForeignAnswer:
@@ -93,7 +93,7 @@ def _datagram(text: Any) -> tuple[bytes, RecordedBytes]:
 
 
 def _entries(trace: list[Any]) -> Iterable[Entry]:
-    """Yield the lines of a trace except its header. The harness writes the header itself."""
+    """Yield the lines of a trace, except the header. The harness writes the header itself."""
     for number, line in enumerate(trace):
         if isinstance(line, dict) and "schema" in line:
             continue

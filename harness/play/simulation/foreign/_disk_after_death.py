@@ -1,4 +1,4 @@
-"""Find the content of a dead foreign agent's disk.
+"""Find the content of the disk of a foreign agent (a separate program) that has died.
 
 A program that has ended cannot answer the command `store`. Agents in virtual time are deterministic, so a new program
 with the same inputs stores the same data. The input at which the agent died is left out, because an agent writes its

@@ -1,5 +1,5 @@
-"""Run one start of a foreign agent (a separate program) in virtual time. It has the same interface as an agent in this
-process.
+"""Run a foreign agent (a separate program) in virtual time, from one start to its end. This object has the same
+interface as an agent in this process.
 
 The harness writes each input to the program as a line. The answer contains the datagrams that the agent sends, the
 expiry of its next timer, and the lines of its trace. The harness asks for the agent's state with the commands of the
@@ -48,13 +48,13 @@ refuse it (127).
 
 
 class _CounterPerSecond:
-    """A counter of the events in the current mission second."""
+    """A counter of the events that happen in the current mission second."""
 
     def __init__(self) -> None:
         self._second = self._count = 0
 
     def add(self, count: int, now: float) -> int:
-        """Add `count`, and return the total for the mission second of `now`."""
+        """Add `count` to the counter. Return the total for the mission second that contains `now`."""
         self._count = count + (self._count if self._second == int(now) else 0)
         self._second = int(now)
         return self._count
@@ -69,7 +69,7 @@ class IncarnationRecord:
     agent_id: int
     command: tuple[str, ...]
     after_another: bool
-    """Add `count` to the counter. Return its total for the mission second of `now`."""
+    """Add `count` to the counter. Return the total for the mission second that contains `now`."""
     limit: int
     exchanges: list[tuple[bytes, bytes]] = field(default_factory=list)
     length: int = 0
@@ -127,7 +127,7 @@ class ForeignAgent:
         self._sent: list[tuple[bytes, RecordedBytes]] = []
         self._trace: list[Entry] = []
         self._completed: list[bytes] | None = [] if tracing else None
-        """Hashes of the completed blocks from the trace. None without a trace."""
+        """Hashes of the completed blocks, which the trace shows. None without a trace."""
         self._status: AgentStatus | None = None
         """The current status of the agent. None if the status is unknown, because an input may have changed it."""
         self._export: dict[str, Any] | None = None
@@ -175,7 +175,7 @@ class ForeignAgent:
         return self._timer
 
     def silent_until(self) -> float | None:
-        """Return None, because the harness does not know how long a separate program ignores messages."""
+        """Return None, because the harness does not know for how long a separate program ignores messages."""
         return None
 
     def outgoing(self) -> Sequence[AgentOutput]:
@@ -257,7 +257,7 @@ class ForeignAgent:
         return f"at {now if self._clock is None else self._clock.mission_s(now):g} s"
 
     def _ask(self, command: str, now: float) -> dict[str, Any]:
-        """Send a command that must not change the agent's state, and return the answer."""
+        """Send the agent a command that must not change its state, and return the answer."""
         timer = self._timer
         answer = self._exchange(f'{{"t":{self._time_text(now)},"command":"{command}"}}', f"the command {command}", now)
         if answer.sent or answer.timer != timer or any(isinstance(entry, HandlerRun) for entry in answer.trace):
@@ -275,7 +275,9 @@ class ForeignAgent:
         return command_answer
 
     def _give_input(self, line: str, what: str, now: float) -> ForeignAnswer:
-        """Give an input to the agent, and store the outputs. An input that the agent refuses has no outputs."""
+        """Give an input to the agent, and store the outputs of the agent. If the agent refuses the input, there are no
+        outputs.
+        """
         answer = self._exchange(line, what, now)
         if self._datagrams_sent.add(len(answer.sent), now) > MAX_SENT_PER_S:
             what = f"sent more than {MAX_SENT_PER_S} datagrams within a second, {self._at(now)}"
@@ -316,7 +318,7 @@ class ForeignAgent:
         return answer
 
     def _check(self, entries: list[Entry]) -> list[bytes]:
-        """Check the times in the trace, and return the hashes of the blocks that it reports as completed."""
+        """Check the times in the trace. Return the hashes of the blocks that the trace reports as completed."""
         for entry in entries:
             if not abs(entry.t - self._now) <= ROUNDED_S:
                 raise self._failure("crashed", f"wrote t={entry.t!r} into its trace of an input at {self._now:g} s")
@@ -352,5 +354,5 @@ def _changes(entries: list[Entry]) -> Iterator[tuple[str, str]]:
 
 
 def _where(error: ValidationError) -> str:
-    """Return the path of the first invalid key in an answer."""
+    """Return the path of the first invalid key in an answer of the agent."""
     return f"`{'.'.join(str(part) for part in error.errors()[0]['loc'])}`"

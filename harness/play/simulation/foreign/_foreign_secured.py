@@ -30,7 +30,9 @@ class SecuredForeignAgent(ForeignAgent):
         super().__init__(*arguments, **options)
 
     def sealed_to_send(self) -> Iterator[OutgoingDatagram]:
-        """Yield the datagrams since the previous call, in order. A datagram that cannot be decrypted has no message."""
+        """Yield the datagrams that the agent sent since the previous call, in order. A datagram that cannot be
+        decrypted is yielded without a message.
+        """
         sent, self._sent = self._sent, []
         for data, _ in sent:
             try:
@@ -44,7 +46,7 @@ class SecuredForeignAgent(ForeignAgent):
             yield OutgoingDatagram(data, content.sequence, content.message if is_own else None, opened.recorded)
 
     def revoke(self, body: bytes, now: float) -> None:
-        """Give the agent a signed list of vehicles that are excluded from the mission."""
+        """Give the agent a signed list of vehicles whose keys are revoked."""
         given = f'{{"t":{self._time_text(now)},"command":"revoke","revocation":"{in_base64(body)}"}}'
         self._checked_answer("revoke", self._give_input(given, "the command revoke", now).command_answer)
 

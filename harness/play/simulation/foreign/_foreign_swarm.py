@@ -28,9 +28,8 @@ def commands_of(scenario: Scenario) -> dict[int, list[str]]:
 
 
 class ForeignSwarm:
-    """The foreign agents of a scenario, that is, the agents that are separate programs.
-
-    By default `programs` is the pool that all missions in this process share. `keys` are the keys of a secured mission.
+    """The foreign agents of a scenario (agents that are separate programs). By default, `programs` is the pool of
+    programs that all missions in this process share. `keys` are the keys of a secured mission.
     """
 
     def __init__(
@@ -61,9 +60,8 @@ class ForeignSwarm:
         return self._commands[agent_id]
 
     def start(self) -> None:
-        """Start the programs of all foreign agents. Raises HarnessError if a program cannot be started.
-
-        The programs then load at the same time.
+        """Start the programs of all foreign agents, so that they load at the same time. Raises HarnessError if a
+        program cannot be started.
         """
         for agent_id in self._commands:
             self._start(agent_id)
@@ -82,9 +80,8 @@ class ForeignSwarm:
     def begin(
         self, agent_id: int, incarnation: int, now: float, stored: DiskContents | None, *, started_at: float
     ) -> ForeignAgent:
-        """Start the agent, with the contents of its disk if `stored` is given. Raises HarnessError.
-
-        The agent starts at mission second `started_at`, when its clock shows `now`.
+        """Start the agent at mission second `started_at`, when its clock shows `now`. `stored` is the content of its
+        disk, or None. Raises HarnessError.
         """
         if agent_id not in self._playing:
             self._start(agent_id)
@@ -112,7 +109,7 @@ class ForeignSwarm:
         return agent
 
     def ended(self, agent_id: int) -> None:
-        """Return the program of an ended agent to the pool, so that a different agent can use it."""
+        """Return the program of an ended agent to the pool, so that another agent can use this program."""
         if (program := self._playing.pop(agent_id, None)) is not None:
             self._programs.give_back(program)
 

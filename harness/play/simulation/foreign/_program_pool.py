@@ -1,4 +1,4 @@
-"""Keep a pool of programs that play agents in virtual time.
+"""Keep a pool of programs that run agents in virtual time.
 
 Starting a program takes longer than playing a short mission, so a pool keeps them for the next mission. Each process
 of the harness has a pool of its own. A forked child starts with an empty pool.
@@ -14,27 +14,27 @@ from threading import Lock
 from harness.play.simulation.foreign.line_program import LineProgram
 
 MAX_IDLE = 128
-"""Maximum number of idle programs. A further one ends the program that has been idle for the longest time."""
+"""Maximum number of idle programs. If a further program becomes idle, the program that has been idle for the longest
+time ends.
+"""
 GRACE_S = 1.0
 
 
 class ProgramPool:
-    """A pool of idle programs for reuse.
-
-    Standard error of a program goes to a file for each agent in the directory `logs`. With None, only error messages
-    use it.
+    """A pool of idle programs for reuse. `logs` is a directory for the standard error of the programs, with one file
+    for each agent. If `logs` is None, standard error is used only in error messages.
     """
 
     def __init__(self, logs: Path | None = None) -> None:
         self._logs = logs
         self._idle: list[LineProgram] = []
-        """Idle programs, the longest idle one first."""
+        """Idle programs. The program that has been idle for the longest time is first."""
         self._taken: set[LineProgram] = set()
         self._lock = Lock()
 
     def take(self, command: Sequence[str], agent_id: int) -> LineProgram:
-        """Return an idle or a new program, which the caller must give back. Raises OSError if a new program cannot be
-        started.
+        """Return an idle program, or a new program. The caller must give the program back. Raises OSError if a new
+        program cannot be started.
         """
         log = self._logs / f"{agent_id}.log" if self._logs is not None else None
         with self._lock:
@@ -53,7 +53,7 @@ class ProgramPool:
         return None
 
     def give_back(self, program: LineProgram) -> None:
-        """Return the program to the pool. If it has not answered its last input, end it instead."""
+        """Return the program to the pool. If the program has not answered its last input, end it."""
         with self._lock:
             self._taken.discard(program)
             if program.owes_an_answer:
@@ -65,7 +65,9 @@ class ProgramPool:
                 self._idle.pop(0).close()
 
     def close(self) -> dict[int, list[str]]:
-        """End all programs. Return, by agent, the names of processes that a program with a log left behind."""
+        """End all programs. Return the names of processes that a program left behind, by agent. Only programs with a
+        log are checked.
+        """
         programs = [*self._taken, *self._idle]
         self._taken.clear()
         self._idle.clear()
@@ -77,7 +79,9 @@ class ProgramPool:
         return {int(each.log.stem): each.left_behind for each in programs if each.log is not None and each.left_behind}
 
     def release_all(self) -> None:
-        """Empty the pool without ending the programs, because they belong to the parent process."""
+        """Empty the pool without ending the programs. A forked process calls this method, because the programs belong
+        to its parent process.
+        """
         for program in [*self._taken, *self._idle]:
             program.release()
         self._taken.clear()
@@ -86,7 +90,9 @@ class ProgramPool:
 
 
 SHARED = ProgramPool()
-"""The pool of programs for missions in memory, because a sweep plays thousands of these missions."""
+"""The pool of programs for missions in memory. Many missions use this pool, for example the thousands of missions of a
+sweep.
+"""
 
 atexit.register(SHARED.close)
 os.register_at_fork(after_in_child=SHARED.release_all)

@@ -32,10 +32,10 @@ class NondeterminismError(HarnessError):
 
 
 class DeterminismCheck:
-    """A check of recorded agents for determinism, with one process for each command. Close it after use.
+    """A check whether recorded agents are deterministic.
 
-    If `patient` is true, the check first waits for the next second of the clock, because an agent may read a clock in
-    whole seconds.
+    It starts one process for each command, so close it after use. If `patient` is true, the check first waits for the
+    next second of the clock, because an agent may read a clock in whole seconds.
     """
 
     def __init__(self, *, patient: bool) -> None:

@@ -1,4 +1,4 @@
-"""Drive a program that plays agents in virtual time.
+"""Exchange lines with a program that runs agents in virtual time.
 
 The harness writes one line to the program's standard input and reads one line as its answer, as the contract describes
 for `--virtual`. The program has a few seconds of wall time for each answer. It does not receive Ctrl-C. It ends when
@@ -24,7 +24,9 @@ from harness.play.simulation.foreign._answer import Outcome
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
-"""Wall time after which a program that does not answer counts as hung. The first answer may take `START_LIMIT_S`."""
+"""Seconds of wall time without an answer after which a program counts as hung. The first answer may take
+`START_LIMIT_S`.
+"""
 MAX_ANSWER_BYTES = MAX_EXPORT_BYTES
 CHUNK_BYTES = 64 * 1024
 END_LIMIT_S = 1.0
@@ -48,8 +50,8 @@ class ProgramFailedError(Exception):
 class LineProgram:
     """A running program that was started with `command` and the argument `--virtual`.
 
-    Its standard error goes to `log`. Without `log`, it goes to a temporary file that each mission clears. Raises
-    OSError if the program cannot be started.
+    Its standard error goes to the file `log`. Without `log`, it goes to a temporary file, which is cleared at the start
+    of each mission. Raises OSError if the program cannot be started.
     """
 
     def __init__(self, command: Sequence[str], log: Path | None = None) -> None:
@@ -60,7 +62,7 @@ class LineProgram:
         self._received = b""
         self._processes = ChildProcesses()
         self.left_behind: list[str] = []
-        """Names of the child processes that remained after the program's end."""
+        """Names of the child processes that still ran after the program's end."""
         self._errors: IO[bytes] = log.open("ab") if log is not None else _temporary_file()
         try:
             self._process = subprocess.Popen(
@@ -181,7 +183,7 @@ class LineProgram:
         return f"; its last output: {words}" if words else ""
 
     def last_line(self) -> str:
-        """Return the last line of the program's standard error. Return an empty string if there is none."""
+        """Return the last line of the program's standard error. Return an empty string if it has no line."""
         if self.log is not None:
             return last_line_in(self.log)
         size = self._errors.seek(0, os.SEEK_END)
@@ -234,7 +236,7 @@ class LineProgram:
         self.end()
 
     def release(self) -> None:
-        """Close the pipes and files that this process uses for the program. Do not kill the program."""
+        """Close the pipes and files with which this process uses the program. The program continues."""
         self.close_input()
         assert self._process.stdout is not None
         self._process.stdout.close()
