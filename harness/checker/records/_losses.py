@@ -27,6 +27,7 @@ from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import accumulate
 from math import exp, inf, log
 
 from harness.archive.connectivity import Link
@@ -99,17 +100,18 @@ class _LossHistory:
                 self._losses[link].append(loss)
         self._changed_at = [at_s for at_s, _ in requested]
         single = [[1 - link.duplicate for link in conditions.all_links()] for _, conditions in requested]
+        # The smallest and largest probability that a link sends no second copy, from each of `_changed_at` on:
         self._fewest = [min(shares) for shares in single]
         self._most = [max(shares) for shares in single]
-        # The smallest and largest probability that a link sends no second copy, from each of `_changed_at` on.
 
     def range_at(self, link: Link, sent_s: float) -> tuple[float, float]:
         """Return the minimum and maximum probability that the link loses all copies around this time."""
         losses = self._around(self._times[link], self._losses[link], sent_s)
-        least, most = min(losses), max(losses)
         fewest = min(self._around(self._changed_at, self._fewest, sent_s))
+        most = max(self._around(self._changed_at, self._most, sent_s))
         # No copy passes a partition, but a second copy passes a link that loses every first copy.
-        return least * fewest, most if most == 1.0 else most * max(self._around(self._changed_at, self._most, sent_s))
+        highest = max(losses)
+        return min(losses) * fewest, highest if highest == 1.0 else highest * most
 
     def _around(self, times: list[float], values: list[float], sent_s: float) -> list[float]:
         """Return the values that apply around this time. Each value applies from its time on."""
@@ -182,14 +184,19 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
     expected: dict[int, _ExpectedDeliveries] = {}
     for receiver, trace in evidence.traces.items():
         seen = expected[receiver] = _ExpectedDeliveries(dropped=trace.dropped().total())
-        triggers = [run.trigger for run in trace.runs if isinstance(run.trigger, MessageTrigger)]
-        handled = Counter((trigger.sender, trigger.message, trigger.sequence) for trigger in triggers)
         ready = _ReadyTimes(evidence, receiver) if in_virtual_time(trace) else None
+        counted = None if ready is None else ready.counted
+        triggers = [run.trigger for run in trace.runs if isinstance(run.trigger, MessageTrigger)]
+        handled = Counter(
+            (trigger.sender, trigger.message, trigger.sequence)
+            for trigger in triggers
+            if counted is None or trigger.message in counted
+        )
         for sender, by_type in evidence.sendings.items():
             if (sender, receiver) not in known:
                 continue
             for message, by_sequence in by_type.items():
-                if ready is not None and message not in ready.counted:
+                if counted is not None and message not in counted:
                     continue
                 for sequence, sent in by_sequence.items():
                     if len(sent) > 1 and duplicates:
@@ -223,8 +230,9 @@ class _ReadyTimes:
                     since = None
             if since is not None:
                 busy.append((since, inf))
-        self._busy = sorted(busy)
-        self._starts = [from_s for from_s, _ in self._busy]
+        busy.sort()
+        self._starts = [from_s for from_s, _ in busy]
+        self._busy_until = [*accumulate((until_s for _, until_s in busy), max)]
         self._end_s = evidence.end_of(agent_id) or 0.0
 
     def handles(self, sent_s: float) -> bool:
@@ -233,7 +241,7 @@ class _ReadyTimes:
         if arrives_s >= self._end_s:
             return False
         number = bisect_right(self._starts, arrives_s + SAME_TIME_S)
-        return all(until_s < sent_s - SAME_TIME_S for _, until_s in self._busy[max(0, number - 2) : number])
+        return number == 0 or self._busy_until[number - 1] < sent_s - SAME_TIME_S
 
 
 def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterator[Contradiction]:
