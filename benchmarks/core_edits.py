@@ -2,8 +2,8 @@
 
     python -m benchmarks.core_edits [EDIT ...]
 
-`core_edits.yaml` has the edits. An edit is made in a copy of the clone. Each command then plays the
-same mission: five agents lose 30 % of the messages, and 10 % arrive twice. The benchmark prints a row for
+`core_edits.yaml` has the edits. An edit is made in a copy of the clone. Each command then plays the same mission: five
+agents lose 30 % of the messages, 10 % arrive twice, and an operator orders reconciles. The benchmark prints a row for
 each edit: `named` if the command failed and printed the handler, `red` if it only failed, and `green` otherwise.
 With a `green`, the exit status is 1. EDIT is the number of an edit, from 1.
 """
@@ -25,6 +25,7 @@ MISSION = {
     "network": {"loss": 0.3, "duplicate": 0.1},
     "vehicles": {"kind": "none"},
     "events": {"source": "random", "mean_s": 12},
+    "timeline": [{"at_s": at_s, "reconcile": [1, 2, 3, 4, 5]} for at_s in (150, 152)],
     "final_reconcile": True,
 }
 FILES = {
@@ -35,9 +36,13 @@ FILES = {
     "test_edited.py": f"""
 import pytest
 
-@pytest.mark.swarm(**{ ({key: value for key, value in MISSION.items() if key != "duration_s"})!r})
+@pytest.mark.swarm(**{ ({key: MISSION[key] for key in MISSION if key not in ("duration_s", "timeline")})!r})
 def test_swarm(swarm):
-    swarm.run_for(500)
+    swarm.run_for(150)
+    swarm.reconcile(1, 2, 3, 4, 5)
+    swarm.run_for(2)
+    swarm.reconcile(1, 2, 3, 4, 5)
+    swarm.run_for(348)
     swarm.final_reconcile()
 """,
 }

@@ -22,6 +22,7 @@ SCENARIO = {
     "name": "edited core",
     "duration_s": 800,
     "network": {"loss": 0.3, "duplicate": 0.1},
+    "timeline": [{"at_s": at_s, "reconcile": [1, 2, 3, 4, 5]} for at_s in (150, 152)],
     "final_reconcile": True,
 }
 

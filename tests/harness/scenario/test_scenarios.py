@@ -175,6 +175,12 @@ def flapping(run: Simulated, seed: int) -> None:
     assert distinct_chains(run) == 1
 
 
+def ordered_twice(run: Simulated, seed: int) -> None:
+    for agent in (1, 4):
+        runs = [run for run in run.evidence.traces[agent].runs if run.handler == "reconcile_begin"]
+        assert [run.branch for run in runs if run.t == 202] == ["already in progress"]
+
+
 def attrition(run: Simulated, seed: int) -> None:
     losses = survival(run.evidence).losses
     assert [(loss.at_s, loss.what, loss.vehicles) for loss in losses] == [
@@ -351,6 +357,7 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
         late_joiner,
         asymmetric_links,
         flapping,
+        ordered_twice,
         shared_channel,
         attrition,
         forced_tie,

@@ -4,13 +4,16 @@
 """
 
 from dataclasses import replace
+from itertools import zip_longest
 from random import Random
 from typing import Any
 
 import pytest
 
+from harness.archive.vocabulary import TIMER_OF
 from harness.checker.reference.reference_agent import ReferenceAgent
 from harness.checker.reference.state import Settings as ReferenceSettings
+from harness.checker.steps.deviation import StepDeviation
 from harness.proof._proof import prove
 from harness.proof.bounds import Bounds
 from tests.harness.checker.reference.random_inputs import LIFE, ROSTER, Inputs
@@ -19,6 +22,7 @@ from ucp.settings import ALTERNATIVES, Settings
 from ucp.store import StoredState
 from ucp.trace import HandlerRun
 
+HANDLER_OF = {timer: handler for handler, timer in TIMER_OF.items()}
 INPUTS = 2_500
 """Random inputs for each of 40 seeds."""
 
@@ -39,6 +43,23 @@ def runs_of(agent: Agent | ReferenceAgent) -> list[HandlerRun]:
     return [replace(entry, input=None) for entry in agent.trace() if isinstance(entry, HandlerRun)]
 
 
+def first_difference(did: list[HandlerRun], should: list[HandlerRun]) -> str | None:
+    """Return a sentence about the first handler run that differs. Return None if all runs are equal."""
+    for before, (mine, theirs) in zip([None, *did], zip_longest(did, should), strict=False):
+        if mine is None or theirs is None or mine.handler != theirs.handler:
+            after = f"after {before.handler} of Algorithm {before.algorithm}: " if before else ""
+            return f"{after}it ran {mine and mine.handler}; it should have run {theirs and theirs.handler}"
+        if mine != theirs:
+            return StepDeviation(1, 0, mine.t, mine.handler, run=mine, expected=theirs).sentence(str)
+    return None
+
+
+def next_handler(agent: Agent) -> str:
+    """Return the handler of the timer that expires next."""
+    running = {timer.deadline: timer.name for timer in agent.state.timers if timer.deadline is not None}
+    return HANDLER_OF[running[min(running)]] if running else "no timer"
+
+
 @pytest.mark.parametrize("seed", range(40))
 def test_core_and_reference_agree_on_random_inputs_in_random_states(seed: int) -> None:
     rng = Random(seed)
@@ -52,12 +73,14 @@ def test_core_and_reference_agree_on_random_inputs_in_random_states(seed: int) -
             if stored is not None:
                 core.boot(stored, now)
                 reference.boot(stored, now)
-        assert reference.next_timer() == core.next_timer()
+        assert reference.next_timer() == core.next_timer(), (
+            f"input {number}: {next_handler(core)} is due too soon or late"
+        )
         now, give = inputs.draw(core, number, now)
         give(core)
         give(reference)
         did, should = runs_of(core), runs_of(reference)
-        assert did == should, f"input {number}"
+        assert did == should, f"input {number}: {first_difference(did, should)}"
         steps += len(did)
         assert core.messages_to_send() == reference.messages_to_send()
         stored = StoredState.of(core.state)
