@@ -15,8 +15,8 @@ from harness.report.chain_tree import ChainTreeMark
 
 FONT_SIZE = 13
 CHARACTER_WIDTH = 0.66 * FONT_SIZE
-"""Upper limit for the width in pixels of a digit or lower-case letter in common system fonts (0.64 em in DejaVu Sans
-and Verdana).
+"""Upper limit for the width of a digit or lower-case letter in common system fonts, in pixels. DejaVu Sans and Verdana
+have 0.64 em.
 """
 SMALL_FONT_SIZE = 12
 BOX_HEIGHT = 26
@@ -31,8 +31,8 @@ MARGIN = 8
 
 @dataclass(slots=True)
 class PlacedMark:
-    """A mark of the picture with its position in CSS pixels. `x` is its centre, and `y` is its top. `y` increases
-    downwards.
+    """A mark of the picture with its position in CSS pixels. `x` is the horizontal centre of the mark, and `y` is its
+    upper edge. `y` increases downwards.
     """
 
     mark: ChainTreeMark
@@ -46,7 +46,7 @@ class PlacedMark:
 
     @property
     def rows(self) -> range:
-        """The rows that the mark occupies, including the gap above the mark."""
+        """The number of rows that the mark occupies, with the gap above the mark."""
         return range(self.row, self.row + math.ceil((self.height + ROW_GAP) / ROW_HEIGHT))
 
     def walk(self) -> Iterator["PlacedMark"]:
@@ -68,7 +68,9 @@ class ChainTreeLayout:
 
 
 class _SubtreeOutline:
-    """The outline of a subtree: its leftmost and rightmost position in each row, relative to its root."""
+    """The outline of a subtree: the leftmost and the rightmost position in each row, as distances from the root of the
+    subtree.
+    """
 
     def __init__(self) -> None:
         self.shift = 0.0
@@ -79,8 +81,8 @@ class _SubtreeOutline:
             self._rows[row] = (-width / 2 - self.shift, width / 2 - self.shift)
 
     def distance_to(self, right: "_SubtreeOutline", gap: float = COLUMN_GAP) -> float:
-        """Return the distance at which the root of the subtree `right` must be placed on the right of this root. It is
-        the smallest distance that leaves `gap` between the two subtrees.
+        """Return the distance at which the root of the subtree `right` must be placed on the right of this root. This
+        is the smallest distance that keeps `gap` free between the two subtrees.
         """
         shared = self._rows.keys() & right._rows.keys()
         return max(
@@ -89,8 +91,8 @@ class _SubtreeOutline:
         )
 
     def merged_with(self, other: "_SubtreeOutline", x: float) -> "_SubtreeOutline":
-        """Merge two outlines, and return the result. The root of `other` is at `x`, relative to this root. Afterwards,
-        neither of the two outlines may be used.
+        """Merge two outlines, and return the result. The root of `other` is `x` to the right of this root. The caller
+        may not use the two old outlines again.
         """
         other.shift += x
         large, small = (self, other) if len(self._rows) >= len(other._rows) else (other, self)
@@ -157,7 +159,9 @@ def _width(characters: int) -> float:
 
 
 def _offsets(placed_marks: list[PlacedMark]) -> dict[int, float]:
-    """Return the horizontal distance between each mark and the mark below it. The keys are the values of `id(mark)`."""
+    """Return the horizontal distance between each mark and the mark below it. The keys are the results of
+    `id(mark)`.
+    """
     offsets: dict[int, float] = {}
     outlines: dict[int, _SubtreeOutline] = {}
     beside = {id(item.beside) for item in placed_marks}

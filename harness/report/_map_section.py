@@ -1,4 +1,6 @@
-"""Draw the map in the report: the flight paths of the vehicles, and small maps of the swarm at important moments."""
+"""Draw the maps in the report: one map with the flight paths of the vehicles, and small maps that show the swarm at
+important moments.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,26 +28,26 @@ from harness.scenario.changes import RANGE
 from sitl.vehicle import VehicleType
 
 MOVES_M = 1.0
-"""Number of metres. A vehicle that stays within this distance counts as standing still."""
+"""Metres. A vehicle that stays within this distance counts as standing still."""
 MOMENTS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class MapMoment:
-    """A small map that shows the swarm at one moment.
-
-    `at` is the time, `what` is the event at this time or "", and `network` is the state of the network.
-    """
+    """A small map that shows the swarm at one moment."""
 
     at: str
+    """The time of the moment."""
     what: str
+    """The event at this time, or ""."""
     network: str
+    """The groups of connected vehicles at this time."""
     picture: Markup
 
 
 @dataclass(frozen=True, slots=True)
 class MapSection:
-    """The map with its legend. If it cannot be drawn, `tracks` is None and `notes` contains the reason."""
+    """The map with its legend. If the map cannot be drawn, `tracks` is None and `notes` contains the reason."""
 
     tracks: Markup | None
     legend: list[tuple[Markup, str]]
@@ -102,7 +104,8 @@ def _drawn(
 def _notable_moments(
     known: Sequence[NetworkDivision], network: Connectivity, tracks: VehicleTracks, end_s: float
 ) -> list[tuple[float, NetworkDivision | None]]:
-    """Return up to `MOMENTS` + 1 moments to show. Each moment has the groups of vehicles that are connected then.
+    """Return up to `MOMENTS` + 1 moments that the report shows on small maps. Each moment comes with the groups of
+    vehicles that are connected at that time.
 
     The moments are the start, the end, the most important network changes and the time of the worst losses. The
     importance of a change is the number of affected vehicles multiplied by the duration of the new state.
@@ -179,7 +182,9 @@ def _legend(flown: Sequence[FlightPath], *, rebooted: bool) -> list[tuple[Markup
 
 
 def _in_words(losses: Collection[float]) -> str:
-    """Describe the losses by their smallest and largest rate. Return an empty text if both are negligible."""
+    """Describe the losses of the links by the smallest and the largest loss rate. Return an empty text if both are
+    negligible.
+    """
     least, most = min(losses, default=0.0), max(losses, default=0.0)
     if not quality(most):
         return ""
@@ -188,8 +193,8 @@ def _in_words(losses: Collection[float]) -> str:
 
 
 def _legend_of_moments(moments: Sequence[MapMoment], types: set[VehicleType]) -> list[tuple[Markup, str]]:
-    """Return the part of the legend about links with losses. If the swarm has several types of vehicles, it also
-    explains their shapes.
+    """Return the part of the legend that explains links with losses. If the swarm has several types of vehicles, this
+    part also explains the shape of each type.
     """
     drawn = "".join(moment.picture for moment in moments)
     entries = [

@@ -14,7 +14,7 @@ from harness.report import _network_strip
 from harness.report.map_parts import divisions
 
 MOST_PAIRS = 10
-"""Maximum number of rows for pairs of vehicles. The pairs with the largest losses are kept."""
+"""Maximum number of table rows about pairs of vehicles. The table keeps the pairs with the largest losses."""
 NAMED_PAIRS = 3
 REASONS = {
     "collision": "collision with other frames",
@@ -25,7 +25,7 @@ REASONS = {
     "queue": "full queue",
     "too_long": "message too long for the radio",
 }
-"""Reason of a loss on a shared channel -> description."""
+"""Reason for the loss of a message on a shared radio channel -> description."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +58,8 @@ def strip(
 
 
 def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.ConditionSpan]:
-    """Return the load of the shared channel over time. Neighbouring intervals with the same load in percent are
-    joined.
+    """Return the load of the shared radio channel over time. Neighbouring intervals whose loads round to the same
+    percentage are joined.
     """
     loads = [round(share, 2) for share in channel.load] + [0.0]
     changes = [number for number, load in enumerate(loads) if number == 0 or load != loads[number - 1]]
@@ -68,7 +68,7 @@ def _load(channel: ChannelRecord, end_s: float) -> list[_network_strip.Condition
 
 
 def channel(record: RunRecord) -> list[str]:
-    """Return sentences about the shared radio channel: its model, its load, and the reasons for losses."""
+    """Return sentences about the shared radio channel: its model, its load, and the reasons why it lost messages."""
     if (found := record.channel) is None:
         return []
     mean = sum(found.load) * found.load_interval_s / record.mission_s if record.mission_s else 0.0
@@ -156,7 +156,8 @@ def _fault_detail(fault: FaultRecord) -> str:
 
 
 def _command_detail(command: OperatorCommand) -> str:
-    """Return a text about a command, such as "vehicle 2: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3 times until 2:05".
+    """Return a text that describes an operator command, such as "vehicle 2: MAV_CMD_DO_SET_MODE; param1 1, param2 6; 3
+    times until 2:05".
 
     Parameters with the value 0 are left out.
     """

@@ -1,6 +1,7 @@
 """Draw the network conditions over mission time: partitions, losses, and a tick for each fault.
 
-Horizontal positions are percentages of the width. The strip therefore fits any screen, and its text is never scaled.
+Horizontal positions are percentages of the picture's width. The picture therefore fits any screen, and the text in it
+is never scaled.
 """
 
 from collections.abc import Sequence
@@ -23,12 +24,12 @@ class ConditionSpan:
     to_s: float
     text: str
     level: float = 1.0
-    """The filled share of the row's height, from 0 to 1."""
+    """Height of the filled part of the row, as a share of the row's height from 0 to 1."""
 
 
 def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[ConditionSpan]:
-    """Convert changes to intervals. A change is (at_s, text, level), and lasts until the next change. A change to level
-    0 gives no interval.
+    """Convert changes of a network condition to intervals. A change is a tuple (at_s, text, level), and its level
+    applies until the next change. A change to level 0 gives no interval.
     """
     spans: list[ConditionSpan] = []
     in_time = sorted(changes, key=lambda change: change[0])
@@ -40,7 +41,7 @@ def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[Con
 
 
 def draw(lanes: Sequence[tuple[str, list[ConditionSpan]]], ticks: Sequence[tuple[float, str]], end_s: float) -> Markup:
-    """Draw the rows from top to bottom. `ticks` are pairs (at_s, text)."""
+    """Draw the rows of the picture from top to bottom. `ticks` contains a pair (at_s, text) for each fault."""
     parts: list[Markup] = []
     for number, (name, spans) in enumerate(lanes):
         parts.append(
@@ -71,7 +72,7 @@ def draw(lanes: Sequence[tuple[str, list[ConditionSpan]]], ticks: Sequence[tuple
 
 
 def _span(lane: str, span: ConditionSpan, y: float, end_s: float) -> Markup:
-    """Draw an interval as a nested <svg> element, which cuts off a text that is too long."""
+    """Draw an interval as a nested <svg> element. This element cuts off a text that is too long for the interval."""
     filled = max(2.0, _LANE * span.level)
     return Markup(
         '<svg x="{}" y="{}" width="{}" height="{}"><title>{}</title><rect class="span" y="{:.1f}" width="100%"'

@@ -1,4 +1,6 @@
-"""Describe the agents on other computers in the report: clocks, connections, and times in which they were cut off."""
+"""Describe agents that ran on other computers: their clocks, their connections, and the times when they were cut off
+from the swarm.
+"""
 
 from collections.abc import Iterator
 
@@ -27,7 +29,7 @@ def sentences(record: RunRecord) -> list[str]:
 
 
 def _workers(record: RunRecord) -> Iterator[str]:
-    """Yield a sentence about each worker of a cluster that played agents."""
+    """Yield a sentence about each worker (a computer of a cluster) that ran agents."""
     played: dict[str, dict[int, RemoteRecord]] = {}
     for agent_id, found in record.remote.items():
         if found.worker is not None:

@@ -35,7 +35,7 @@ class ReportSource:
 
     @cached_property
     def traces(self) -> dict[int, Trace]:
-        """The traces by agent. In large traces, handler runs that only received a message are left out."""
+        """Agent ID -> the trace of the agent. Large traces lack the handler runs that only received a message."""
         traces = self.archive.traces
         return {agent: trace.skimmed() for agent, trace in traces.items()} if self.archive.large else traces
 
@@ -54,7 +54,9 @@ class ReportSource:
 
     @property
     def unmet_expectations(self) -> list[str]:
-        """Sentences about expected results that the run did not show. The expected verdicts are not included."""
+        """Sentences about expected results that the run did not show. Sentences about the expected verdicts are not
+        included.
+        """
         if not self.record.characteristics:
             return []
         kinds = self.record.unmet_expectations(self.chains, self.top_chain_hashes)
@@ -62,12 +64,12 @@ class ReportSource:
 
     @property
     def chains_missing(self) -> list[str]:
-        """Sentences about agents without a usable chain export, and about damaged exports."""
+        """Sentences about agents whose chain export is missing or unusable, and about damaged exports."""
         return [*_swarm_section.missing(self.archive), *map(self.archive.within, self.exports.errors)]
 
     @property
     def files_missing(self) -> list[str]:
-        """Sentences about missing or damaged files. Chain exports are left out, because `chains_missing` describes
+        """Sentences about missing or damaged files. Chain exports are not included, because `chains_missing` describes
         them.
         """
         exports = set(self.exports.errors)

@@ -14,8 +14,8 @@ MAX_ROWS = 500
 
 @dataclass(frozen=True, slots=True)
 class InjectionRow:
-    """A table row about one result of an injection. `message` is a message type. For refused datagrams, it is the
-    reason of the refusal.
+    """A table row about one result of an injected message. `message` is the type of this message. If agents refused a
+    datagram, `message` is the reason.
     """
 
     at: str
@@ -29,14 +29,16 @@ class InjectionRow:
 
 @dataclass(frozen=True, slots=True)
 class RogueSection:
-    """The table of injections. `left_out` is the number of rows that exceed `MAX_ROWS` and are omitted."""
+    """The table of injected messages. `left_out` is the number of rows that the table omits, because it has at most
+    `MAX_ROWS` rows.
+    """
 
     rows: list[InjectionRow]
     left_out: int
 
 
 def section(injections: Sequence[RogueInjection]) -> RogueSection | None:
-    """Return the table of injections. Return None if the record contains no injection."""
+    """Return the table of injected messages. Return None if no message was injected in the run."""
     rows = [row for injection in injections for row in _rows(injection)]
     return RogueSection(rows[:MAX_ROWS], max(0, len(rows) - MAX_ROWS)) if rows else None
 

@@ -36,7 +36,9 @@ EVIDENCE_SHOWN = 3
 LONG_TEXT = 240
 SCENARIO_FILE = "scenario.yaml"
 MAX_SCENARIO = 100_000
-"""Maximum number of characters of the scenario that the page shows. The complete scenario is in the run directory."""
+"""Maximum number of characters of the scenario that the page shows. The run directory contains the complete
+scenario.
+"""
 
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 
@@ -88,7 +90,7 @@ def draw(left: ReportSource) -> str:
 
 
 def _again(left: ReportSource, scenario: str) -> str:
-    """Return the command that repeats the run. Return an empty text if the record of the run does not contain the
+    """Return the command that repeats the run. Return an empty text if the run directory does not contain the
     scenario.
     """
     if not scenario:
@@ -100,8 +102,8 @@ def _again(left: ReportSource, scenario: str) -> str:
 def _pictures(
     exports: Mapping[int, Export], before: Mapping[int, Export], ink: Mapping[int, AgentColours]
 ) -> list[dict[str, Any]]:
-    """Return two pictures of the chains: at the end of the mission, and after the final reconcile. If the chains are
-    equal, return one picture.
+    """Return two pictures of the chains: one shows them at the end of the mission, the other after the final reconcile.
+    If the chains did not change between these times, return one picture.
     """
     if not exports:
         return []

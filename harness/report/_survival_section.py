@@ -12,7 +12,7 @@ from harness.report.chain_tree import ranges
 
 @dataclass(frozen=True, slots=True)
 class LostBlockRow:
-    """A table row about a block that a lost vehicle completed, or that no vehicle holds any more."""
+    """A table row about a block that a lost vehicle completed, or that no vehicle holds any longer."""
 
     name: str
     ink: AgentColours | None
@@ -26,7 +26,9 @@ class LossRow:
     what: str
     vehicles: str
     counts: list[str]
-    """Numbers of blocks: completed before the loss, survived, destroyed by the loss, and missing at the end."""
+    """Four numbers of blocks: completed before the loss, still held after the loss, destroyed by the loss, and missing
+    at the end.
+    """
     blocks: list[LostBlockRow]
 
 

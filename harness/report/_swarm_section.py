@@ -16,7 +16,7 @@ from harness.report.chain_tree import holders, ranges
 IN_THE_RECORD_ONLY = {"binary_sha256", "parameters_file"}
 """Fields of a vehicle that are in run.json but not in the table."""
 MAX_PARAMETERS = 10
-"""Maximum number of vehicle parameters in one table cell."""
+"""Maximum number of vehicle parameters that one table cell shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,8 @@ VEHICLE_FAULTS_KEY = "befallen"
 
 
 def agents_table(archive: RunArchive, ink: Mapping[int, AgentColours]) -> dict[str, object]:
-    """Return the column titles and a row for each agent with its vehicle. A row consists of agent ID, colour, and the
-    cells by column.
+    """Return the column titles, and one row for each agent with its vehicle. A row consists of the agent ID, a colour,
+    and the cells by column title.
     """
     record, exports = archive.record, archive.exports.by_agent
     mixed = bool(programs(record))

@@ -25,7 +25,7 @@ Figure = Callable[[ReplicationFigures], float | None]
 
 @dataclass(frozen=True, slots=True)
 class TimelineChart:
-    """A chart with its legend. Each element of `lines` is a sample of a line, and its meaning."""
+    """A chart with its legend. Each entry of `lines` contains a sample of a line and the meaning of this line."""
 
     name: str
     lines: list[tuple[Markup, str]]
@@ -41,14 +41,14 @@ _CHARTS: tuple[tuple[str, tuple[tuple[str, Figure], ...]], ...] = (
     ("copies in chains", (("mean", lambda spread: spread.copies_mean), ("fewest", lambda spread: spread.copies_min))),
 )
 _LINE_CLASSES = ("broken", "whole")
-"""CSS classes of the two lines in a chart. A chart with one line uses the last class."""
+"""CSS classes of the two lines in a chart. If a chart has only one line, the line has the last class."""
 
 
 def draw(
     spreads: Sequence[ReplicationFigures], faults: Sequence[FaultRecord], shades: Sequence[PartitionShade], end_s: float
 ) -> list[TimelineChart]:
-    """Return a chart for each group of numeric results. `spreads` contains the copies of blocks over time. It has at
-    least one entry.
+    """Return a chart for each group of numeric results. `spreads` contains the numbers of copies of blocks over time,
+    with at least one entry.
     """
     moments = thin_states(spreads, end_s)
     behind = draw_background(shades, faults, HEIGHT)
@@ -56,9 +56,10 @@ def draw(
 
 
 def thin_states(spreads: Sequence[ReplicationFigures], end_s: float) -> Sequence[ReplicationFigures]:
-    """Shorten a long list of states to the states that are visible when the picture shows the whole run.
+    """Shorten a long list of states.
 
-    For each column of the picture, the result keeps the last state and the state with the shortest mutual chain.
+    The result contains only the states that are visible when the picture shows the whole run. For each column of the
+    picture, the result contains the last state and the state with the shortest mutual chain.
     """
     if len(spreads) <= MAX_MOMENTS:
         return spreads
@@ -114,7 +115,7 @@ def _chart(
 
 
 def _steps(moments: Sequence[ReplicationFigures], figure: Figure, per_px: float, end_s: float) -> str:
-    """Return a stepped line as an SVG path. It starts at the first known value."""
+    """Return a line with steps as an SVG path. The line starts at the first known value."""
     path = ""
     last: float | None = None
     for moment in moments:
@@ -133,8 +134,8 @@ def _tip(moment: ReplicationFigures, figures: Sequence[tuple[str, Figure]], name
 
 CYCLE_HEIGHT = 34
 MAX_ROUNDS = 400
-"""Maximum number of brackets that mark repetitions. A larger number could not be distinguished, so only the last
-brackets are drawn.
+"""Maximum number of brackets that mark repetitions. If there are more repetitions, only the last ones get brackets,
+because nobody could distinguish all of them.
 """
 MOST_ROUNDS = 1_000_000
 MAX_TEXT = 1000

@@ -46,7 +46,7 @@ OUTCOMES = {
 """Outcome of a vote -> description."""
 PHASE_HEIGHTS = {"phase 1": 4, "phase 2": 7, "phase 3": 10, "finalize": 2}
 BAR_HEIGHT = 7
-"""Height in pixels of a reconcile that is drawn without its phases, because there are too many."""
+"""Height in pixels of a reconcile that has too many phases to draw them."""
 
 MAX_BARS = 6000
 MAX_COMMITS = 4000
@@ -160,7 +160,7 @@ def _legend(
 
 
 def block_label(block: str, names: Mapping[str, str]) -> str:
-    """Return the name of a block. If no export contains the block, use the first 12 digits of its hash."""
+    """Return the name of a block. If no export contains the block, return the first 12 digits of its hash."""
     return names.get(block, block[:12])
 
 
@@ -173,7 +173,7 @@ def phases_in_words(reconcile: AgentReconcile) -> str:
 
 
 def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[BlockCommit]]:
-    """Combine commits of an agent that are close in time, so that at most about `MAX_COMMITS` marks remain."""
+    """Combine commits of the same agent that are close in time. At most about `MAX_COMMITS` marks remain."""
     groups = [[commit] for commit in commits]
     within_s = end_s / 4000
     while len(groups) > MAX_COMMITS:
@@ -188,15 +188,15 @@ def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[Blo
 
 
 def _longest(spans: Sequence[Span]) -> list[Span]:
-    """Return the `MAX_BARS` longest intervals in order of time. Of equally long intervals, the earlier ones are
-    kept.
+    """Return the `MAX_BARS` longest intervals in order of time. Among intervals with equal lengths, the earlier ones
+    are preferred.
     """
     kept = sorted(spans, key=lambda span: (round(span.start_s - span.end_s, 3), span.start_s))[:MAX_BARS]
     return sorted(kept, key=attrgetter("start_s"))
 
 
 def _css_class(outcome: str) -> str:
-    """Return the CSS class of a vote with this result. A result other than approval and disapproval counts as
+    """Return the CSS class of a vote with this result. Any result other than approval and disapproval counts as
     undecided.
     """
     return {"approved": "approved", "not approved": "refused"}.get(outcome, "undecided")
@@ -263,8 +263,8 @@ def _commit(group: Sequence[BlockCommit], lane_height: int, names: Mapping[str, 
 
 
 def _tie(tie: Phase2Tie, lane_height: int) -> Markup:
-    """Draw a tie as a dot. The dot is a line of length 0 with round ends, so it stays round when the picture is
-    stretched.
+    """Draw the mark of a tied vote as a dot. The dot is a line with length 0 and round ends, so that it stays round
+    when the picture is stretched.
     """
     return Markup('<path class="tie" d="M{} {}h0"><title>{}</title></path>').format(
         format_number(tie.at_s),
@@ -274,7 +274,9 @@ def _tie(tie: Phase2Tie, lane_height: int) -> Markup:
 
 
 def _running_background(agent: int, faults: Sequence[FaultRecord], lane_height: int, end_s: float) -> list[Markup]:
-    """Draw the background of an agent's row while the agent runs. While the agent is paused, draw a broken line."""
+    """Draw the background of an agent's row for the times when the agent runs. For the times when the agent is paused,
+    draw a broken line.
+    """
     ran: list[tuple[float, float]] = []
     paused: list[tuple[float, float]] = []
     since_s: float | None = 0.0

@@ -18,7 +18,7 @@ TICK_HEIGHT = 22
 
 @dataclass(frozen=True, slots=True)
 class PartitionShade:
-    """An interval of mission time during which the network is partitioned, with a description of the partition."""
+    """An interval of mission time in which the network is partitioned, with a description of the partition."""
 
     start_s: float
     end_s: float
@@ -49,14 +49,16 @@ def plot(view: Iterable[Markup], pinned: Iterable[Markup], height: float, end_s:
 
 
 def pin(at_s: float, end_s: float, y: float, shape: Markup) -> Markup:
-    """Place a shape at this mission second. The shape keeps its size when the user zooms."""
+    """Draw a shape at this mission second. The shape keeps its size when the user zooms."""
     return Markup('<svg class="pin" data-at="{}" x="{}%" y="{}">{}</svg>').format(
         format_number(at_s), format_number(100 * at_s / end_s), n(y), shape
     )
 
 
 def draw_background(shades: Sequence[PartitionShade], faults: Sequence[FaultRecord], height: float) -> Markup:
-    """Draw the background: shades for partitions, and vertical lines for network changes and faults."""
+    """Draw the background of the picture: coloured areas for partitions, and vertical lines for network changes and
+    faults.
+    """
     parts = [
         Markup('<rect class="shade" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(
             format_number(shade.start_s),

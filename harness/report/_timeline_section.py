@@ -45,7 +45,9 @@ MAX_FAULTS = 500
 
 @dataclass(frozen=True, slots=True)
 class TimelineTable:
-    """The rows of a table. `left_out` is the number of rows that exceed `MAX_ROWS` and are omitted."""
+    """The rows of a table. `left_out` is the number of rows that the table omits, because it has at most `MAX_ROWS`
+    rows.
+    """
 
     rows: list[list[str]]
     left_out: int
@@ -53,8 +55,8 @@ class TimelineTable:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """The timeline picture. `messages` is JSON from which the script of the page draws arrows. It is "null" if the page
-    shows no messages.
+    """The timeline picture. `messages` is a JSON text, from which the script of the page draws arrows. The text is
+    "null" if the page shows no messages.
     """
 
     end_s: float
@@ -129,7 +131,7 @@ def section(left: ReportSource, names: Mapping[str, str]) -> TimelineSection | N
 
 
 def end_s(left: ReportSource) -> float:
-    """Return the mission second at which the timeline ends."""
+    """Return the mission second at which the timeline picture ends."""
     faults = possible_faults(left.record.faults)
     return max(end_of_traces(left.traces), *(fault.at_s for fault in faults), _planned_s(left.record), 1.0)
 
@@ -142,7 +144,9 @@ def _planned_s(record: RunRecord) -> float:
 
 
 def _shades(network: Connectivity, end_s: float) -> tuple[list[PartitionShade], int]:
-    """Return the longest partitions, at most `MAX_SHADES`, and the number of omitted shorter partitions."""
+    """Return the `MAX_SHADES` longest partitions of the network, and the number of shorter partitions, which are
+    omitted.
+    """
     known = divisions(network.states)
     ends = [*(division.at_s for division in known[1:]), end_s]
     shades = [
@@ -213,8 +217,8 @@ def _reconcile_row(reconcile: AgentReconcile) -> list[str]:
 
 
 def _in_words(history: MissionHistory, agents: int, end_s: float, unknown: bool) -> str:
-    """Return a text that describes the timeline. If `unknown` is true, the text adds that traces contain undefined
-    names and may hide events.
+    """Return a text that describes the timeline. If `unknown` is true, the text also warns that traces contain unknown
+    names, so the timeline may lack events.
     """
     approved = sum(vote.outcome == "approved" for vote in history.votes)
     return (

@@ -1,4 +1,4 @@
-"""List the programs that ran as agents in a run, if any of them is not the harness's own agent."""
+"""List the programs that ran as agents in a run. The list is empty if all agents ran the harness's own program."""
 
 import shlex
 from collections.abc import Iterable, Mapping
@@ -12,14 +12,13 @@ from harness.scenario import Scenario
 
 @dataclass(frozen=True)
 class AgentProgram:
-    """The program that one or more agents ran. `command` is None for the harness's own agent.
-
-    `version` is the version that the agents reported, or None.
-    """
+    """The program that one or more agents ran."""
 
     agents: tuple[int, ...]
     command: tuple[str, ...] | None
+    """None for the harness's own program."""
     version: str | None
+    """The version that the agents reported, or None."""
 
     @property
     def in_words(self) -> str:
@@ -33,16 +32,15 @@ class AgentProgram:
 
 
 def programs(record: RunRecord) -> list[AgentProgram]:
-    """Return the programs, ordered by the lowest agent ID that ran each program. The list is empty if all agents ran
-    the harness's own program.
+    """Return the programs in the order of the lowest agent ID that ran each program. The list is empty if all agents
+    ran the harness's own program.
     """
     return [] if record.scenario is None else asked_for(record.scenario, record.agents)
 
 
 def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[AgentProgram]:
-    """Return the programs that a scenario names for its agents.
-
-    If the scenario was played, `agents` are the recorded agents.
+    """Return the programs that a scenario names for its agents. After a run of the scenario, `agents` contains the
+    agents that the run recorded.
     """
     if not scenario.foreign:
         return []

@@ -17,7 +17,7 @@ from harness.archive.exports import Export, ExportedBlock
 KEPT_AT_EACH_END = 3
 """Number of blocks that are drawn before and after an ellipsis."""
 FEWEST_HIDDEN = 3
-"""Minimum number of blocks that an ellipsis hides. For fewer blocks, it would save no space."""
+"""Minimum number of blocks that an ellipsis replaces. An ellipsis for fewer blocks would save no space."""
 
 OVAL_LINE_CHARACTERS = 14
 
@@ -28,7 +28,7 @@ class ChainTreeNode:
 
     block: ExportedBlock | None
     holders: list[int] = field(default_factory=list)
-    """Agents whose chains contain this block after the same earlier blocks."""
+    """The IDs of the agents whose chains contain this block after the same earlier blocks."""
     ends: list[int] = field(default_factory=list)
     """Agents whose chains end at this block."""
     children: dict[str, "ChainTreeNode"] = field(default_factory=dict)
@@ -52,7 +52,7 @@ class ChainTreeMark:
     holders: list[int]
     children: list["ChainTreeMark"] = field(default_factory=list)
     beside: "ChainTreeMark | None" = None
-    """The oval beside the box of a block at which some chains end and others continue. None without such an oval."""
+    """The oval beside a block at which some chains end and other chains continue. None if there is no such oval."""
 
 
 def chain_tree(exports: Mapping[int, Export]) -> ChainTreeNode:
@@ -69,7 +69,7 @@ def chain_tree(exports: Mapping[int, Export]) -> ChainTreeNode:
 
 
 def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
-    """Return block hash -> the agents whose chains contain the block."""
+    """Return a mapping from block hashes to the agents whose chains contain the block."""
     held_by: dict[str, list[int]] = {}
     for agent_id, export in sorted(exports.items()):
         for block_hash in dict.fromkeys(export.chain_of_block_hashes):
@@ -78,10 +78,8 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool) -> ChainTreeMark:
-    """Return the mark of the inception block, with all other marks above it. `names` contains the names of blocks by
-    hash.
-
-    The marks above a block are ordered by the lowest agent ID that they concern.
+    """Return the mark of the inception block. It leads to all other marks. `names` maps the hashes of blocks to their
+    names. The marks above a block are ordered by the lowest ID of the agents whose chains they show.
     """
     root = ChainTreeMark("block", [inception], ["inception block"], inception.holders)
     to_grow = [(root, inception)]
@@ -103,8 +101,8 @@ def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool)
 def _stretch(
     below: ChainTreeMark, first: ChainTreeNode, names: Mapping[str, str], abridged: bool
 ) -> tuple[ChainTreeMark, ChainTreeNode]:
-    """Add marks for consecutive blocks above the mark `below`. The first block is `first`. The last one is where the
-    tree branches or a chain ends.
+    """Add marks for consecutive blocks above the mark `below`. These blocks begin with `first`, and end with the next
+    block at which the tree branches or a chain ends.
 
     Return the topmost mark and its node.
     """
@@ -134,9 +132,8 @@ def _name(node: ChainTreeNode, names: Mapping[str, str]) -> str:
 
 
 def ranges(agent_ids: list[int]) -> list[str]:
-    """Return agent IDs as ranges: [1, 2, 3, 5, 6] gives "1 to 3", "5", "6", with an en dash for "to".
-
-    Three or more consecutive IDs become a range.
+    """Return agent IDs as texts. Three or more consecutive IDs become one text with an en dash: [1, 2, 3, 5, 6] gives
+    "1 to 3", "5", "6", with an en dash in place of "to".
     """
     runs: list[list[int]] = []
     for agent_id in sorted(agent_ids):

@@ -34,10 +34,11 @@ _DOTS_LENGTH = 2 * _DOT_SPACING + 1  # three dots; the last one lies just before
 
 
 class ChainTreePicture:
-    """A picture of the tree of chains. It can be drawn in an abridged form or with all blocks.
+    """A picture of the tree of chains.
 
-    `key` makes the identifiers unique on a page with several pictures. `names` maps block hashes to names, if the
-    caller knows more names than these exports contain.
+    The picture can be drawn with all blocks, or without the middle of long sequences of blocks. `key` makes the
+    identifiers unique on a page with several pictures. `names` maps the hashes of blocks to names, if the caller knows
+    more names than the exports contain.
     """
 
     def __init__(
@@ -56,11 +57,11 @@ class ChainTreePicture:
         self.hidden = sum(
             len(placed.mark.nodes) for placed in self._abridged.root.walk() if placed.mark.kind == "ellipsis"
         )
-        """Number of blocks that the abridged form omits."""
+        """Number of blocks that the short form of the picture omits."""
 
     def draw(self, form: Literal["abridged", "full"]) -> Markup:
-        """Return the picture as SVG. The page that contains it must include STYLE, and may show both forms of the
-        picture.
+        """Return the picture as SVG. The page that contains the picture must include STYLE. The page may show both
+        forms of the picture.
         """
         if form == "abridged":
             return self._draw(self._abridged, form, Markup(""))
@@ -175,8 +176,8 @@ class ChainTreePicture:
 
 
 def _path(below: PlacedMark, above: PlacedMark) -> str:
-    """Return an SVG path from the top of one mark to the bottom of the mark above it. The path has two corners if the
-    marks are not aligned.
+    """Return an SVG path from the top of one mark to the bottom of the mark above it. If the marks are not aligned, the
+    path has two corners.
     """
     start, end = below.y, above.y + above.height
     if above.x == below.x:

@@ -50,7 +50,9 @@ def title(record: RunRecord) -> str:
 
 
 def summary(record: RunRecord, exports: Exports) -> list[str]:
-    """Return short phrases about the result, the swarm, the main settings, and the place and time of the run."""
+    """Return short phrases about the run: its result, the swarm, the main settings, and the place and time of
+    the run.
+    """
     scenario = record.scenario
     parts: list[str] = [] if record.outcome == "running" else [record.outcome]
     agents = len({*record.known_agents, *exports.by_agent})
@@ -91,8 +93,8 @@ def figures(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def cut_off(record: RunRecord) -> list[str]:
-    """Return a sentence for each time in which remote agents were cut off, because their connections were lost. The
-    agents of one worker have one sentence together.
+    """Return a sentence for each time when agents on other computers were cut off, because their connections were lost.
+    Agents of the same worker share a sentence.
     """
     lines = []
     for computer, agents in _by_computer(record).items():
@@ -125,7 +127,7 @@ def agents_in_words(agent_ids: Iterable[int]) -> str:
 
 
 def _by_computer(record: RunRecord) -> dict[str, list[int]]:
-    """Return the remote agents by a phrase for the computer or the worker that played them."""
+    """Return a phrase for each computer that ran remote agents, with the IDs of these agents."""
     found: dict[str, list[int]] = {}
     for agent, remote in record.remote.items():
         computer = f"computer {remote.host}" if remote.worker is None else f"worker {remote.worker}"
@@ -145,7 +147,7 @@ def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
 
 
 def link_qualities() -> list[str]:
-    """Return the legend texts for the qualities of a link. The first text describes the best quality."""
+    """Return the texts that explain the link qualities in the legend. The first text explains the best quality."""
     limits = map(text.percent, QUALITY_LIMITS)
     return ["link", *(f"link that loses {low} to {high}" for low, high in pairwise(limits))]
 

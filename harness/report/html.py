@@ -27,8 +27,8 @@ PAGE_STYLE = PALETTE + (_HERE / "page.css").read_text(encoding="utf-8")
 
 
 class _TemplateCache(BytecodeCache):
-    """Keeps compiled templates in `__pycache__`, beside the compiled modules of Python. Compiling the template of a
-    report takes longer than rendering it.
+    """A cache that stores compiled templates in `__pycache__`, beside the compiled modules of Python. To compile the
+    template of a report takes longer than to render it.
     """
 
     def _file(self, bucket: Bucket) -> Path:

@@ -21,47 +21,49 @@ from harness.report.chain_tree import ranges
 MAX_SEGMENTS = 4000
 """Maximum number of track segments of all vehicles together. More segments could not be distinguished."""
 MAX_NAMED = 6
-"""Maximum number of parts of the swarm that a text lists."""
+"""Maximum number of groups of vehicles that a text lists."""
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkDivision:
-    """The division of the swarm into parts from `at_s` on. The vehicles of a part are connected. All other living
-    vehicles are alone.
-
-    If all vehicles reach each other, `together` contains all of them, and `parts` is empty.
-    """
+    """A division of the swarm into groups of connected vehicles (*parts*), from one network change to the next."""
 
     at_s: float
+    """The mission second of the change with which the division begins."""
     what: str
     parts: dict[int, frozenset[int]]
+    """Number of a part -> the vehicles in the part. Empty if all vehicles reach each other."""
     alone: frozenset[int]
+    """The living vehicles that reach no other vehicle."""
     together: frozenset[int]
+    """All living vehicles if all of them reach each other. Empty otherwise."""
 
     @property
     def living(self) -> frozenset[int]:
         return self.together | self.alone | frozenset().union(*self.parts.values())
 
     def place_of(self, vehicle: int) -> tuple[int | None, frozenset[int]]:
-        """Return the number of the part to which a vehicle belongs, and the vehicles that it reaches."""
+        """Return the number of the part to which the vehicle belongs, and the vehicles that the vehicle reaches."""
         return self.part_of(vehicle), self.reachable_from(vehicle)
 
     def part_of(self, vehicle: int) -> int | None:
-        """Return the number of the part to which the vehicle belongs. Return None if it belongs to no part."""
+        """Return the number of the part of the swarm to which the vehicle belongs. Return None if the vehicle belongs
+        to no part.
+        """
         return next((number for number, members in self.parts.items() if vehicle in members), None)
 
     def reachable_from(self, vehicle: int) -> frozenset[int]:
-        """Return the vehicles that this vehicle reaches, including itself."""
+        """Return the vehicles that this vehicle reaches. The vehicle itself is one of them."""
         part = self.part_of(vehicle)
         if part is not None:
             return self.parts[part]
         return self.together if vehicle in self.together else frozenset({vehicle})
 
     def changed_since(self, before: "NetworkDivision") -> int:
-        """Return the number of vehicles that differ from the division `before`: they were lost, replaced, or reach
-        different vehicles.
+        """Count the vehicles that changed since the division `before`.
 
-        The comparison of reached vehicles ignores vehicles that live in only one of the two states.
+        A vehicle changed if it was lost or replaced, or if it reaches other vehicles than before. Only vehicles that
+        live in both divisions are considered as reached vehicles.
         """
         both = self.living & before.living
         moved = sum(self.reachable_from(vehicle) & both != before.reachable_from(vehicle) & both for vehicle in both)
@@ -83,9 +85,8 @@ class NetworkDivision:
 
 @dataclass(frozen=True, slots=True)
 class TrackSegment:
-    """A section of a flight path on which the vehicle stays in the same part of the swarm.
-
-    `division` is the division of the swarm at the start of the section.
+    """A section of a flight path on which the vehicle belongs to the same part of the swarm all the time. `division` is
+    the division of the swarm at the start of the section.
     """
 
     vehicle: int
@@ -95,8 +96,8 @@ class TrackSegment:
 
 @dataclass(frozen=True, slots=True)
 class FlightPath:
-    """The path of a vehicle from its start to its loss or the end of the run. If the start is unknown, the path begins
-    at the first known position.
+    """The path of a vehicle from its start to its loss, or to the end of the run. If the start of the path is unknown,
+    the path begins at the first known position.
     """
 
     vehicle: int
@@ -137,10 +138,8 @@ def divisions(states: Sequence[Topology]) -> list[NetworkDivision]:
 
 
 def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]) -> dict[int, frozenset[int]]:
-    """Number the parts of the swarm. A part gets the number of an earlier part if it contains more than half of its
-    vehicles.
-
-    Other parts get the lowest free numbers.
+    """Number the parts of the swarm. If a part contains more than half of the vehicles of an earlier part, it gets the
+    number of the earlier part. The other parts get the lowest free numbers.
     """
     numbers: dict[int, frozenset[int]] = {}
     for part in parts:
@@ -154,8 +153,8 @@ def _numbered(parts: Sequence[frozenset[int]], before: dict[int, frozenset[int]]
 
 
 def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, most: int) -> list[NetworkDivision]:
-    """Return at most `most` divisions of the swarm: the first division, and the divisions that lasted longest. The map
-    shows each division until the next one.
+    """Return at most `most` divisions of the swarm: the first one, and the ones that lasted longest. The map shows a
+    division until the next returned division begins.
     """
     if len(all_divisions) <= most:
         return list(all_divisions)
@@ -167,7 +166,7 @@ def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, mo
 def flights(
     vehicle: int, tracks: VehicleTracks, network: Connectivity, all_divisions: Sequence[NetworkDivision], end_s: float
 ) -> Iterator[FlightPath]:
-    """Yield the path of a vehicle, and the paths of the vehicles that replaced it after a loss."""
+    """Yield the flight path of a vehicle. If other vehicles replaced it after a loss, also yield their flight paths."""
     wreck: PositionFix | None = None
     for begin_s, until_s, lost in network.airborne_intervals(vehicle, end_s):
         flown = [fix for fix in tracks.by_vehicle[vehicle] if begin_s <= fix.at_s <= until_s]
@@ -203,9 +202,9 @@ MIN_SPAN_M = 20.0
 MIN_ASPECT = 0.45
 """Minimum ratio of the shorter side of a map to the longer side."""
 MARGIN = 0.05
-"""Margin around the tracks, as a share of the length of each side."""
+"""Margin around the flight paths, as a share of the length of each side of the map."""
 INVISIBLE_PX = 0.5
-"""Number of pixels up to which a deviation is invisible."""
+"""Pixels. Nobody can see a deviation of a line that is not larger than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,8 +240,8 @@ def _widen(low: float, high: float, shortest: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class MapProjection:
-    """A converter from positions in the area `land` to pixels of a rectangle. `left` and `top` are the upper left
-    corner of the rectangle.
+    """A converter that maps positions in the area `land` to pixels in a rectangle. `left` and `top` are the pixel
+    coordinates of the rectangle's upper left corner.
     """
 
     land: GroundRectangle
@@ -273,8 +272,8 @@ class MapProjection:
         return self.x(fix.east_m), self.y(fix.north_m)
 
     def ticks_m(self) -> tuple[list[float], list[float]]:
-        """Return round numbers of metres for the ticks of both axes, first north and then east. Both axes have the same
-        step.
+        """Return the positions of the ticks on both axes of the map, in metres. The first list is for the north axis,
+        the second for the east axis. Both axes have the same step, which is a round number.
         """
         every = svg.step(max(self.land.width_m, self.land.height_m), 9)
         return _multiples(every, self.land.south_m, self.land.north_m), _multiples(
@@ -282,7 +281,9 @@ class MapProjection:
         )
 
     def scale_bar_m(self) -> float:
-        """Return a round length in metres for the scale bar. It is at least a fifth of the map's width."""
+        """Return the length of the scale bar in metres. The length is a round number, and at least a fifth of the map's
+        width.
+        """
         return svg.step(self.land.width_m, 5)
 
 
@@ -291,9 +292,8 @@ def _multiples(every: float, low: float, high: float) -> list[float]:
 
 
 def thin(lines: Sequence[Sequence[Point]], most: int) -> list[list[Point]]:
-    """Simplify the lines to an accuracy of half a pixel. If more than `most` points remain, reduce the accuracy.
-
-    Each line keeps both its ends.
+    """Remove points from the lines. A deviation of half a pixel is allowed. If more than `most` points remain, a larger
+    deviation is allowed. Each line keeps its first and last point.
     """
     tolerance, thin = INVISIBLE_PX, [simplify(line, INVISIBLE_PX) for line in lines]
     while sum(map(len, thin)) > max(most, 2 * len(lines)):

@@ -30,7 +30,7 @@ from sitl.vehicle import VehicleType
 
 HEIGHT, DIGIT, PADDING = 16, 7.5, 8
 NEAR, FAR = 14, 34
-"""Two possible distances in pixels from a place to the middle of a tag above it."""
+"""The two distances in pixels that may lie between a place on the map and the middle of the tag above it."""
 _DIRECTIONS = ((0, -1), (0, 1), (1, -1), (-1, -1), (1, 1), (-1, 1), (1, 0), (-1, 0))
 
 Box = tuple[float, float, float, float]
@@ -40,9 +40,8 @@ Box = tuple[float, float, float, float]
 def tags(
     tagged: Sequence[tuple[int, Point]], crosses: Sequence[Point], to_px: MapProjection, ink: Mapping[int, AgentColours]
 ) -> Markup:
-    """Draw tags with vehicle IDs. No tag overlaps another tag or one of the points `crosses`.
-
-    A vehicle without room for a tag has only its tooltip.
+    """Draw tags with vehicle IDs. A tag overlaps no other tag and none of the points `crosses`. If there is no room for
+    a tag, the vehicle has only a tooltip.
     """
     occupied = [(x - 5, y - 5, x + 5, y + 5) for x, y in (*(place for _, place in tagged), *crosses)]
     drawn = []
@@ -56,7 +55,7 @@ def tags(
 
 
 def _boxes(digits: int, place: Point) -> list[Box]:
-    """Return possible rectangles for a tag beside a place. The best rectangle is first."""
+    """Return the rectangles in which a tag beside a place could be drawn. The best rectangle is first."""
     width = digits * DIGIT + PADDING
     boxes = []
     for distance in (NEAR, FAR):
@@ -107,11 +106,13 @@ def _overlap(first: Box, second: Box) -> bool:
 STYLE = (Path(__file__).parent / "map.css").read_text(encoding="utf-8")
 
 PART_CLASSES = 4
-"""Number of different line styles for parts of the swarm. Further parts have the same styles and other letters."""
+"""Number of different line styles for the parts of a swarm. Further parts use the same styles again, but have other
+letters.
+"""
 TRACK_CLASSES = ("unknown", "whole", *(f"part{number}" for number in range(PART_CLASSES)), "alone")
 MAX_POINTS = 20_000
 MAX_LINKS = 1500
-"""Maximum number of links that are drawn at one moment. The shortest links are kept."""
+"""Maximum number of links that the map of one moment shows. The map shows the shortest links."""
 MOST_TAGGED_AT_A_MOMENT = 15
 """Maximum number of vehicles with ID tags in a small map."""
 
@@ -121,7 +122,7 @@ _MOMENT_WIDTH, _MOMENT_HEIGHT = 300, 240
 
 
 def css_class(division: NetworkDivision | None, vehicle: int) -> str:
-    """Return the CSS class of a vehicle. It depends on the part of the swarm to which the vehicle belongs."""
+    """Return the CSS class of a vehicle. The class depends on the part of the swarm to which the vehicle belongs."""
     if division is None:
         return "unknown"
     if vehicle in division.together:
@@ -138,7 +139,7 @@ def draw_tracks(
     description: str,
 ) -> Markup:
     """Draw the map. `reboots` contains the position and the agent of each reboot. `description` is a text about the
-    picture.
+    picture for readers who cannot see it.
     """
     to_px = MapProjection(land, _LEFT, _TOP, _ROOM_WIDTH, _ROOM_HEIGHT)
     return Markup(
@@ -191,7 +192,9 @@ def draw_moment(
 
 
 def _links(at: Mapping[int, Point], links: Mapping[tuple[int, int], float], division: NetworkDivision | None) -> Markup:
-    """Draw the links. Links with small loss rates are drawn last, so that they are on top of the others."""
+    """Draw the links between vehicles. Links with small loss rates are drawn last, so that they cover the
+    other links.
+    """
     drawn: dict[tuple[int, str], list[str]] = {}
     shortest = sorted(links, key=lambda pair: math.dist(at[pair[0]], at[pair[1]]))
     for vehicle, neighbour in shortest[:MAX_LINKS]:
@@ -226,9 +229,8 @@ def _shape(vehicle_type: VehicleType, place: Point) -> str:
 
 
 def sample(which: str) -> Markup:
-    """Draw a sample of a line for the legend.
-
-    `which` is one of LOOKS, "start", "end", "lost", "reboot", a link quality such as "q1", or a vehicle type.
+    """Draw a sample line or mark for the legend. `which` is one of LOOKS, "start", "end", "lost", "reboot", a link
+    quality such as "q1", or a vehicle type.
     """
     place = (17.0, 8.0)
     match which:
@@ -286,8 +288,8 @@ def frame(to_px: MapProjection) -> Markup:
 
 
 def _track_paths(segments: Sequence[TrackSegment], to_px: MapProjection) -> Markup:
-    """Draw the flight paths. Sections in which the vehicle belongs to a part of the swarm are drawn last, above the
-    others.
+    """Draw the flight paths. The sections in which a vehicle belongs to a part of the swarm are drawn last, so that
+    they cover the other sections.
     """
     lines = thin([[to_px(fix) for fix in segment.fixes] for segment in segments], MAX_POINTS)
     classes = [css_class(segment.division, segment.vehicle) for segment in segments]
@@ -321,7 +323,9 @@ def _marks(
     to_px: MapProjection,
     ink: Mapping[int, AgentColours],
 ) -> Markup:
-    """Draw the starts, reboots and ends of flight paths, with tags at the ends."""
+    """Draw the marks for the starts, the reboots and the ends of flight paths. The ends have tags with the
+    vehicle IDs.
+    """
     parts = []
     for flight in flights:
         colours, start, end = ink[flight.vehicle], flight.start, flight.end

@@ -20,7 +20,7 @@ STATEMENTS = {
 }
 ICONS = {"good": "✓", "bad": "✗", "unknown": "\u2013"}
 KINDS = {"good": "holds", "bad": "violated", "unknown": "unknown"}
-"""Class of a verdict -> CSS class."""
+"""Name of a verdict -> CSS class."""
 EVIDENCE_KEPT = 200
 
 
@@ -37,16 +37,16 @@ class VerdictEntry:
     """CSS class of the verdict."""
     reason: str
     evidence: list[dict[str, Any]]
-    """The pieces of evidence, each as label -> value."""
+    """The evidence for the verdict, as pairs of a label and a value."""
     evidence_left_out: int
     remark: str = ""
-    """The relation between the verdict and the expected one, such as "as expected". Empty if no verdict was
-    expected.
+    """A text that compares the verdict with the expected verdict, such as "as expected". Empty if the scenario expects
+    no verdict.
     """
 
     @property
     def in_words(self) -> str:
-        """The verdict with its remark, such as "violated, as expected"."""
+        """The verdict with a remark, such as "violated, as expected"."""
         return ", ".join(filter(None, (self.verdict, self.remark)))
 
     @property
@@ -95,9 +95,10 @@ def _verdict(key: str, judged: CharacteristicRecord | JudgementRecord | None, ex
 
 
 def headline(verdicts: list[VerdictEntry], *, completed: bool) -> tuple[str, str]:
-    """Return a one-line summary of the verdicts, and the CSS class of this summary.
+    """Return a summary of the verdicts in one line, and the CSS class of the summary.
 
-    The class is never "holds" for a run that did not complete. It is "unknown" if all bad verdicts were expected.
+    If the run was not completed, the class is never "holds". If the scenario expected all bad verdicts, the class is
+    "unknown".
     """
     characteristics = [verdict for verdict in verdicts if verdict.number]
     violated, holding = (sum(verdict.kind == kind for verdict in characteristics) for kind in ("violated", "holds"))

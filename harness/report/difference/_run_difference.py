@@ -17,11 +17,11 @@ from ucp.trigger import Trigger
 
 @dataclass(frozen=True)
 class ComparedStep:
-    """A handler run in the form in which two runs are compared. The mission second `t` and the line number `line` are
-    not compared.
+    """A handler run in the form in which two runs are compared. The comparison ignores the mission second `t` and the
+    line number `line`.
 
-    `changes` holds (operation, block) and `sent` holds (message, block). A block is represented by its name. None
-    stands for no block.
+    `changes` contains pairs (operation, block), and `sent` contains pairs (message, block). The name of the block
+    represents it. None means that there is no block.
     """
 
     life: int
@@ -35,9 +35,8 @@ class ComparedStep:
 
     @classmethod
     def of(cls, line: HandlerRunLine, names: Mapping[str, str]) -> "ComparedStep":
-        """Return the comparable form of a trace line.
-
-        `names` maps block hashes to names. Other blocks are represented by 12 digits of their hash.
+        """Return a trace line in the form that is compared. `names` maps the hashes of blocks to names. A block without
+        a name is represented by the first 12 digits of its hash.
         """
         run = line.parse()
         return cls(
@@ -69,9 +68,8 @@ def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str
 
 @dataclass(frozen=True)
 class KeyDifference:
-    """A scenario key with different values in the two runs, such as `network.loss` or `timeline.0.at_s`.
-
-    If a run lacks the key, the value for this run is None.
+    """A scenario key, such as `network.loss` or `timeline.0.at_s`, whose value differs between the two runs. If the
+    scenario of a run does not contain the key, the value for this run is None.
     """
 
     key: str
@@ -97,8 +95,8 @@ def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
 
 @dataclass(frozen=True)
 class FirstDifference:
-    """The first position at which the two traces of an agent differ, with the handler run of each trace. For a trace
-    that ended earlier, the handler run is None.
+    """The first position at which the two traces of an agent differ, with the handler run that each trace has there.
+    For a trace that has already ended, the handler run is None.
     """
 
     number: int
@@ -107,7 +105,7 @@ class FirstDifference:
 
     @property
     def at_s(self) -> float:
-        """The earlier time of the two differing handler runs, in mission seconds."""
+        """The mission second of the earlier of the two handler runs that differ."""
         return min(step.t for step in (self.a, self.b) if step is not None)
 
 
@@ -116,7 +114,7 @@ class ChainDifference:
     """The first position (from 1) at which the exported chains of an agent differ, with the name of the block that each
     chain has there.
 
-    For a chain that ended earlier, the name is None. An agent without an export has an empty chain.
+    For a chain that has already ended, the name is None. If an agent has no export, its chain counts as empty.
     """
 
     place: int
@@ -132,25 +130,27 @@ class AgentDifference:
 
 @dataclass(frozen=True)
 class RunDifference:
-    """All differences between two runs.
-
-    keys: differing keys of the scenario, and `seed`. agents: every agent of the roster. Both fields are None for an
-    agent without a difference. handler_runs: the number of equal handler runs of all agents, up to the first difference
-    of each. programs: the programs of either run, if not all agents were the harness's own. exact: the traces are equal
-    to the last byte. errors: a sentence for each unusable export, and for each run without a recorded end.
-    """
+    """All differences between two runs."""
 
     keys: list[KeyDifference]
+    """The keys of the scenario with different values. The seed of the run counts as the key `seed`."""
     programs: dict[Literal["a", "b"], list[AgentProgram]]
+    """The programs of the agents in each run. Empty if all agents ran the harness's own program."""
     agents: dict[int, AgentDifference]
+    """An entry for every agent of the mission. In the entry of an agent without a difference, both fields are None."""
     handler_runs: int
+    """The number of equal handler runs of all agents. For each agent, only handler runs before its first difference
+    count.
+    """
     exact: bool
+    """True if the traces are equal to the last byte."""
     errors: list[str]
+    """A sentence for each unusable export, and for each run whose end is not recorded."""
 
     @property
     def first(self) -> int | None:
-        """The agent with the earliest first difference in mission time. If several agents have the earliest difference,
-        it is the agent with the lowest ID. None without differences.
+        """The agent whose first difference has the earliest mission time. If this is true for several agents, return
+        the lowest ID. None if there are no differences.
         """
         at_s = {
             agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None
@@ -179,9 +179,8 @@ class RunDifference:
 
 
 def compare(a: Path, b: Path) -> RunDifference:
-    """Return the differences between two run directories.
-
-    Raises RunDirectoryError if a directory is no run, or if the rosters or backends differ.
+    """Return the differences between two run directories. Raises RunDirectoryError if a directory contains no run, or
+    if the two runs have different agents or different backends.
     """
     run_a, run_b = _ComparedRun(a), _ComparedRun(b)
     _check_comparable(run_a, run_b)
@@ -226,7 +225,7 @@ class _ComparedRun:
         yield from self.exports.errors
 
     def requested(self) -> dict[str, object]:
-        """Return the seed and the scenario of the run as a JSON object."""
+        """Return the scenario of the run as a JSON object that also contains the seed."""
         scenario = self.record.scenario
         return {"seed": self.record.seed, **(scenario.model_dump(mode="json", by_alias=True) if scenario else {})}
 

@@ -88,7 +88,7 @@ class ExportedRun:
 
     @cached_property
     def agents(self) -> list[int]:
-        """The IDs of all agents that appear in any file of the run, in ascending order."""
+        """The IDs of all agents that any file of the run mentions, in ascending order."""
         archive = self.archive
         return sorted({*archive.roster, *archive.traces, *archive.exports.by_agent})
 
@@ -98,12 +98,12 @@ class ExportedRun:
         return name_blocks(self.archive.exports.by_agent)
 
     def block(self, block_hash: str) -> str:
-        """Return the name of a block. If no export contains the block, use the first 12 digits of its hash."""
+        """Return the name of a block. If no export contains the block, return the first 12 digits of its hash."""
         return self.block_names.get(block_hash, block_hash[:12])
 
     @cached_property
     def history(self) -> MissionHistory:
-        """The votes, reconciles and messages of all agents."""
+        """All votes, reconciles and messages in the traces of the agents."""
         return history_of(self.archive.traces, self.faults, self.end_s)
 
     @cached_property
@@ -186,7 +186,7 @@ class ExportedRun:
                 yield FieldPosition(self.time.at(fix.at_s), vehicle, metres, place)
 
     def _by_events(self) -> Iterator[FieldPosition]:
-        """Yield the positions in logged events. The first of all these positions is used as the centre of the field."""
+        """Yield the positions in logged events. The first position becomes the centre of the field."""
         if not self.archive.exports.by_agent:
             return
         untimed, field = 0, None
@@ -259,7 +259,9 @@ class ExportedRun:
             yield ReconcileSample(self.time.at(reconcile.end_s, reconcile.agent), reconcile)
 
     def _log_lines(self) -> Iterator[LogLine]:
-        """Yield a log line for each fault, each operator command, and, at the end of the run, each verdict."""
+        """Yield a log line for each fault, each operator command and each verdict. The verdicts have the time at which
+        the run ended.
+        """
         for state in self.archive.record.network[:1]:
             yield LogLine(self.time.at(0.0), "info", FAULTS, f"{state.what}: {state.detail}")
         for fault in self.faults:

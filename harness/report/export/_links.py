@@ -21,8 +21,8 @@ def vehicle_frame(vehicle: int) -> str:
 
 
 class LinkLine(NamedTuple):
-    """A line for the link between two vehicles. `loss` is the larger loss rate of the two directions, and is below
-    1.
+    """A line that represents the link between two vehicles. `loss` is the larger loss rate of the two directions, and
+    is below 1.
     """
 
     low: Metres
@@ -47,11 +47,11 @@ class CurrentLinks:
         self._moved_ns = -1
 
     def move(self, position: FieldPosition) -> list[LinkLine] | None:
-        """Store a new position. If an update of the lines is due, return the lines for the previous positions. Return
-        None otherwise.
+        """Store a new position.
 
-        Vehicles move at the same times. The lines for one time are therefore complete when the first later position
-        arrives.
+        If it is time to update the lines, return the lines that belong to the previous positions. Return None
+        otherwise. All vehicles report their positions at the same times. When the first later position arrives, the
+        lines for one time are therefore complete.
         """
         at_ns = position.at_ns
         due = at_ns > self._moved_ns and self._are_due(at_ns)

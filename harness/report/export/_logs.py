@@ -57,17 +57,15 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
 
 
 def _zone_s(ahead_s: float) -> float:
-    """Return the time zone of a log as an offset in seconds. It is computed from the difference between the first line
-    of the log and the start of the mission.
-
-    Return infinity if no zone matches, as in virtual time.
+    """Return the time zone of a log file as an offset in seconds. The offset is the difference between the first line
+    of the log file and the start of the mission. Return infinity if no zone matches, for example in virtual time.
     """
     zone_s = round(ahead_s / _ZONE_STEP_S) * _ZONE_STEP_S
     return zone_s if abs(zone_s) <= _FURTHEST_ZONE_S else math.inf
 
 
 def _seconds(timed: re.Match[str]) -> float | None:
-    """Parse a time, and return seconds since the Unix epoch. The text is interpreted as UTC. Return None if it is not a
+    """Parse a text as a time in UTC, and return it in seconds since the Unix epoch. Return None if the text is not a
     valid time.
     """
     try:

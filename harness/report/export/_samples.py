@@ -34,20 +34,21 @@ class EarthPosition(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FieldPosition:
-    """The position of a vehicle at one time, in the coordinates of the field.
-
-    `place` is None if the field's location is unknown.
-    """
+    """The position of one vehicle at one time."""
 
     at_ns: int
     vehicle: int
     metres: Metres
+    """Metres east, north and up from the centre of the field."""
     place: EarthPosition | None
+    """The position on Earth. None if the location of the field is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class LossSample:
-    """A change of loss rates. A link is a pair (sender, receiver). Links that are not listed keep their loss rate."""
+    """A change of loss rates. `losses` maps pairs (sender, receiver) to loss rates. The other pairs keep their loss
+    rates.
+    """
 
     at_ns: int
     losses: Mapping[Link, float]
@@ -117,7 +118,7 @@ class ReplicationSample:
 
 @dataclass(frozen=True, slots=True)
 class TelemetrySample:
-    """A MAVLink message of a vehicle, decoded by pymavlink."""
+    """A MAVLink message of a vehicle, which pymavlink decoded."""
 
     at_ns: int
     vehicle: int
@@ -126,7 +127,9 @@ class TelemetrySample:
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """A line of a log file, a fault, a network change or a verdict. `source` names the file or the part of the run."""
+    """A line of text with a time: a line of a log file, a fault, a network change or a verdict. `source` is the name of
+    the file, or says which part of the run the line describes.
+    """
 
     at_ns: int
     level: Level
@@ -150,8 +153,8 @@ Sample = (
 
 
 MAX_EPOCH_S = 2**31 - 1 - round(LATEST_S)
-"""Latest start of a mission. The times of a later mission could exceed the last time that ROS can represent, in
-2038.
+"""Latest start of a mission. ROS can represent times until 2038, and a mission that starts later could exceed this
+limit.
 """
 MAX_SPEEDUP = 1000.0
 _NS = 1_000_000_000
@@ -159,44 +162,43 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class MissionTime:
-    """The clock of the mission, which converts between mission seconds and time since the Unix epoch.
-
-    `epoch_ns` is the time of mission second 0. `by_agent` holds this time for agents whose clocks differ.
-    """
+    """The clock of the mission. It converts between mission seconds and time since the Unix epoch."""
 
     epoch_ns: int
+    """The time of mission second 0, in nanoseconds since the Unix epoch."""
     speedup: float
     by_agent: Mapping[int, int]
+    """Agent ID -> the time of mission second 0, for agents with other clocks."""
 
     def at(self, mission_s: float, agent: int | None = None) -> int:
-        """Return the time since the Unix epoch at a mission second. If `agent` is given, its clock is used. The time is
-        never before 1970.
+        """Convert a mission second to nanoseconds since the Unix epoch. If `agent` is given, use the clock of this
+        agent. The result is never negative.
         """
         epoch_ns = self.epoch_ns if agent is None else self.by_agent.get(agent, self.epoch_ns)
         return max(0, epoch_ns + round(mission_s * _NS))
 
     def mission_s(self, at_ns: int) -> float:
-        """Return the mission second at a time since the Unix epoch."""
+        """Convert a time since the Unix epoch to a mission second."""
         return (at_ns - self.epoch_ns) / _NS
 
     def of_wall(self, wall_s: float) -> int | None:
-        """Convert wall time (Unix seconds) to a time on this clock, which runs `speedup` times as fast. Return None if
-        it is far outside the mission.
+        """Convert wall time (Unix seconds) to a time on the clock of the mission, which runs `speedup` times as fast.
+        Return None if the result is far outside the mission.
         """
         mission_s = (wall_s - self.epoch_ns / _NS) * self.speedup
         return self.at(mission_s) if abs(mission_s) <= LATEST_S else None
 
     def of_timestamp(self, timestamp_us: int) -> int | None:
-        """Convert the timestamp of a block or an event to a time on this clock. Return None if it is far outside the
-        mission.
+        """Convert the timestamp of a block or an event to a time on the clock of the mission. Return None if the result
+        is far outside the mission.
         """
         at_ns = timestamp_us * 1000
         return at_ns if abs(self.mission_s(at_ns)) <= LATEST_S else None
 
 
 def mission_time(headers: Mapping[int, TraceHeader], record: RunRecord, problems: list[str]) -> MissionTime:
-    """Return the clock of the mission. It comes from the headers of the traces, or from run.json if no trace has a
-    header.
+    """Return the clock of the mission. The headers of the traces contain the start of this clock. If no trace has a
+    header, run.json contains it.
 
     Add a sentence to `problems` for each invalid clock.
     """
@@ -225,8 +227,8 @@ def _speedup(headers: Mapping[int, TraceHeader], record: RunRecord) -> float:
 
 
 def _start_ns(record: RunRecord) -> int:
-    """Return the start time of the run in nanoseconds, as an estimate of the start of the mission. Return 0 in virtual
-    time.
+    """Return the time at which the run started, in nanoseconds since the Unix epoch. It is an estimate of the start of
+    the mission. Return 0 in virtual time.
     """
     try:
         start = datetime.fromisoformat(record.started_at or "")

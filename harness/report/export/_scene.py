@@ -22,7 +22,7 @@ _TEXT = Color(r=1.0, g=1.0, b=1.0, a=1.0)
 
 
 def colours_of(vehicles: Iterable[int]) -> dict[int, Any]:
-    """Return the colour of each vehicle. The colours are the same as in reports."""
+    """Return the colour of each vehicle. Reports use the same colours."""
     return {vehicle: _colour(ink.fill) for vehicle, ink in inks(vehicles).items()}
 
 
@@ -32,7 +32,7 @@ def _colour(fill: str) -> Any:
 
 
 class FieldScene:
-    """The 3D view, which changes over time. `links` contains the current loss rates."""
+    """The contents of the 3D view, which change over time. `links` contains the current loss rates."""
 
     def __init__(self, record: RunRecord, colours: Mapping[int, Any]) -> None:
         self.links = CurrentLinks()
@@ -40,7 +40,7 @@ class FieldScene:
         self._drawn: set[int] = set()
 
     def move(self, position: FieldPosition) -> Iterator[Any]:
-        """Yield the updates of the 3D view (SceneUpdate messages) that follow from a new position."""
+        """Yield the messages (SceneUpdate) that change the 3D view after a vehicle has moved."""
         if (lines := self.links.move(position)) is not None:
             yield _drawn_links(position.at_ns, lines)
         if position.vehicle not in self._drawn:

@@ -31,7 +31,9 @@ Schema = dict[str, Any]
 _NUMBER, _WHOLE, _YES_OR_NO, _TEXT = ({"type": name} for name in ("number", "integer", "boolean", "string"))
 _AGENTS = {"type": "array", "items": _WHOLE}
 _LARGEST = 2**53
-"""Largest integer up to which a float represents every integer exactly. Some tools store all numbers as floats."""
+"""The largest integer that every tool shows exactly. Some tools store all numbers as floats, and floats cannot
+represent all larger integers.
+"""
 
 
 def schema(**properties: Schema) -> Schema:
@@ -176,7 +178,7 @@ class TopicConverter:
 
 
 def _is_plottable(value: Any) -> bool:
-    """Return true if the value is known and can be written as JSON."""
+    """Return true if the value is known, and JSON can represent it."""
     return math.isfinite(value) if isinstance(value, float) else value is not None
 
 
@@ -197,7 +199,7 @@ def _link(link: Link) -> str:
 
 
 def _whole(number: Any) -> int | None:
-    """Return the number if it is an integer that all tools can show. Return None for any other number."""
+    """Return the number if it is an integer that all tools show exactly. Return None otherwise."""
     return number if isinstance(number, int) and abs(number) <= _LARGEST else None
 
 
@@ -210,8 +212,8 @@ def _mavlink_schema(message: type[Any]) -> Schema:
 
 
 def _lengths(message: type[Any]) -> Iterable[int]:
-    """Return the number of array elements of each field of a MAVLink message. The number is 0 for a field that is not
-    an array.
+    """Return the number of array elements for each field of a MAVLink message. The number is 0 if the field is not an
+    array.
     """
     in_order: Mapping[str, int] = dict(zip(message.ordered_fieldnames, message.array_lengths, strict=True))
     return [in_order[name] for name in message.fieldnames]

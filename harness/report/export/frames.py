@@ -13,11 +13,11 @@ from harness.present.polars import pl
 from ucp.trigger import MessageTrigger, Trigger
 
 BATCH = 20_000
-"""Maximum number of records that are in memory at the same time, before they are converted to columns."""
+"""Maximum number of records that are in memory before they are converted to columns."""
 
 Record = TypeVar("Record")
 Columns = Mapping[str, tuple[Any, Callable[[Record], Any]]]
-"""Name of a column -> the type of the column, and a function that returns the value for a record."""
+"""Name of a column -> the type of the column, and a function that returns the value of the column for a record."""
 
 _NAME = pl.Categorical
 """Column type for text with few distinct values."""

@@ -46,8 +46,8 @@ _LARGEST = 2**63 - 1
 _SEQUENCE = 1
 
 Event = tuple[int, int, Any]
-"""Time, order among packets of the same time, and packet. The order is 1 for effects of messages, so that sending
-precedes receiving.
+"""A tuple of time, rank and packet. The rank orders packets with the same time. Packets about effects of a message have
+rank 1, so that receiving follows sending.
 """
 
 
@@ -87,8 +87,8 @@ class _MessageArrows:
         self._from: dict[tuple[int, int, float], list[int]] = {}
         self._to: dict[tuple[int, int, int, float], int] = {}
         self.backwards = 0
-        """Number of receipts that come before their sending according to the clocks of the agents. They get no
-        arrow.
+        """Number of receipts that are earlier than the sending of their message, because the clocks of the agents
+        differ. The trace contains no arrows for these receipts.
         """
         for message in messages:
             for receiver, at_s in message.receipts:
@@ -216,7 +216,7 @@ class _PerfettoTrace:
         return at_ns, 0, self._packet(at_ns, _agent(agent), track, TrackEvent.TYPE_SLICE_END)
 
     def _count(self, at_ns: int, group: str, name: str, value: float) -> Iterator[Event]:
-        """Yield a counter event if the value of the counter has changed since its last event."""
+        """Yield a counter event if the value differs from the value in the last event of this counter."""
         if self._counters.get((group, name)) != value and abs(value) <= _LARGEST:
             self._counters[group, name] = value
             packet = self._packet(at_ns, group, name, TrackEvent.TYPE_COUNTER)

@@ -34,12 +34,12 @@ with extra("export", "writing a ROS bag"):
     from rosbags.typesys import Stores, get_typestore
 
 Timed = tuple[int, str, Any]
-"""The time, topic and content of a message."""
+"""A ROS message with its time and its topic."""
 
 METADATA_VERSION: Literal[8] = 8
 """Version of the bag format. ROS 2 Humble and later versions read it."""
 LEVELS = {"info": 20, "warning": 30, "error": 40}
-"""Levels of rcl_interfaces/Log by name: INFO, WARN and ERROR."""
+"""Name of a level -> the number of the level in rcl_interfaces/Log, for INFO, WARN and ERROR."""
 _LARGEST = 2**32 - 1
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _NS = 1_000_000_000
@@ -134,7 +134,7 @@ class _RosMessages:
                 yield f"/vehicle_{vehicle}/mavlink", _bytes(bytes(message.get_msgbuf()))
 
     def _count(self, topic: str, kind: str, value: float) -> Iterator[tuple[str, Any]]:
-        """Yield a message with the value if it differs from the last value on this topic."""
+        """Yield a message with the value if the value differs from the last value on this topic."""
         if self._counts.get(topic) != value:
             self._counts[topic] = value
             yield topic, _message(f"std_msgs/msg/{kind}", data=value)
@@ -207,8 +207,8 @@ def _transform(position: FieldPosition) -> Any:
 
 
 def _markers(at_ns: int, lines: list[LinkLine]) -> Any:
-    """Return one marker that contains all lines. Without lines, return a marker that deletes the previous lines,
-    because RViz rejects an empty list.
+    """Return one marker that contains all lines. If there are no lines, return a marker that deletes the previous
+    lines, because RViz rejects an empty list.
     """
     marker: Any = _STORE.types["visualization_msgs/msg/Marker"]
     origin = (0.0, 0.0, 0.0)

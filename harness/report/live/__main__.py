@@ -21,7 +21,7 @@ from harness.report.live.feed_to_log import copy_live_run
 from harness.report.live.server import UPDATE_S, LivePageServer
 
 MAX_UNWATCHED_S = 3.0
-"""Seconds after which the server ends if no page is open. A page that is reloaded reconnects within this time."""
+"""Seconds. If no page is open for this time, the server ends. A page that is reloaded reconnects earlier."""
 
 
 async def main(directory: Path, port: int) -> None:
@@ -48,7 +48,7 @@ def _print(line: str) -> None:
 
 
 def _send_request(page: int, request: Any) -> None:
-    """Send the request of a browser page to the process that plays the run."""
+    """Send the request of a browser page to the process that carries out the run."""
     if isinstance(request, dict):
         _print(json.dumps([page, request.get("number"), request]))
 
@@ -56,8 +56,8 @@ def _send_request(page: int, request: Any) -> None:
 async def _read_until_over(
     reader: asyncio.StreamReader, server: LivePageServer, log: ChangeLog, clock: RunClock
 ) -> bool:
-    """Read messages from the process that plays the run, until the run is over. Return false if the process ended
-    early.
+    """Read messages from the process that carries out the run, until the run has ended. Return false if this process
+    ended before the run.
     """
     while line := await reader.readline():
         kind, *rest = json.loads(line)

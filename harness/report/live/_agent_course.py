@@ -26,7 +26,7 @@ from ucp.trigger import MessageTrigger
 Change = list[Any]
 
 KEY_LENGTH = 16
-"""Number of hexadecimal digits of a block hash that identify a block on the page."""
+"""Number of hexadecimal digits that identify a block on the page. They are the first digits of the block's hash."""
 
 _RECEIPT_LINE = re.compile(
     rb'\{"t":([\d.]+),"handler":"receive_\w+","algorithm":\d+,'
@@ -39,7 +39,7 @@ _TIME = re.compile(rb'\{"t":(\d{1,9}(?:\.\d{1,9})?),')
 
 
 class MessageReceipt(NamedTuple):
-    """A change: the message with sequence number `seq` of the agent `sender` was received."""
+    """A change for the page: the agent received the message with sequence number `seq` from the agent `sender`."""
 
     t: float
     sender: int
@@ -47,8 +47,8 @@ class MessageReceipt(NamedTuple):
 
 
 class SentMessage(NamedTuple):
-    """A change: the message with sequence number `seq` was broadcast. `block` identifies the block that the message
-    concerns, if any.
+    """A change for the page: the agent broadcast the message with sequence number `seq`. `block` identifies the block
+    that the message concerns, or is None.
     """
 
     t: float
@@ -58,8 +58,8 @@ class SentMessage(NamedTuple):
 
 
 class AgentActions:
-    """The actions of one agent that were read so far. Callers read and empty the lists `changes`, `sent` and
-    `receipts`.
+    """A reader of one agent's trace, which collects the actions of the agent. Callers read the lists `changes`, `sent`
+    and `receipts`, and then empty them.
     """
 
     def __init__(self, agents: Path, agent_id: int) -> None:
@@ -70,18 +70,18 @@ class AgentActions:
         self.at_s = 0.0
         """Mission second of the last entry that was read."""
         self.problem: str | None = None
-        """The reason why the rest of the trace cannot be read. None without a problem."""
+        """The reason why the rest of the trace cannot be read. None if there is no problem."""
         self.has_messages_without_effect = False
-        """True if the trace records a message without effect. By default, traces of virtual time omit these
-        messages.
+        """True if the trace records any message that had no effect on its receiver. By default, traces of virtual time
+        omit such messages.
         """
         self.has_unread = False
-        """True if the last `read` left lines unread."""
+        """True if the last call of `read` left lines unread."""
         self.leaves_out_messages = False
-        """True to read only changes of the state, which is several times as fast."""
+        """If true, `read` only processes changes of the agent's state. This is several times as fast."""
         self._trace = AgentTrace(agents, agent_id)
         self._ahead: MessageReceipt | HandlerRun | DroppedDatagram | None = None
-        """An entry that was read but lies after the requested mission second."""
+        """An entry that was read but is later than the requested mission second."""
         self._has_started = False
         self._held = HeldBlocks()
         self._completed: dict[str, int] = {}
@@ -114,7 +114,7 @@ class AgentActions:
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the next entry, which was already read but not processed. None without such an
+        """The mission second of the next entry, which was already read but not processed. None if there is no such
         entry.
         """
         return None if self._ahead is None else self._ahead.t
@@ -123,7 +123,9 @@ class AgentActions:
         self._trace.close()
 
     def _next(self) -> MessageReceipt | HandlerRun | DroppedDatagram | None:
-        """Return the next entry that has a valid time. Return None if the trace has no further entry yet."""
+        """Return the next trace entry with a valid time. Return None if the trace does not contain such an
+        entry yet.
+        """
         while self.problem is None:
             if self.leaves_out_messages and (dropped := self._trace.drop_while(self._has_no_effect)):
                 time = _TIME.match(dropped)
@@ -159,7 +161,7 @@ class AgentActions:
         return bool(self._held.not_in_chain) and b'"idle":true' in line
 
     def _begin(self) -> None:
-        """Forget the state that was computed from the trace, because the agent was restarted."""
+        """Delete the state that was computed from the trace, because the agent restarted without it."""
         if self._has_started:
             self.changes.append(["z", self.at_s, self.agent_id])
         self._has_started, self._held, self._idle_too_early = True, HeldBlocks(), False
@@ -192,7 +194,7 @@ class AgentActions:
             self.changes.append(["c", run.t, self.agent_id, moves, run.state.top[:KEY_LENGTH], how])
 
     def _report_activity(self, run: HandlerRun) -> None:
-        """Report the votes, reconciles and phases that began or ended with the handler run."""
+        """Add a change for each vote, reconcile and phase of a reconcile that began or ended in this handler run."""
         for step in self._incarnation.feed(run):
             match step:
                 case ActivityStart("vote"):
@@ -212,7 +214,7 @@ class AgentActions:
         self.changes.append(["s", t, self.agent_id, activity, detail])
 
     def _report_violations(self, run: HandlerRun) -> None:
-        """Report a violation of characteristic 2 or 3 when it first occurs."""
+        """Add a change for a violation of characteristic 2 or 3 when the violation first occurs."""
         for operation, block in run.changes:
             if operation.endswith("+") and self._held.copies[block] > 1 and block not in self._duplicates:
                 self._duplicates.add(block)

@@ -1,8 +1,8 @@
 """Follow a growing trace file line by line, including all restarts of its agent.
 
 An agent that is a process writes the trace of each incarnation into its own directory (`7.trace.jsonl`, then
-`7-2/7.trace.jsonl`). At the end of the run, the first file gets the traces of all incarnations. In virtual time, a
-single file contains all incarnations.
+`7-2/7.trace.jsonl`). At the end of the run, the traces of all incarnations are joined in the first file. In virtual
+time, all incarnations use one file from the start.
 """
 
 from collections import deque
@@ -37,8 +37,8 @@ class GrowingFile:
         return self._lines.popleft()
 
     def drop_while(self, can_be_dropped: Callable[[bytes], bool]) -> bytes | None:
-        """Drop the next lines of the part that was read, up to the first line that the function rejects. Return the
-        last dropped line.
+        """Drop lines that were read but not returned yet, until the function returns false for a line. Return the last
+        dropped line.
         """
         dropped, lines = None, self._lines
         while lines and can_be_dropped(lines[0]):
@@ -51,7 +51,7 @@ class GrowingFile:
             self._file = None
 
     def _read(self) -> bool:
-        """Read a part of the file. Return true if there was new data."""
+        """Read the next part of the file. Return true if the file contained new data."""
         if self.trouble is not None:
             return False
         try:
@@ -75,7 +75,7 @@ class GrowingFile:
 
 
 class AgentTrace:
-    """The lines of one agent's trace, in all incarnations of the agent."""
+    """A reader for the lines of one agent's trace, in all incarnations of the agent."""
 
     def __init__(self, agents: Path, agent_id: int) -> None:
         self._agents, self._agent_id = agents, agent_id
@@ -106,7 +106,9 @@ class AgentTrace:
             self._incarnation, self._headers = self._incarnation + 1, 0
 
     def drop_while(self, can_be_dropped: Callable[[bytes], bool]) -> bytes | None:
-        """Drop lines of the current incarnation as `GrowingFile.drop_while` does."""
+        """Drop lines of the current incarnation, until the function returns false for a line. Return the last dropped
+        line.
+        """
         return self._file.drop_while(can_be_dropped)
 
     @property

@@ -22,7 +22,7 @@ MAX_DETAIL = 300
 
 class _TimedNetworkLine(NetworkLine):
     detail: Any = ""
-    """A description of the change for human readers."""
+    """A text for the user that describes the change."""
     by_hand: bool = False
 
 
@@ -30,9 +30,8 @@ TimedLine = TypeVar("TimedLine", _TimedNetworkLine, TrackLine)
 
 
 class _TimedFile(Generic[TimedLine]):
-    """A growing file in which each entry has a time.
-
-    `model` validates each line. `play` processes the line when the caller reads up to its mission second.
+    """A growing file whose entries have times. `model` validates each line. When the caller reads up to a mission
+    second, `play` processes all lines up to this second.
     """
 
     def __init__(self, path: Path, model: type[TimedLine], play: Callable[[TimedLine], None]) -> None:
@@ -40,7 +39,7 @@ class _TimedFile(Generic[TimedLine]):
         self._model: type[TimedLine] = model
         self._play: Callable[[TimedLine], None] = play
         self.ahead: TimedLine | None = None
-        """An entry that was read but lies after the requested mission second."""
+        """An entry that was read but is later than the requested mission second."""
         self.at_s = 0.0
         """Mission second of the last entry that was processed."""
         self.problems: dict[str, None] = {}
@@ -77,8 +76,8 @@ class _TimedFile(Generic[TimedLine]):
 
 
 class NetworkAndVehicles:
-    """The network and the vehicles of a run, according to the parts of the files read so far. Callers read the list
-    `changes` and empty it.
+    """The network and the vehicles of a run, according to the parts of the files that were read so far. Callers read
+    the list `changes`, and then empty it.
     """
 
     def __init__(self, directory: Path, vehicles: Collection[int]) -> None:
@@ -105,7 +104,7 @@ class NetworkAndVehicles:
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the next entry, which was already read but not processed. None without such an
+        """The mission second of the next entry, which was already read but not processed. None if there is no such
         entry.
         """
         ahead = (self._conditions.ahead, self._tracks.ahead)
@@ -151,7 +150,7 @@ class NetworkAndVehicles:
 
 
 def _state_after(fault: type[Fault]) -> str:
-    """Return the state of an agent after a fault in one word. Return an empty text if the fault does not change the
+    """Return one word for the state of an agent after a fault. Return an empty text if the fault does not change the
     state.
     """
     states = {

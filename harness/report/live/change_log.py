@@ -14,14 +14,16 @@ from harness.report.live._agent_course import Change
 MAX_BYTES = 512 * 1024 * 1024
 CHUNK_BYTES = 256 * 1024
 FAR_BEHIND_BYTES = 4 * 1024 * 1024
-"""Number of bytes. A live reader that is further behind skips messages and positions to catch up."""
+"""Number of bytes. If a live reader is behind by more than this, it skips frequent changes, such as messages and
+positions, to catch up.
+"""
 _LEFT_OUT = (b'["m"', b'["p"', b'["t"', b'["d"')
 
 _encode = partial(json.dumps, separators=(",", ":"), check_circular=False)
 
 
 class ChangeLog:
-    """A log that has one change in each line. `size` is its size in bytes."""
+    """A log with one change per line. `size` is its size in bytes."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115
@@ -42,9 +44,10 @@ class ChangeLog:
         self.size += len(lines)
 
     def read(self, start: int, *, may_skip: bool = False) -> tuple[int, str]:
-        """Return (position after the lines, lines): the complete lines that follow the position `start`.
+        """Return a pair: the position after the returned lines, and the complete lines that follow the position
+        `start`.
 
-        If `may_skip` is true and the reader is far behind, messages and positions are omitted.
+        If `may_skip` is true and the reader is far behind, frequent changes such as messages and positions are omitted.
         """
         skips = may_skip and self.size - start > FAR_BEHIND_BYTES
         data = self._pread(start, FAR_BEHIND_BYTES if skips else CHUNK_BYTES)

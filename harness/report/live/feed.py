@@ -48,27 +48,30 @@ from harness.scenario.faults import TIMELINE_FAULTS, VehicleFault
 from harness.scenario.verdict_names import kind_of
 
 MAX_VEHICLES = 200
-"""Maximum number of vehicles whose links the page can draw."""
+"""Maximum number of vehicles in a swarm whose links the page can draw."""
 LINES_AT_ONCE = 500
-"""Maximum number of lines that are read from one file before the reader continues with the next file. Lines that are
-left out do not count.
+"""Maximum number of lines that are read from one file before the reader continues with the next file. Omitted lines do
+not count.
 """
 LINES_AT_ONCE_LATE = 50
 POLLS_UNTIL_REPORTED = 2
-"""Number of polls between the first sight of a message and its change on the page. After this time most receivers have
-recorded the message. If a receiver on a busy machine records it later, this causes a change `h`.
+"""Number of polls between the poll that first finds a message in a trace and the poll that shows it on the page. After
+this time, most receivers have recorded the message. A receiver on a busy machine may record the message later. The page
+then gets a change of the kind `h`.
 """
 MAX_BEHIND_S = 2.0
-"""Wall time. If the stream is further behind an active run, it leaves out messages until it has caught up."""
+"""Seconds of wall time. If the stream of changes is behind an active run by more than this, it omits messages until it
+has caught up.
+"""
 MAX_KEPT = 100_000
-"""Maximum number of reported messages that can still get a change `h`. The same limit applies to messages that only
-receivers have recorded.
+"""Maximum number of messages for which further receivers can still be added on the page. The same limit applies to
+messages that only receivers have recorded.
 """
 
 
 @dataclass
 class _Broadcast:
-    """A broadcast message. `message` is None until the sender's record of it was read."""
+    """A broadcast message. `message` is None until the reader finds the message in the trace of the sender."""
 
     mask: int
     polls: int
@@ -77,14 +80,16 @@ class _Broadcast:
     block: str | None = None
 
     def add_receiver(self, bit: int) -> bool:
-        """Add the receiver with this bit. Return true if it is a new receiver."""
+        """Add a receiver of the message. The number `bit` stands for the receiver. Return true if the
+        receiver is new.
+        """
         before = self.mask
         self.mask |= bit
         return self.mask != before
 
 
 class RunClock:
-    """The mission seconds that an active run reported, and the wall time of each report."""
+    """The mission seconds that an active run reported, with the wall time of each report."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -95,7 +100,9 @@ class RunClock:
         self._reports.append((now_s, time.monotonic()))
 
     def wall_s_since(self, mission_s: float) -> float:
-        """Return the wall time since this mission second. Earlier seconds are forgotten."""
+        """Return the wall time that has passed since this mission second. Reports of earlier mission seconds are
+        deleted.
+        """
         while self._reports and self._reports[0][0] <= mission_s:
             self._reports.popleft()
         return time.monotonic() - self._reports[0][1] if self._reports else 0.0
@@ -104,8 +111,8 @@ class RunClock:
 class ChangeFeed:
     """The stream of changes in a run directory.
 
-    Raises RunDirectoryError if the directory contains no run, if the run has nothing to show, or if it has more than
-    `MAX_VEHICLES` vehicles.
+    Raises RunDirectoryError if the directory contains no run, if the run contains no data for the page, or if it has
+    more than `MAX_VEHICLES` vehicles.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -125,11 +132,11 @@ class ChangeFeed:
         self._surroundings = NetworkAndVehicles(directory, self._roster)
         self._broadcasts: dict[tuple[int, int], _Broadcast] = {}
         self._reported: dict[tuple[int, int], _Broadcast] = {}
-        """(sender, sequence number) -> the message, for the last reported messages."""
+        """(sender, sequence number) -> the message, for the last messages that the page got."""
         self._polls = 0
         self._leaves_out_messages = False
         self._messages_from_s = -1.0
-        """Messages up to this mission second are left out, because their receivers are not known completely."""
+        """Mission second up to which messages are omitted, because not all of their receivers are known."""
         self._reported_late: Change = ["late", 0, False]
         self._reported_s = 0.0
         self._reported_problems: set[str] = set()
@@ -164,14 +171,14 @@ class ChangeFeed:
         ]
 
     def _is_flown(self) -> bool:
-        """Return true if the vehicles are real programs. Only such vehicles can have vehicle faults."""
+        """Return true if the vehicles of the run are real programs. Only real programs can have vehicle faults."""
         record, scenario = self._record, self._record.scenario
         has_vehicles = scenario is not None and scenario.vehicles.kind != "none"
         return has_vehicles and record.backend is not None and not in_virtual_time(record.backend)
 
     def poll(self, until_s: float = float("inf")) -> tuple[list[Change], bool]:
-        """Return the new changes up to mission second `until_s`, and whether there are further changes up to this
-        second.
+        """Return a pair: the new changes up to mission second `until_s`, and whether there are further changes up to
+        this second.
         """
         more = self._surroundings.read(until_s, LINES_AT_ONCE)
         at_once = LINES_AT_ONCE_LATE if self._leaves_out_messages else LINES_AT_ONCE
@@ -193,7 +200,8 @@ class ChangeFeed:
     def poll_live(self, clock: RunClock) -> tuple[list[Change], bool]:
         """Return the new changes of an active run, and whether more changes remain unread.
 
-        Far behind the run, the feed leaves out messages, which are most of the traces. It reports how late it is.
+        If the feed is far behind the run, it omits messages, because most lines of the traces are about messages. The
+        page shows by how many seconds the feed is late.
         """
         changes, more = self.poll()
         unread = (course.at_s for course in self._courses if course.has_unread)
@@ -221,13 +229,13 @@ class ChangeFeed:
         self._reported.clear()
 
     def final_changes(self) -> list[Change]:
-        """Return the changes that were not returned yet, and the result of the run."""
+        """Return all remaining changes, and the result of the run."""
         changes = [*self._take_changes(), *self._messages(report_all=True)]
         return [*changes, *self._notes(), ["end", self._ending()]]
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the next entry, which was already read but not processed. None without such an
+        """The mission second of the next entry, which was already read but not processed. None if there is no such
         entry.
         """
         ahead = (self._surroundings.next_s, *(course.next_s for course in self._courses))
@@ -256,8 +264,8 @@ class ChangeFeed:
             changes.clear()
 
     def _messages(self, *, report_all: bool) -> Iterator[Change]:
-        """Yield the messages whose receivers had enough time to record them. If `report_all` is true, yield all
-        messages.
+        """Yield the messages that had enough time to reach the traces of their receivers. If `report_all` is true,
+        yield all messages.
         """
         happened: list[tuple[float, int, int, SentMessage | MessageReceipt]] = []
         for course in self._courses:
@@ -305,7 +313,7 @@ class ChangeFeed:
         return ["m", broadcast.t, sender, broadcast.message, broadcast.block, f"{broadcast.mask:x}", sequence]
 
     def _notes(self) -> Iterator[Change]:
-        """Yield sentences about new problems with the files."""
+        """Yield a sentence about each new problem with the files."""
         damaged = (course.problem for course in self._courses)
         for sentence in chain(self._surroundings.problems, damaged):
             if sentence is not None and sentence not in self._reported_problems:

@@ -1,4 +1,6 @@
-"""Copy the stream of changes to the log: at the speed of an active run, or all at once for a finished run."""
+"""Write the stream of changes to the log. The changes of an active run are written as they occur, and the changes of a
+finished run all at once.
+"""
 
 import asyncio
 
@@ -7,7 +9,7 @@ from harness.report.live.feed import ChangeFeed, RunClock
 from harness.report.live.server import UPDATE_S
 
 STRIDE_S = 20.0
-"""Number of mission seconds of a finished run that are read from all files in one step."""
+"""Mission seconds of a finished run that are read from all files in one step."""
 
 
 async def copy_finished_run(feed: ChangeFeed, log: ChangeLog) -> None:
@@ -27,8 +29,8 @@ async def copy_finished_run(feed: ChangeFeed, log: ChangeLog) -> None:
 
 
 async def copy_live_run(feed: ChangeFeed, log: ChangeLog, ended: asyncio.Event, clock: RunClock) -> None:
-    """Write the changes of an active run to a log until the run has a result. Also stop when `ended` is set, because
-    the process that plays the run has ended. `clock` has the mission seconds that the run reports.
+    """Write the changes of an active run to a log until the run has a result. Also stop when the event `ended` is set,
+    which means that the process of the run has ended. `clock` contains the mission seconds that the run reported.
     """
     log.append([feed.run_change(live=True)])
     while True:

@@ -38,9 +38,11 @@ GONE_S = 20.0
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 RequestHandler = Callable[[int, Any], None]
-"""A function that receives the number of a page and its request. `LivePageServer.answer` sends the answer."""
+"""A function that gets the number of a page and a request from this page. `LivePageServer.answer` sends the answer to
+the page.
+"""
 MOST_ANSWERS = 32
-"""Maximum number of answers that wait for one page. Further answers replace the oldest."""
+"""Maximum number of answers that wait for one page. A further answer replaces the oldest one."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def _files() -> Mapping[str, _PageFile]:
 
 
 class _OpenPage:
-    """A page that is open in a browser."""
+    """A browser page that is connected to the server."""
 
     def __init__(self, socket: web.WebSocketResponse) -> None:
         self.socket = socket
@@ -67,7 +69,7 @@ class _OpenPage:
 
 
 class LivePageServer:
-    """A web server for the log of one run. `live` is true if the run is still active."""
+    """A web server that sends the log of one run to browsers. `live` is true if the run is still active."""
 
     def __init__(
         self, log: ChangeLog, directory: Path, *, live: bool, on_request: RequestHandler | None = None
@@ -145,7 +147,9 @@ class LivePageServer:
         )
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
-        """Return the report of the run. The browser gets it as a page without rights, because its author is unknown."""
+        """Return the report of the run. The browser shows it as a page without rights, because the report may come from
+        an unknown author.
+        """
         path = self._directory / "report.html"
         if not path.is_file():
             raise web.HTTPNotFound
@@ -203,8 +207,8 @@ class LivePageServer:
 
 
 def _log() -> logging.Logger:
-    """Return a log for errors of the server. It omits malformed requests, because any program on this machine can send
-    them.
+    """Return a logger for errors of the server. The logger omits errors about malformed requests, because any program
+    on this machine can send such requests.
     """
     log = logging.getLogger(__name__)
     log.addFilter(_is_own_error)

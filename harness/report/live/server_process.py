@@ -28,7 +28,7 @@ open pages.
 """
 ENDING_S = 5.0
 MAX_OUTGOING = 10_000
-"""Maximum number of unsent lines. If the server hangs, further lines are lost."""
+"""Maximum number of lines that wait for the server. If the server hangs, further lines are lost."""
 _LAST_LINES = 20
 _NO_REASON = "it does not say why"
 
@@ -66,7 +66,7 @@ class LivePage:
         self._writer, self._reader = _thread(self._write_lines), _thread(self._read_requests)
         self._state_sender = _thread(self._send_state)
         self.problem: str | None = None
-        """A sentence about an early end of the server, after the run. None without a problem."""
+        """A sentence that reports that the server ended before the end of the run. None if there was no problem."""
 
     def tee(self, progress: ProgressDisplay) -> ProgressDisplay:
         """Return a progress display that forwards all progress to `progress` and also updates the page."""
@@ -76,7 +76,7 @@ class LivePage:
         self._snapshot = snapshot
 
     def run_is_over(self) -> bool:
-        """Inform the web server that the run is over. Return true if a page is open."""
+        """Tell the web server that the run has ended. Return true if a page is open."""
         self._ended.set()
         self._state_sender.join()
         self._send(["over"])
@@ -119,7 +119,7 @@ class LivePage:
         return self._last_lines[-1] if self._last_lines else _NO_REASON
 
     def _read_errors(self) -> None:
-        """Read the error output of the web server. If no thread read it, a full pipe would block the server."""
+        """Read the error output of the web server. Without a reader, a full pipe would block the server."""
         for line in _required(self._process.stderr):
             if line.strip():
                 self._last_lines.append(line.strip())
@@ -159,7 +159,7 @@ class LivePage:
         self._send(["answer", page, number, {"at_s": done.result()} if error is None else {"error": str(error)}])
 
     def _send_state(self) -> None:
-        """Send the mission second and the state of the controls whenever they change."""
+        """Send the mission second and the state of the controls to the web server whenever they change."""
         before: tuple[Any, ...] = ()
         now_s = -1.0
         while not self._ended.wait(STATE_EVERY_S):
@@ -210,7 +210,7 @@ def _required(stream: IO[str] | None) -> IO[str]:
 
 
 def _perform(interventions: Interventions, request: dict[str, Any]) -> Future[float]:
-    """Execute a request that a page sent. Raises ValueError, TypeError, KeyError or AttributeError if the request is
+    """Carry out a request that a page sent. Raises ValueError, TypeError, KeyError or AttributeError if the request is
     invalid.
     """
     match request["do"]:
@@ -232,8 +232,8 @@ def _perform(interventions: Interventions, request: dict[str, Any]) -> Future[fl
 
 @contextmanager
 def live_page(directory: Path, port: int, interventions: Interventions) -> Iterator[LivePage]:
-    """Inside the context, run a web server for the run in this directory. Raises MachineError if the server cannot be
-    started.
+    """Run a web server for the run in this directory while the context is open. Raises MachineError if the server
+    cannot be started.
     """
     server = LivePage(directory, port, interventions)
     try:
@@ -243,6 +243,6 @@ def live_page(directory: Path, port: int, interventions: Interventions) -> Itera
 
 
 def require_packages() -> None:
-    """Raise MachineError with the install command if a package of the server is missing."""
+    """Raise MachineError if a package that the server needs is missing. The error contains the install command."""
     with extra("watch", "watching a run"):
         import aiohttp  # noqa: F401

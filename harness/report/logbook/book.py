@@ -17,21 +17,22 @@ if TYPE_CHECKING:
 
 @dataclass
 class Logbook:
-    """The chain exports of a swarm, by agent, with the facts that are needed to print them.
-
-    names: names of the blocks by hash. telemetry: whether the events come from the source `mavlink`, which is assumed
-    for exports without a run. absent: a sentence for each agent of the mission without an export. errors: a sentence
-    for each unusable file. event_data: the reader of events in blocks. epoch_us: the timestamp of mission second 0,
-    None if unknown.
-    """
+    """The chain exports of a swarm, with the facts that are needed to print them."""
 
     exports: dict[int, Export]
+    """Agent ID -> the chain export of the agent."""
     names: dict[str, str]
+    """Block hash -> name of the block."""
     telemetry: bool = True
+    """True if the events come from the source `mavlink`. If the exports do not belong to a run, this is assumed."""
     absent: dict[int, str] = field(default_factory=dict)
+    """Agent ID -> a sentence, for each agent of the mission without an export."""
     errors: list[str] = field(default_factory=list)
+    """A sentence for each unusable file."""
     event_data: EventData = field(default_factory=EventData)
+    """The reader of the events in blocks."""
     epoch_us: int | None = None
+    """The timestamp of mission second 0 in microseconds. None if it is unknown."""
 
     def name(self, block_hash: str) -> str:
         return self.names.get(block_hash, block_hash[:12])
@@ -44,9 +45,8 @@ class Logbook:
         return mission_s if mission_s is not None and abs(mission_s) <= LATEST_S else None
 
     def only(self, agent_id: int) -> "Logbook":
-        """Return a logbook that contains only the export of this agent.
-
-        Blocks keep their names. Raises ExportError if there is no export.
+        """Return a logbook that contains only the export of this agent. The blocks keep their names. Raises ExportError
+        if the agent has no export.
         """
         if agent_id in self.exports:
             return replace(self, exports={agent_id: self.exports[agent_id]}, absent={})
@@ -59,7 +59,8 @@ class Logbook:
 def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
     """Return the logbook of an archive. `depot` decrypts encrypted events.
 
-    Raises RunDirectoryError if the archive has no exports, and ExportError if no events are encrypted for this depot.
+    Raises RunDirectoryError if the archive contains no exports. Raises ExportError if the given depot cannot decrypt
+    any events.
     """
     exports = archive.exports
     if not exports.by_agent and not exports.errors:
@@ -79,9 +80,8 @@ def read(archive: RunArchive, depot: "Depot | None" = None) -> Logbook:
 
 
 def logged_telemetry(record: RunRecord) -> bool:
-    """Return true if the events are telemetry of vehicles.
-
-    In a run without vehicles, events are random. Without run.json, they are assumed to be telemetry.
+    """Return true if the events of the run are telemetry of vehicles. In a run without vehicles, events are random. If
+    there is no run.json, the events are assumed to be telemetry.
     """
     scenario = record.scenario
     if scenario is None:

@@ -16,8 +16,8 @@ _BYTES_SHOWN = 8
 
 
 def lines(logbook: Logbook, decode: bool) -> Iterator[str]:
-    """Yield the lines of each agent's chain. The oldest block is first. If `decode` is true, events are described in
-    words.
+    """Yield the lines of each agent's chain, with the oldest block first. If `decode` is true, the lines describe the
+    events in words.
     """
     vehicle_types = _vehicle_types(logbook) if decode else {}
     for agent_id, export in logbook.exports.items():
@@ -52,7 +52,7 @@ def document(logbook: Logbook, decode: bool) -> dict[str, object]:
 
 
 def words(event: LoggableEvent, telemetry: bool, of_type: int | None = None) -> str:
-    """Return a description of an event. `of_type` is the type (MAV_TYPE) of the vehicle that logged it."""
+    """Return a description of an event. `of_type` is the MAV_TYPE of the vehicle whose agent logged the event."""
     description = describe(event.event_id, event.data, of_type) if telemetry else ""
     if description and description != "unreadable":
         return description
@@ -62,8 +62,8 @@ def words(event: LoggableEvent, telemetry: bool, of_type: int | None = None) -> 
 
 
 def _vehicle_types(logbook: Logbook) -> dict[int, int]:
-    """Return the type (MAV_TYPE) of each agent's vehicle. The first change of the flight mode that an agent logged
-    contains it.
+    """Return the MAV_TYPE of each agent's vehicle. It is part of the first change of the flight mode that the agent
+    logged.
     """
     types: dict[int, int] = {}
     if not logbook.telemetry:
@@ -78,7 +78,9 @@ def _vehicle_types(logbook: Logbook) -> dict[int, int]:
 
 
 def _time(timestamp_us: int, logbook: Logbook) -> str:
-    """Format a timestamp as text. The mission second precedes it, unless both are the same number."""
+    """Format a timestamp as text. The text begins with the mission second, unless the mission second and the timestamp
+    are the same number.
+    """
     mission_s = logbook.mission_s(timestamp_us) if logbook.epoch_us else None
     return moment(timestamp_us) if mission_s is None else f"{mission_s:8.1f} s  {moment(timestamp_us)}"
 

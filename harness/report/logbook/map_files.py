@@ -12,8 +12,8 @@ def geojson(tracks: Iterable[EventTrack]) -> dict[str, object]:
     """Return a GeoJSON FeatureCollection. Altitudes are metres above mean sea level.
 
     The property `times` of a LineString holds the time of each position. A vehicle with a single position has no
-    LineString. Other events get the last known position of the vehicle, which is `position_age_s` seconds older than
-    the event. Events before the first position have the geometry null.
+    LineString. An event that is no position gets the last known position of the vehicle. `position_age_s` is the age of
+    this position in seconds. Events before the first position have the geometry null.
     """
     return {"type": "FeatureCollection", "features": [feature for track in tracks for feature in _features(track)]}
 

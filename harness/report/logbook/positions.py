@@ -34,32 +34,31 @@ class GlobalPosition(Protocol):
 
 @dataclass(frozen=True)
 class LogEntry:
-    """One event in the block `block`. If the event has no position, `position` is the previous position of the vehicle,
-    or None without one.
-
-    `position_age_s` is the age of the position at the time of the event, in seconds.
-    """
+    """One event of an agent."""
 
     block: str
+    """The name of the block that contains the event."""
     event: LoggableEvent
     is_position: bool
     position: GlobalPosition | None
+    """The position of the vehicle. If the event is no position, the position before it. None if there is none."""
     position_age_s: float | None
+    """The age of the position at the time of the event, in seconds."""
 
 
 @dataclass(frozen=True)
 class EventTrack:
-    """All events of one agent, with the oldest first. `fixes` contains the positions of the agent, with timestamps in
-    microseconds.
-    """
+    """The events of one agent."""
 
     agent_id: int
     entries: list[LogEntry]
+    """All events of the agent, with the oldest first."""
     fixes: list[tuple[int, GlobalPosition]]
+    """The positions of the vehicle, with timestamps in microseconds."""
 
 
 def tracks(logbook: Logbook) -> list[EventTrack]:
-    """Return the track of each agent that logged positions, in order of agent IDs. The list is empty if the events are
+    """Return one track for each agent that logged positions, in order of agent IDs. The list is empty if the events are
     not telemetry.
     """
     if not logbook.telemetry:
@@ -111,7 +110,7 @@ def track_of(agent_id: int, logged: Iterable[tuple[LoggableEvent, str]]) -> Even
 
 
 class RoundedPosition(NamedTuple):
-    """A position in units of 1e-7 degrees, with an altitude in millimetres above mean sea level."""
+    """A position on Earth in units of 1e-7 degrees, with an altitude in millimetres above mean sea level."""
 
     lat_e7: int
     lon_e7: int
@@ -119,8 +118,8 @@ class RoundedPosition(NamedTuple):
 
 
 def recorded_tracks(record: RunRecord, recorded: VehicleTracks) -> list[EventTrack]:
-    """Return a track without events for each vehicle whose flight path was recorded. The home position in the scenario
-    is the origin of the recorded positions.
+    """Return a track without events for each vehicle whose flight path the run recorded. Recorded positions are
+    relative to the home position in the scenario.
     """
     if record.scenario is None:
         return []

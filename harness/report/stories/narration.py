@@ -29,20 +29,20 @@ lateness still counts as punctual. On a slow machine, the lateness of timers in 
 
 @dataclass
 class AgentReaction:
-    """An action of an agent: the handler run for an input, and all handler runs that followed from it."""
+    """An action of an agent: all handler runs that followed from one input."""
 
     agent_id: int
     position: int
-    """Index of the first handler run in the agent's trace."""
+    """Index of the action's first handler run in the agent's trace."""
     runs: list[HandlerRun]
     cause: "AgentReaction | None" = None
-    """The action that sent the message by which this action was triggered. None if no message triggered this action."""
+    """The action of another agent that sent the triggering message. None if no message triggered this action."""
     receivers: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
     """Sequence number of a sent message -> the receivers of the message."""
     at_s: float = 0.0
-    """Mission second at which the first cause of this action would have happened if no timer had been late."""
+    """Mission second at which the first cause of this action would have happened if all timers had expired on time."""
     distance: int = 0
-    """Number of messages between the first cause of the instant and this action."""
+    """Number of messages between this action and the first cause at the same instant."""
 
     @property
     def instant(self) -> int:
@@ -55,12 +55,12 @@ class AgentReaction:
 
     @property
     def answer(self) -> MessageTrigger | None:
-        """The trigger of the action, if it is an answer to a query or request. None otherwise."""
+        """The trigger of the action if the action received an answer to a query or request. None otherwise."""
         trigger = self.runs[0].trigger
         return trigger if isinstance(trigger, MessageTrigger) and trigger.message in ANSWERS else None
 
     def message(self, sequence: int) -> SentMessage | None:
-        """Return the message with this sequence number, if the action sent it. Return None otherwise."""
+        """Return the message with this sequence number. Return None if the action did not send it."""
         return next((sent for run in self.runs for sent in run.sent if sent.seq == sequence), None)
 
     @property
@@ -70,8 +70,8 @@ class AgentReaction:
 
     @property
     def answers_another_agent(self) -> bool:
-        """True if the action received an answer that is meant for another agent. All agents receive each answer,
-        because answers are broadcasts.
+        """True if the action received an answer that another agent needed. Answers are broadcasts, so all agents
+        receive each answer.
         """
         if self.answer is None or self.cause is None:
             return False
@@ -80,7 +80,9 @@ class AgentReaction:
 
 
 class StoryWriter:
-    """A writer of stories. A story is a text with the steps of a mission, written from the traces of all agents."""
+    """A writer of stories. A story is a text that describes a mission step by step. The writer uses the traces of all
+    agents.
+    """
 
     def __init__(self, traces: Mapping[int, Trace], roster: Sequence[int]) -> None:
         self._traces = traces
@@ -92,7 +94,9 @@ class StoryWriter:
         )
 
     def answer(self, section: StorySection, *, first: bool = False) -> list[str]:
-        """Return the lines for one section. If `first` is true, the lines also include earlier actions."""
+        """Return the lines for one section of the story. If `first` is true, the lines also describe the actions before
+        the section.
+        """
         from_s = 0 if first else section.from_s
         actions = [
             action for action in self._actions if from_s <= action.instant and _before(action.instant, section.until_s)
@@ -103,7 +107,7 @@ class StoryWriter:
         return [*lines, *(self._chains(section.until_s) if section.shows_chains else [])]
 
     def _instant(self, actions: Sequence[AgentReaction]) -> Iterator[str]:
-        """Yield the lines for one instant. Agents with equal actions share their lines."""
+        """Yield the lines for all actions at one instant. Agents with equal actions share their lines."""
         equal: dict[tuple[int, int, object], list[AgentReaction]] = {}
         for action in actions:
             key = action.distance, action.agent_id, self._kind(action)
@@ -117,11 +121,11 @@ class StoryWriter:
             yield from (f"  {_listed(agents):<10}{line}" for line in lines)
 
     def _kind(self, action: AgentReaction) -> object:
-        """Return a key for an action. Actions of one agent with equal keys handle equal answers, and the story merges
-        them.
+        """Return a key for an action.
 
-        Equal answers arrive in random order, and only the first one counts, so separate actions would differ from run
-        to run.
+        If actions of one agent have equal keys, they handle equal answers, and the story describes them together. The
+        reason is that equal answers arrive in random order and only the first one has an effect. The text must not
+        depend on this order.
         """
         run = action.runs[0]
         if action.cause is None or action.answer is None:
@@ -130,9 +134,10 @@ class StoryWriter:
         return run.handler, message_text(sent, self._names) if sent else run.branch
 
     def _lines(self, equal: Sequence[AgentReaction]) -> Iterator[str]:
-        """Yield a line for each handler run: algorithm, name, branch, changes and messages.
+        """Yield a line for each handler run, with the algorithm, the name of the handler, the branch in the algorithm,
+        the changes and the messages.
 
-        For merged answers, the first line lists all branches in order.
+        If several equal answers share their lines, the first line lists the branches of all answers in order.
         """
         sender = [action.sender for action in equal if action.sender is not None]
         in_order = sorted(equal, key=lambda action: action.position)
@@ -156,16 +161,17 @@ class StoryWriter:
         return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
 
     def _missing_receivers(self, action: AgentReaction, sent: SentMessage) -> str:
-        """Return a note about the agents that should have received the message but did not.
-
-        An answer only concerns the agent that sent the query.
+        """Return a note about the agents that a message should have reached but did not reach. If the message is an
+        answer, it should only reach the agent that sent the query.
         """
         meant = {action.sender} if sent.message in ANSWERS else {*self._roster} - {action.agent_id}
         missed = sorted(agent for agent in meant - action.receivers[sent.seq] if agent is not None)
         return f", not to {_listed(missed)}" if missed else ""
 
     def _chains(self, until_s: int | None) -> list[str]:
-        """Return the chains of all agents as a tree of blocks. The agents are listed at the ends of their chains."""
+        """Return the chains of all agents as a tree of blocks. Each branch of the tree ends with the agents whose
+        chains end there.
+        """
         chains: dict[int, list[str]] = {}
         for agent_id, trace in self._traces.items():
             positions = {action.position: action.instant for action in self._actions if action.agent_id == agent_id}
@@ -184,7 +190,7 @@ class StoryWriter:
 
 
 def _actions_with_causes(traces: Mapping[int, Trace]) -> list[AgentReaction]:
-    """Return all actions of agents. Each action has its cause, which is the action that sent the triggering message."""
+    """Return all actions of all agents. The cause of an action is the action that sent the triggering message."""
     actions = [action for agent_id, trace in traces.items() for action in _actions(agent_id, trace)]
     sent: dict[tuple[int, int], list[AgentReaction]] = defaultdict(list)
     for action in actions:
@@ -192,7 +198,7 @@ def _actions_with_causes(traces: Mapping[int, Trace]) -> list[AgentReaction]:
             for message in run.sent:
                 sent[action.agent_id, message.seq].append(action)
     due: dict[tuple[int, object], float] = {}
-    """(Agent ID, timer) -> the mission second at which the timer should expire."""
+    """A pair (agent ID, timer) -> the mission second at which the timer should expire."""
     for action in sorted(actions, key=lambda action: (action.runs[0].t, action.agent_id, action.position)):
         run = action.runs[0]
         timer = run.trigger.timer if isinstance(run.trigger, TimerTrigger) else None
@@ -224,7 +230,7 @@ def _set_cause(action: AgentReaction, sent: Mapping[tuple[int, int], Sequence[Ag
 
 
 def _actions(agent_id: int, trace: Trace) -> Iterator[AgentReaction]:
-    """Yield the actions in a trace. If a handler run triggered another handler run, both belong to the same action."""
+    """Yield the actions in a trace. If one handler run triggered another, both belong to the same action."""
     action: AgentReaction | None = None
     for position, run in enumerate(trace.runs):
         if not has_possible_time(run):
@@ -240,8 +246,8 @@ def _actions(agent_id: int, trace: Trace) -> Iterator[AgentReaction]:
 
 
 def _tree(chains: Mapping[int, Sequence[str]], indent: str) -> Iterator[str]:
-    """Yield a line for the common beginning of the chains. Below it, yield an indented tree for each different
-    continuation.
+    """Yield a line that shows the blocks with which all chains begin. Below this line, yield an indented tree for each
+    different continuation.
     """
     common = 0
     while all(len(chain) > common for chain in chains.values()) and (

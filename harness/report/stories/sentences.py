@@ -9,7 +9,7 @@ from harness.scenario.faults import TIMELINE_FAULTS
 from harness.scenario.load import parse_yaml
 
 EVENT_BYTES = 256
-"""Default size of the data of a scripted event, in bytes."""
+"""Default size of the data of an event in a script, in bytes."""
 
 _IDS = r"(\d{1,7}(?: \d{1,7})*)"
 _LOGS = re.compile(rf"{_IDS} logs?(?: (\d{{1,7}}) bytes)?")
@@ -26,8 +26,8 @@ SENTENCES = (
 
 
 class StoryEntries:
-    """The scenario entries for the sentences that were added so far: `script` for logged events, `timeline` for other
-    entries, and the time of the end.
+    """The scenario entries for all sentences that were added so far: entries of `script` for logged events, entries of
+    `timeline` for everything else, and the mission second of the end.
     """
 
     def __init__(self) -> None:

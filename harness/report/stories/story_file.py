@@ -40,8 +40,8 @@ change of the network takes some milliseconds.
 
 @dataclass(frozen=True)
 class StorySection:
-    """A place in the story file after line `line` (counted from 0), for the reactions from mission second `from_s` to
-    `until_s`.
+    """The place in a story file for the reactions of the agents in an interval of mission time. The place is after line
+    `line`, counted from 0. The interval begins at `from_s` and ends at `until_s`.
     """
 
     line: int
@@ -52,8 +52,8 @@ class StorySection:
 
 @dataclass(frozen=True)
 class Story:
-    """The content of a story file, which describes a mission in sentences. `lines` contains its lines without the
-    reactions of the agents.
+    """The content of a story file, which describes a mission in sentences. `lines` contains the lines of the file
+    without the reactions of the agents.
     """
 
     path: Path
@@ -64,14 +64,16 @@ class Story:
 
     @property
     def in_virtual_time(self) -> Scenario:
-        """The scenario of the story. It has a constant message delay, so that messages stay in order."""
+        """The scenario of the story with a constant message delay. This delay keeps messages in order."""
         if self.scenario.network.delay:
             return self.scenario
         network = self.scenario.network.model_copy(update={"delay": DELAY_S})
         return self.scenario.model_copy(update={"network": network})
 
     def with_answers(self, answers: Sequence[Sequence[str]]) -> str:
-        """Return the text of the story file with new reactions. `answers` has one list of lines for each section."""
+        """Return the text of the story file with new reactions of the agents. `answers` contains a list of lines for
+        each section.
+        """
         after = {section.line: answer for section, answer in zip(self.sections, answers, strict=True)}
         lines: list[str] = []
         for number, line in enumerate(self.lines):
@@ -85,7 +87,7 @@ class Story:
 
 
 def is_story(path: Path) -> bool:
-    """Return true if the file is a story of this harness. Other tools use the file name suffix `.story` too."""
+    """Return true if the file is a story of this harness. Files of other tools may also have the suffix `.story`."""
     try:
         lines = read_text(path, MAX_BYTES).splitlines()
         return any(_SENTENCE.fullmatch(line) for line in lines[:MAX_LINES])
@@ -153,21 +155,21 @@ def _parsed(path: Path, text: str) -> Story:
 
 
 def _in_its_line(problem: str, entry_lines: Mapping[str, Sequence[int]]) -> str:
-    """Return an error message that names the line of the sentence instead of the scenario entry."""
+    """Return the error message with the line number of the sentence in place of the scenario entry."""
     entry = _ENTRY.match(problem)
     return f"line {entry_lines[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
 
 
 def _gap(lines: Sequence[str]) -> list[str]:
-    """Return an empty line if the last line is a sentence. The empty line separates the sentence from the following
-    comment.
+    """Return an empty line if the last line is a sentence. The empty line separates this sentence from the comment that
+    follows.
     """
     return [""] if _SENTENCE.fullmatch(lines[-1]) else []
 
 
 def _sections(sentences: Sequence[tuple[int, int, bool]]) -> list[StorySection]:
-    """Return one section for each mission second in the story. The section is placed after the last sentence of this
-    mission second.
+    """Return one section for each mission second that the story mentions. The place of a section is after the last
+    sentence with this mission second.
     """
     last = {
         at_s: (line, any(chains for _, other_s, chains in sentences if other_s == at_s)) for line, at_s, _ in sentences

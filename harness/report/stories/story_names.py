@@ -25,13 +25,13 @@ from ucp.trace import HandlerRun, SentMessage
 
 INCEPTION = "inception"
 MAX_FULL_CHAIN = 4
-"""Maximum length of a chain whose name lists all blocks. The name of a longer chain has only its first and last
-blocks.
+"""Maximum length of a chain whose name lists all of its blocks. The name of a longer chain consists of its first and
+last blocks.
 """
 
 
 class LocalChain:
-    """The chain of an agent according to its trace: block hashes and chain hashes, oldest first."""
+    """The chain of an agent according to the agent's trace: block hashes and chain hashes, with the oldest first."""
 
     def __init__(self, trace: Trace) -> None:
         try:
@@ -42,7 +42,7 @@ class LocalChain:
         self.blocks: list[str] = []
 
     def replay(self, run: HandlerRun) -> None:
-        """Apply the changes of the next handler run. Impossible changes are ignored."""
+        """Apply the changes of the next handler run to the chain. Ignore changes that are impossible."""
         for operation, block in run.changes:
             if operation == "chain+":
                 self.blocks.append(block)
@@ -53,7 +53,7 @@ class LocalChain:
 
 
 def _digest(block_hash: str) -> bytes:
-    """Return the hash as bytes. Return empty bytes if the text is not a hash."""
+    """Return the bytes of a hexadecimal hash. Return empty bytes if the text is not a hash."""
     try:
         return bytes.fromhex(block_hash)
     except ValueError:
@@ -61,8 +61,8 @@ def _digest(block_hash: str) -> bytes:
 
 
 class StoryNames:
-    """Names of blocks as in the figures of the thesis, such as "1.1". The name of a chain lists the names of its
-    blocks.
+    """The names of all blocks, such as "1.1". The figures of the thesis use the same form. The name of a chain lists
+    the names of its blocks.
     """
 
     def __init__(self, traces: Mapping[int, Trace]) -> None:
@@ -117,7 +117,7 @@ class NameSource(Protocol):
 ANSWERS = frozenset(
     message.NAME for message in (BlockAddResponse, ChainContainResponse, NextInSequenceResponse, BlockResponse)
 )
-"""Names of the messages that answer a single agent."""
+"""Names of the messages that answer the query or request of a single agent."""
 
 _FORMATS: dict[type[Message], Callable[[Any, NameSource], str]] = {
     BlockAddRequest: lambda message, names: (
