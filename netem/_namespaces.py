@@ -12,12 +12,17 @@ import ctypes
 import os
 import pwd
 import re
+import signal
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 CLONE_NEWNET = 0x40000000
+_CLONE_NEWNS, _CLONE_NEWUSER, _CLONE_NEWPID = 0x00020000, 0x10000000, 0x20000000
+_NEW_NAMESPACES = CLONE_NEWNET | _CLONE_NEWNS | _CLONE_NEWPID
+_PR_SET_PDEATHSIG = 1
+_MS_NOSUID, _MS_NODEV, _MS_NOEXEC, _MS_REC, _MS_PRIVATE = 2, 4, 8, 0x4000, 0x40000
 
 AS_ROOT = "as root"
 
@@ -53,6 +58,32 @@ def inside(namespace: int, home: int) -> Iterator[None]:
         yield
     finally:
         enter_network(home)
+
+
+def die_with_parent() -> None:
+    """Let the kernel kill this process when the thread that started it ends."""
+    _check(_libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL))
+
+
+def become_first_process(*, user_namespace: bool) -> None:
+    """Return in the first process of a private network, which is a grandchild of the calling process.
+
+    The calling process becomes the process outside, as that of `unshare --kill-child`. Both end with their parents.
+    """
+    user, group = os.geteuid(), os.getegid()
+    _check(_libc.unshare(_NEW_NAMESPACES | (_CLONE_NEWUSER if user_namespace else 0)))
+    if user_namespace:
+        for name, text in (("setgroups", "deny"), ("uid_map", f"0 {user} 1"), ("gid_map", f"0 {group} 1")):
+            Path("/proc/self", name).write_text(text)
+    die_with_parent()
+    pid = os.fork()
+    if pid:
+        os.closerange(0, os.sysconf("SC_OPEN_MAX"))
+        os.waitpid(pid, 0)
+        os._exit(0)
+    die_with_parent()
+    _check(_libc.mount(b"none", b"/", None, _MS_REC | _MS_PRIVATE, None))
+    _check(_libc.mount(b"proc", b"/proc", b"proc", _MS_NOSUID | _MS_NODEV | _MS_NOEXEC, None))
 
 
 def _check(result: int) -> None:

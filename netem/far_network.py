@@ -34,7 +34,14 @@ _IPV4 = b"\x08\x00"
 
 
 def first_process(argv: Sequence[str]) -> list[str]:
-    """Return the command that starts `argv` as the first process of a private network.
+    """Return the command that starts `argv` as the first process of a private network. Raises the errors of
+    `needs_user_namespace`.
+    """
+    return _namespaces.command(argv, user_namespace=needs_user_namespace())
+
+
+def needs_user_namespace() -> bool:
+    """Return true if a private network needs a user namespace of its own on this machine.
 
     Raises LabUnavailable if this machine has no private networks, or no TAP interfaces.
     """
@@ -48,7 +55,19 @@ def first_process(argv: Sequence[str]) -> list[str]:
             f"This machine has no TAP interfaces ({_DEVICE}: {error.strerror})",
             "As root: modprobe tun, and chmod 666 /dev/net/tun.",
         ) from None
-    return _namespaces.command(argv, user_namespace=message != _namespaces.AS_ROOT)
+    return message != _namespaces.AS_ROOT
+
+
+def die_with_parent() -> None:
+    """Let the kernel kill this process when its parent ends."""
+    _namespaces.die_with_parent()
+
+
+def become_first_process(*, user_namespace: bool) -> None:
+    """Return in the first process of a private network, which is a grandchild of the calling process. Both end with
+    their parents. `user_namespace` is the result of `needs_user_namespace`.
+    """
+    _namespaces.become_first_process(user_namespace=user_namespace)
 
 
 def vehicle_at(address: str) -> int | None:

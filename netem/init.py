@@ -9,6 +9,7 @@ background, and reports the end of a child when it happens.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import resource
 import selectors
@@ -32,6 +33,7 @@ from netem._udp_counters import read_udp_counters
 from netem.conditions import NetworkConditions
 from netem.engine import Engine
 from netem.errors import ConditionsError, EngineError, NetemError
+from netem.forked_program import fork_program
 
 _MAX_UNREAD = 64 << 20  # maximum of unread bytes for the orchestrator
 
@@ -53,6 +55,18 @@ def _limit_files(most_bytes: int) -> None:
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
 
+def _module_of(argv: list[str]) -> Callable[[], None]:
+    """Return a function that plays the command `python -P -m MODULE ARGUMENT...`. Import its module now."""
+    _, _, _, name, *arguments = argv
+    module = importlib.import_module(name)
+
+    def main() -> None:
+        sys.argv = [name, *arguments]
+        module.main()
+
+    return main
+
+
 class LabServer:
     """A server that executes requests of the harness. It trusts the requests, but refuses invalid ones."""
 
@@ -61,7 +75,8 @@ class LabServer:
         self._control = control
         self._receiver = MessageReceiver()
         self._unsent: deque[tuple[bytes, list[socket.socket]]] = deque()
-        self._children: dict[int, subprocess.Popen[bytes]] = {}
+        self._children: dict[int, subprocess.Popen[bytes] | None] = {}
+        """Process ID -> child, or None if the child is a fork of this process."""
         self._connections: dict[int, _OpeningConnection] = {}
         self._fabric: VirtualSwitch | None = None
         self._engine: Engine | None = None
@@ -179,6 +194,17 @@ class LabServer:
             for name in ("stdout", "stderr"):
                 files.append(os.open(message[name], mode, 0o644))
             with self._require_fabric().inside(message["vehicle"]):
+                limit = None if most is None else partial(_limit_files, most)
+                if message["fork"]:
+                    pid = fork_program(
+                        _module_of(message["argv"]),
+                        cwd=message["cwd"],
+                        env=message["env"],
+                        files=(files[0], files[1]),
+                        prepare=limit,
+                    )
+                    self._children[pid] = None
+                    return {"pid": pid}
                 # All open files are close-on-exec, and `close_fds` closes them again.
                 child = subprocess.Popen(
                     message["argv"],
@@ -188,7 +214,7 @@ class LabServer:
                     stdout=files[0],
                     stderr=files[1],
                     start_new_session=True,
-                    preexec_fn=None if most is None else partial(_limit_files, most),
+                    preexec_fn=limit,
                 )
         except PermissionError as error:
             raise PermissionError(error.errno, f"{error.strerror} to {_namespaces.user()}", error.filename) from None
@@ -269,10 +295,11 @@ class LabServer:
                 return
             if pid == 0:
                 return
-            child = self._children.pop(pid, None)
-            if child is not None:
-                child.returncode = os.waitstatus_to_exitcode(status)
-                self._send({"event": "exited", "pid": pid, "returncode": child.returncode})
+            if pid in self._children:
+                returncode = os.waitstatus_to_exitcode(status)
+                if (child := self._children.pop(pid)) is not None:
+                    child.returncode = returncode
+                self._send({"event": "exited", "pid": pid, "returncode": returncode})
 
 
 def _error(error: Exception) -> dict[str, Any]:

@@ -155,6 +155,11 @@ class AgentControl:
         self._lock = asyncio.Lock()
         self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
 
+    @property
+    def exists(self) -> bool:
+        """True if the control socket exists. This is much cheaper than an attempt to connect."""
+        return self._path.exists()
+
     async def ask(self, command: str, *, timeout_s: float, **arguments: Any) -> dict[str, Any]:
         """Send a command to the agent and return its answer. The agent has `timeout_s` seconds of wall time to answer.
 

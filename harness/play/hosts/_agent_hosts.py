@@ -40,6 +40,8 @@ class AgentHosts:
         self._worker_of = {agent: worker for worker, agents in self._placed.items() for agent in agents}
         self._listeners: dict[str, socket.socket] = {}
         self._tasks: list[Any] = []
+        self._ended: dict[str, asyncio.Future[None]] = {}
+        """Worker -> the end of its task."""
         self._loop = asyncio.get_running_loop()
         self._problem: asyncio.Future[str] = self._loop.create_future()
         self.secret = secrets.token_bytes(32)
@@ -85,16 +87,18 @@ class AgentHosts:
             task = self._client.submit(play_agents, order, workers=[worker], pure=False, allow_other_workers=False)
             task.add_done_callback(partial(self._notify, worker))
             self._tasks.append(task)
+            self._ended[worker] = self._loop.create_future()
 
     def _notify(self, worker: str, task: Any) -> None:
         """Report the end of a task. A thread of Dask calls this method."""
-        if task.status == "error":
-            problem = f"the worker at {worker} cannot play its agents: {task.exception()}"
-            with contextlib.suppress(RuntimeError):  # the run is over
-                self._loop.call_soon_threadsafe(self._fail, problem)
+        problem = f"the worker at {worker} cannot play its agents: {task.exception()}" if task.status == "error" else ""
+        with contextlib.suppress(RuntimeError):  # the run is over
+            self._loop.call_soon_threadsafe(self._finish, worker, problem)
 
-    def _fail(self, problem: str) -> None:
-        if not self._problem.done():
+    def _finish(self, worker: str, problem: str) -> None:
+        if not self._ended[worker].done():
+            self._ended[worker].set_result(None)
+        if problem and not self._problem.done():
             self._problem.set_result(problem)
 
     async def watch(self) -> None:
@@ -112,10 +116,10 @@ class AgentHosts:
         """Wait until the workers have ended their agents. The workers end them as soon as the harness no longer
         listens.
         """
-        from distributed import wait
-
-        with contextlib.suppress(Exception):  # a lost worker or scheduler, which the run has reported
-            await asyncio.to_thread(wait, self._tasks, timeout=END_LIMIT_S)
+        with contextlib.suppress(OSError):  # the scheduler is lost
+            present = await asyncio.to_thread(self._client.nthreads)
+            if waiting := [ended for worker, ended in self._ended.items() if worker in present]:
+                await asyncio.wait(waiting, timeout=END_LIMIT_S)
 
 
 def _words(command: Sequence[str] | None) -> list[str] | None:

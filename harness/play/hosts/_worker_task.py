@@ -7,6 +7,7 @@ import sys
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from harness.errors import MachineError
@@ -28,14 +29,18 @@ class HostOrder:
     commands: dict[int, list[str] | None]
 
 
-def why_not(programs: list[str]) -> str | None:
+def why_not(programs: list[str], has_keys: bool) -> str | None:
     """Return a sentence if this computer cannot run agents, or if one of the agent programs is missing. Otherwise
     return None.
+
+    If `has_keys` is true, the agents get keys, and this computer must be able to decrypt them.
     """
     try:
-        far_network.first_process([])
+        far_network.needs_user_namespace()
     except LabUnavailable as error:
         return str(error)
+    if has_keys and find_spec("cryptography") is None:
+        return "this mission has keys, which must travel encrypted: run `pip install 'ucp-harness[secure]'` there"
     missing = [program for program in programs if not os.access(program, os.X_OK)]
     return f"it has no program {missing[0]}: install it there at the same path" if missing else None
 

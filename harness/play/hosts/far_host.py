@@ -14,24 +14,28 @@ from pathlib import Path
 from typing import Any
 
 from harness.errors import HarnessError
-from harness.play.remote.join import JoinRequest, directory_of_agents, first_process, play_incarnations
+from harness.play.hosts._nursery import OWN_AGENT, Nursery
+from harness.play.remote._wire import KEYS
+from harness.play.remote.join import JoinRequest, directory_of_agents, play_incarnations
+from netem import far_network
+from netem.errors import LabUnavailable
 
 READ_BYTES = 4096
 
 
-async def _play(order: dict[str, Any], command: list[str], directory: Path) -> None:
-    """Run all agents until the end of the run. If an agent fails, end the other agents, and then raise the
-    first error.
+async def _play(order: dict[str, Any], nursery: Nursery, directory: Path) -> None:
+    """Run all agents until the end of the run. If an agent fails, wait for the other agents, and then raise the first
+    error.
     """
-    own = [sys.executable, "-P", "-m", "ucp.node"]
     playing = []
     for agent, words in order["commands"].items():
         request = JoinRequest(
-            order["host"], order["port"], int(agent), bytes.fromhex(order["secret"]), words or own, service=False
+            order["host"], order["port"], int(agent), bytes.fromhex(order["secret"]), words or OWN_AGENT, service=False
         )
         folder = directory / agent
         folder.mkdir()
-        playing.append(play_incarnations(request, command, lambda sentence: None, folder))
+        (folder / KEYS).symlink_to((directory / KEYS).absolute())
+        playing.append(play_incarnations(request, nursery.start, lambda sentence: None, folder))
     for problem in await asyncio.gather(*playing, return_exceptions=True):
         if problem is not None:
             raise problem
@@ -62,9 +66,10 @@ async def _until_input_ends(work: Any) -> None:
 def main() -> None:
     order = json.loads(FileIO(sys.stdin.fileno(), closefd=False).readline())
     try:
+        nursery = Nursery(user_namespace=far_network.needs_user_namespace())
         with directory_of_agents() as directory:
-            asyncio.run(_until_input_ends(_play(order, first_process(), directory)))
-    except HarnessError as error:
+            asyncio.run(_until_input_ends(_play(order, nursery, directory)))
+    except (HarnessError, LabUnavailable) as error:
         sys.exit(str(error))
 
 

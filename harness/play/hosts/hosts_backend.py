@@ -29,7 +29,8 @@ class HostsBackend(ProcessBackend):
         programs = sorted({command[0] for command in self.agent_commands(scenario).values()})
         own = {self.agent_command(scenario, agent)[0] for agent in scenario.roster if not scenario.command_of(agent)}
         with connected(self._scheduler) as client:
-            for worker, why in client.run(why_not, [program for program in programs if program not in own]).items():
+            needed = [program for program in programs if program not in own]
+            for worker, why in client.run(why_not, needed, scenario.security is not None).items():
                 if why is not None:
                     raise MachineError(f"the worker at {worker} cannot play agents: {why}")
 
@@ -60,11 +61,6 @@ def _refuse_scenario(scenario: Scenario) -> None:
     """Raise ScenarioError if the agents of the scenario cannot run on another computer."""
     if scenario.remote is not None:
         raise ScenarioError("`remote` does not work with --scheduler, which places all agents: leave out one of them")
-    if scenario.security is not None:
-        raise ScenarioError(
-            "`security` does not work with --scheduler, because the connections to the workers would reveal the keys: "
-            "leave out one of them"
-        )
     if scenario.vehicles.kind != "none" and scenario.events.source == "mavlink":
         raise ScenarioError(
             "with --scheduler, agents cannot read the telemetry of their vehicles: add `events: {source: random}`, or "

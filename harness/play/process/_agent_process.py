@@ -106,11 +106,11 @@ class AgentProcess:
         command: Sequence[str],
         now: Callable[[], float],
         *,
-        controlled: Callable[[LabProgram], LabProgram] = lambda program: program,
+        controlled: Callable[[LabProgram], LabProgram] | None = None,
     ) -> None:
         """Create the object without starting the process. `command` starts the agent with its mission file as last
-        argument. `now` returns mission seconds. `controlled` returns the program to control in place of the started
-        one, for a remote agent.
+        argument. `now` returns mission seconds. For a remote agent, `command` starts its stand-in, and `controlled`
+        returns the program to control in place of the stand-in.
         """
         self.agent_id = agent_id
         self._command = command
@@ -191,6 +191,7 @@ class AgentProcess:
                 control=self._control_path,
                 log=self._log,
                 max_file_bytes=trace_quota(scenario, self._rundir.path),
+                has_children=self._controlled is None,
             )
         except SpawnError as error:
             if scenario.command_of(self.agent_id) is None:
@@ -206,7 +207,9 @@ class AgentProcess:
         self.outcome = "running"
 
     async def _spawn(self, lab: MissionLab, argv: Sequence[str], /, **options: Any) -> LabProgram:
-        return self._controlled(await lab.spawn(self.agent_id, argv, role="agent", **options))
+        if self._controlled is None:
+            return await lab.spawn(self.agent_id, argv, role="agent", **options)
+        return self._controlled(await lab.network.spawn(self.agent_id, argv, role="agent", fork=True, **options))
 
     def _begin_incarnation(self) -> _ProcessIncarnation:
         directory = self._rundir.agent(self.agent_id, len(self._incarnations) + 1)

@@ -493,7 +493,7 @@ class ProgramRun:
         """
         self._show("exporting")
         self.played.mission_s = round(self.clock.now(), 1)
-        self._remote.end()
+        await self._remote.end()
         if self._lag is not None:
             await self._lag.stop()
         exported = await asyncio.gather(*(agent.export_at_end() for agent in self.agents), return_exceptions=True)

@@ -52,13 +52,20 @@ class ControlledProgram:
     """A running program, its control socket, its log, and the processes that it started."""
 
     def __init__(
-        self, process: LabProgram, control: Path, log: Path, children: ChildProcesses, answer_limit_s: float
+        self,
+        process: LabProgram,
+        control: Path,
+        log: Path,
+        children: ChildProcesses,
+        answer_limit_s: float,
+        has_children: bool,
     ) -> None:
         self.process = process
         self.log = log
         self.children = children
         self._control = AgentControl(control)
         self._answer_limit_s = answer_limit_s
+        self._has_children = has_children
         self._left_behind: Sequence[str] = ()
 
     @classmethod
@@ -72,14 +79,17 @@ class ControlledProgram:
         log: Path,
         max_file_bytes: int | None = None,
         answer_limit_s: float | None = None,
+        has_children: bool = True,
     ) -> Self:
-        """Start the program in `directory`, without waiting until it is ready. The output of the program goes to `log`.
-        By default, the time limit of an answer is ANSWER_LIMIT_S. Raises SpawnError, NetemError.
+        """Start the program in `directory` without waiting until it is ready. Its output goes to `log`.
+
+        The time limit of an answer is ANSWER_LIMIT_S by default. With `has_children` false, the program starts no
+        processes, so none are sought at its end. Raises SpawnError, NetemError.
         """
         children = ChildProcesses()
         env = children.environment(os.environ)
         process = await spawn(argv, cwd=directory, env=env, stdout=log, stderr=log, max_file_bytes=max_file_bytes)
-        return cls(process, control, log, children, answer_limit_s or ANSWER_LIMIT_S)
+        return cls(process, control, log, children, answer_limit_s or ANSWER_LIMIT_S, has_children)
 
     @property
     def last_line(self) -> str:
@@ -95,6 +105,8 @@ class ControlledProgram:
         deadline = loop.time() + START_LIMIT_S
         while True:
             try:
+                if not self._control.exists:
+                    raise AgentSilentError("it has no control socket")
                 return await self._control.ask("status", timeout_s=self._answer_limit_s)
             except AgentSilentError:
                 if self.process.returncode is not None:
@@ -146,4 +158,6 @@ class ControlledProgram:
     async def end_children(self) -> list[str]:
         """End the processes that the ended program left behind, and return their names."""
         in_container, self._left_behind = self._left_behind, ()
+        if not self._has_children:
+            return [*in_container]
         return [*in_container, *await asyncio.to_thread(self.children.end_left_behind)]

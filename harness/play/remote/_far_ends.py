@@ -120,6 +120,7 @@ class FarEnds:
         self._max_handshakes = MAX_HANDSHAKES + agents
         self._host, self._name, self._places, self._has_keys = host, name, places, has_keys
         self._run = secrets.token_hex(8)
+        self._accepting: dict[socket.socket, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._stand_ins: set[socket.socket] = set()
         self._handshakes = 0
@@ -138,20 +139,29 @@ class FarEnds:
                 path.chmod(0o600)
                 inside.listen(MAX_HANDSHAKES)
                 inside.setblocking(False)
-                accepting = [
-                    *(asyncio.create_task(self._accept(listener, secret)) for listener in listeners),
-                    asyncio.create_task(self._accept_stand_ins(inside)),
-                ]
+                self._accepting = {
+                    listener: asyncio.create_task(self._accept(listener, secret)) for listener in listeners
+                }
+                accepting = asyncio.create_task(self._accept_stand_ins(inside))
                 try:
                     yield
                 finally:
-                    for task in (*accepting, *self._tasks):
+                    await self.stop_listening()
+                    for task in (accepting, *self._tasks):
                         task.cancel()
-                    await asyncio.gather(*accepting, *self._tasks, return_exceptions=True)
+                    await asyncio.gather(accepting, *self._tasks, return_exceptions=True)
                     for stand_in in [*self._stand_ins]:
                         self._forget(stand_in)
         finally:
             path.unlink(missing_ok=True)
+
+    async def stop_listening(self) -> None:
+        """Close the listening sockets. A far end whose agent has ended then knows that no other incarnation follows."""
+        for task in self._accepting.values():
+            task.cancel()
+        await asyncio.gather(*self._accepting.values(), return_exceptions=True)
+        for listener in self._accepting:
+            listener.close()
 
     def _start(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(coroutine)

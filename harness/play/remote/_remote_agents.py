@@ -76,6 +76,7 @@ class RemoteAgents:
         agents = hosts.agents if hosts else scenario.remote.agents if scenario.remote else ()
         self._vehicles = {agent: _RemoteVehicle(agent) for agent in agents}
         self._ended = False
+        self._far_ends: FarEnds | None = None
         self.when_cut_off: Callable[[], None] = lambda: None
         """A function that is called when a vehicle is cut off or connected again."""
 
@@ -91,9 +92,11 @@ class RemoteAgents:
         """Return true if the connection to the agent was lost during the run."""
         return agent_id in self._vehicles and bool(self._vehicles[agent_id].cuts)
 
-    def end(self) -> None:
-        """Keep the vehicles cut off that are cut off now, because the mission has ended."""
+    async def end(self) -> None:
+        """Keep the vehicles cut off that are cut off now, because the mission ends. No agent begins any more."""
         self._ended = True
+        if self._far_ends is not None:
+            await self._far_ends.stop_listening()
 
     def program(self, agent_id: int, stand_in: LabProgram) -> LabProgram:
         """Return the program that the harness controls in place of the stand-in."""
@@ -112,8 +115,8 @@ class RemoteAgents:
             return
         secret, listeners = self._meeting_point()
         has_keys = self._scenario.security is not None
-        far_ends = FarEnds(self, self._scenario.name, agents=len(self._vehicles), has_keys=has_keys)
-        async with far_ends.opened(listeners, secret, self._rundir.path):
+        self._far_ends = FarEnds(self, self._scenario.name, agents=len(self._vehicles), has_keys=has_keys)
+        async with self._far_ends.opened(listeners, secret, self._rundir.path):
             if self._hosts is not None:
                 self._hosts.start()
             try:

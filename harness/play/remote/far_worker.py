@@ -22,13 +22,14 @@ import signal
 import socket
 import sys
 from collections import deque
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from harness.play.remote._connection import Connection
 from harness.play.remote._far_clock import pong
+from harness.play.remote._forked_process import ForkedProcess
 from harness.play.remote._wire import (
     ADDRESS_BYTES,
     KEYS,
@@ -43,6 +44,7 @@ from harness.play.remote._wire import (
     take_over,
 )
 from netem.far_network import FarNetwork, vehicle_at
+from netem.forked_program import fork_program
 from ucp.agent_files import write_json_atomically
 from ucp.plain_file import open_plain_file, read_plain_file
 
@@ -85,10 +87,20 @@ class FileTail:
         return data
 
 
+AgentProgram = asyncio.subprocess.Process | ForkedProcess
+OwnAgent = Callable[[list[str]], int]
+
+
 class FarWorker:
     """The agent on this computer, its network, and the connection to its stand-in."""
 
-    def __init__(self, outside: socket.socket, directory: Path, command: list[str]) -> None:
+    def __init__(
+        self, outside: socket.socket, directory: Path, command: list[str], own_agent: OwnAgent | None = None
+    ) -> None:
+        """Create the object. `own_agent` is called with the mission file in a fork of this process, in place of the
+        command. It is faster.
+        """
+        self._own_agent = own_agent
         self._outside, self._directory, self._command = outside, directory, command
         self._loop = asyncio.get_running_loop()
         self._over = asyncio.Event()
@@ -105,7 +117,7 @@ class FarWorker:
         self._agent_id = 0
         self._home = directory
         self._network: FarNetwork | None = None
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: AgentProgram | None = None
         self._control: asyncio.StreamWriter | None = None
         self._asked: deque[bytes] = deque()
         """The numbers of the requests that the agent has not answered yet. The oldest number is first."""
@@ -236,16 +248,8 @@ class FarWorker:
         most = order["max_file_bytes"]
         with log.open("ab") as output:
             try:
-                self._process = await asyncio.create_subprocess_exec(
-                    *self._command,
-                    path.name,
-                    cwd=self._home,
-                    stdin=asyncio.subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=output,
-                    start_new_session=True,
-                    preexec_fn=None if most is None else partial(_limit_files, int(most)),
-                )
+                limit = None if most is None else partial(_limit_files, int(most))
+                self._process = await self._started(path.name, output.fileno(), limit)
             except OSError as error:
                 output.write(f"{self._command[0]} cannot be started: {error.strerror}\n".encode())
                 self._end({"status": 1, "left_behind": []})
@@ -269,7 +273,24 @@ class FarWorker:
         write_key_file(self._bundle, json.loads(bundle), secret=True)
         return self._bundle
 
-    async def _connect_control(self, process: asyncio.subprocess.Process) -> None:
+    async def _started(self, mission: str, output: int, limit: Callable[[], None] | None) -> AgentProgram:
+        """Start the agent, and return its process. Raises OSError."""
+        if self._own_agent is None:
+            return await asyncio.create_subprocess_exec(
+                *self._command,
+                mission,
+                cwd=self._home,
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+                preexec_fn=limit,
+            )
+        own_agent = partial(self._own_agent, [mission])
+        pid = fork_program(own_agent, cwd=str(self._home), env={**os.environ}, files=(output, output), prepare=limit)
+        return ForkedProcess(pid, os.pidfd_open(pid))
+
+    async def _connect_control(self, process: AgentProgram) -> None:
         """Connect to the control socket of the agent as soon as it exists."""
         while process.returncode is None:
             try:
@@ -315,7 +336,7 @@ class FarWorker:
             if number == signal.SIGTERM:  # a stopped process cannot react to SIGTERM
                 os.killpg(self._process.pid, signal.SIGCONT)
 
-    async def _wait_for_end(self, process: asyncio.subprocess.Process) -> None:
+    async def _wait_for_end(self, process: AgentProgram) -> None:
         status = await process.wait()
         if self._lag is not None and self._lag.stdin is not None:
             self._lag.stdin.close()
@@ -427,15 +448,20 @@ def _other_processes(own: set[int]) -> list[str]:
     return sorted(names)
 
 
-def main() -> None:
-    outside = socket.socket(fileno=int(sys.argv[1]))
+def play(descriptor: int, directory: Path, command: list[str], own_agent: OwnAgent | None = None) -> None:
+    """Play one incarnation of an agent. `descriptor` is that of the socket to the process outside."""
+    outside = socket.socket(fileno=descriptor)
     outside.setblocking(False)
     outside.set_inheritable(False)
 
     async def run() -> None:
-        await FarWorker(outside, Path(sys.argv[2]), sys.argv[3:]).run()
+        await FarWorker(outside, directory, command, own_agent).run()
 
     asyncio.run(run())
+
+
+def main() -> None:
+    play(int(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:])
 
 
 if __name__ == "__main__":

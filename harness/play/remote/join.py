@@ -19,21 +19,24 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from harness.errors import HarnessError, MachineError
 from harness.play.memory_directory import KEYS_PREFIX, memory_directory
 from harness.play.remote._handshake import PROTOCOL, HandshakeError, RefusedError, introduce
 from harness.play.remote._wire import KEYS, Channel, hand_over, prepare
-from harness.scenario import Scenario
 from netem import far_network
 from netem.errors import LabUnavailable
 from sitl.address import ListenAddress
 from ucp.features import CONTRACT
+
+if TYPE_CHECKING:
+    from harness.scenario import Scenario  # a far end starts without it
 
 CONNECT_LIMIT_S = 5.0
 RETRY_S = 1.0
@@ -78,6 +81,23 @@ class _Connected:
     """Number of incarnations of the agent that the harness runs at the same time."""
 
 
+class FarProcess(Protocol):
+    """A running `harness.play.remote.far_worker`. Its process ID is also that of its group."""
+
+    @property
+    def pid(self) -> int: ...
+
+    @property
+    def returncode(self) -> int | None: ...
+
+    async def wait(self) -> int: ...
+
+
+StartWorker = Callable[[socket.socket, Path, Sequence[str]], Awaitable[FarProcess]]
+"""A function that starts `harness.play.remote.far_worker` in a private network, with its socket, directory and
+command."""
+
+
 def join_commands(scenario: Scenario) -> list[str]:
     """Return the commands with which users let the remote agents of a scenario join."""
     remote = scenario.remote
@@ -102,26 +122,31 @@ def join(request: JoinRequest, say: Callable[[str], None]) -> None:
     """Run incarnations of the agent until the run has ended, or without end as a service. Raises MachineError if this
     machine has no private networks. Raises JoinError if no harness listens, or if the harness refuses the agent.
     """
-    asyncio.run(_Joining(request, first_process(), say).run())
-
-
-def first_process() -> list[str]:
-    """Return the command of a process in a private network that runs an agent. Raises MachineError if this machine has
-    no private networks.
-    """
     try:
-        return far_network.first_process([sys.executable, "-P", "-m", "harness.play.remote.far_worker"])
+        first_process = far_network.first_process([sys.executable, "-P", "-m", "harness.play.remote.far_worker"])
     except LabUnavailable as error:
         raise MachineError(str(error)) from None
+    asyncio.run(_Joining(request, partial(_start_worker, first_process), say).run())
 
 
 async def play_incarnations(
-    request: JoinRequest, first_process: Sequence[str], say: Callable[[str], None], directory: Path
+    request: JoinRequest, start: StartWorker, say: Callable[[str], None], directory: Path
 ) -> None:
-    """Run the incarnations of one agent. Other agents may run in the same process. The files of the agent are in
-    `directory`. See `join`.
-    """
-    await _Joining(request, first_process, say).play(directory)
+    """Play incarnations of one of several agents of this process, with its files in `directory`. See `join`."""
+    await _Joining(request, start, say).play(directory)
+
+
+async def _start_worker(
+    first_process: Sequence[str], inside: socket.socket, directory: Path, command: Sequence[str]
+) -> asyncio.subprocess.Process:
+    path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
+    return await asyncio.create_subprocess_exec(
+        *(*first_process, str(inside.fileno()), str(directory), *command),
+        stdin=asyncio.subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": path},
+        pass_fds=[inside.fileno()],
+        start_new_session=True,
+    )
 
 
 @contextmanager
@@ -157,8 +182,8 @@ def _locked(path: Path) -> Iterator[None]:
 class _Joining:
     """A far end that runs one incarnation of its agent after another."""
 
-    def __init__(self, request: JoinRequest, first_process: Sequence[str], say: Callable[[str], None]) -> None:
-        self._request, self._first_process, self._say = request, first_process, say
+    def __init__(self, request: JoinRequest, start: StartWorker, say: Callable[[str], None]) -> None:
+        self._request, self._start, self._say = request, start, say
         self._session = secrets.token_hex(8)
         self._said = ""
 
@@ -235,7 +260,7 @@ class _Joining:
         with own_end:
             own_end.setblocking(False)
             with inside:
-                worker = await self._start_worker(inside, directory)
+                worker = await self._start(inside, directory, self._request.command)
             try:
                 hand_over(own_end, connected.connection, connected.channel.to_json())
                 ended = asyncio.create_task(worker.wait())
@@ -252,16 +277,6 @@ class _Joining:
                     with contextlib.suppress(ProcessLookupError):
                         os.killpg(worker.pid, signal.SIGKILL)
                     await worker.wait()
-
-    async def _start_worker(self, inside: socket.socket, directory: Path) -> asyncio.subprocess.Process:
-        path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
-        return await asyncio.create_subprocess_exec(
-            *(*self._first_process, str(inside.fileno()), str(directory), *self._request.command),
-            stdin=asyncio.subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": path},
-            pass_fds=[inside.fileno()],
-            start_new_session=True,
-        )
 
     async def _asks(self, own_end: socket.socket, ended: asyncio.Task[int]) -> bool:
         """Wait until the worker asks for a connection, or ends. Return true if the worker asks for a connection."""

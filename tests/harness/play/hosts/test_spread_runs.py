@@ -88,7 +88,7 @@ def test_agents_on_two_workers_are_judged_as_on_one_machine(tmp_path: Path, host
         timeline=[{"at_s": 60, "reboot": [2], "down_s": 20, "disk": "kept"}, {"at_s": 120, "kill": [5]}],
     )
     away, here = tmp_path / "away", tmp_path / "here"
-    done = harness("run", path, "--seed", 1, "--scheduler", hosts.scheduler_address, "--out", away)
+    done = harness("run", path, "--seed", 1, "--scheduler", hosts.scheduler_address, "--out", away, deadline_s=240)
     assert done.returncode in (0, 4), done.stderr
     record = record_of(away)
     placed: dict[str, list[int]] = {}
@@ -101,7 +101,7 @@ def test_agents_on_two_workers_are_judged_as_on_one_machine(tmp_path: Path, host
         words = f"{agents[0]} and {agents[1]}" if len(agents) == 2 else f"{agents[0]}\u2013{agents[-1]}"
         assert f"Agents {words} ran on the worker {worker}" in (away / "report.md").read_text()
     until(lambda: hosts.left_behind() == [])
-    assert harness("run", path, "--seed", 1, "--out", here).returncode in (0, 4)
+    assert harness("run", path, "--seed", 1, "--out", here, deadline_s=240).returncode in (0, 4)
     counted = [losses(record), losses(record_of(here))]
     for lost, sent in counted:
         assert sent > 300
@@ -154,6 +154,16 @@ def test_paused_host_is_cut_off_and_returns(tmp_path: Path, hosts: Hosts) -> Non
     until(lambda: hosts.left_behind() == [])
 
 
+def test_secured_mission_gives_good_verdicts_on_a_worker(tmp_path: Path, hosts: Hosts) -> None:
+    pytest.importorskip("cryptography", reason="needs the extra `secure`")
+    hosts.start("one")
+    out = tmp_path / "run"
+    path = scenario(tmp_path, security={"keys": "fresh"}, final_reconcile=True)
+    done = harness("run", path, "--scheduler", hosts.scheduler_address, "--out", out, deadline_s=240)
+    assert (verdicts(record_of(out)), done.returncode) == (GOOD, 0), done.stderr
+    until(lambda: hosts.left_behind() == [])
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_nothing_is_left_behind_by_an_ended_command(tmp_path: Path, hosts: Hosts, number: int) -> None:
     hosts.start("one")
@@ -172,7 +182,6 @@ def test_nothing_is_left_behind_by_an_ended_command(tmp_path: Path, hosts: Hosts
         ({}, ["--backend", "sim"], "--scheduler does not work with --backend sim"),
         ({}, ["--listen", "127.0.0.1:14700"], "none joins at --listen"),
         ({}, ["--kernel", "uml"], "--scheduler does not work with --kernel uml"),
-        ({"security": {"keys": "fresh"}}, [], "`security` does not work with --scheduler"),
         ({"remote": {"agents": [2], "secret_file": "lab.key"}}, [], "`remote` does not work with --scheduler"),
         ({"vehicles": {"kind": "embedded"}, "events": {}}, [], "cannot read the telemetry of their vehicles"),
         ({}, [], "--scheduler nowhere is not an address"),
@@ -195,6 +204,6 @@ def test_worker_without_private_networks_is_named_before_the_run(tmp_path: Path,
     done = harness("run", scenario(tmp_path), "--scheduler", hosts.scheduler_address, "--out", out)
     (sentence,) = sentences(done.stderr)
     assert sentence.startswith("the worker at tcp://127.0.0.1:")
-    assert "cannot play agents: This machine does not let us make a private network" in sentence
+    assert "cannot play agents: This machine does not allow private networks" in sentence
     assert done.returncode == 3
     assert not out.exists()

@@ -1,0 +1,82 @@
+"""Fork the programs of agents on a worker from one process that has imported them.
+
+A new interpreter for each agent would spend most of the start on imports. The nursery has one thread and no event loop,
+so a fork of it is safe. It ends with the process that started it, and its children end with it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from harness.play.remote import far_worker
+from harness.play.remote._forked_process import ForkedProcess
+from netem import far_network
+from netem.forked_program import end_with
+from ucp import node
+
+MAX_ORDER_BYTES = 1 << 16
+OWN_AGENT = [sys.executable, "-P", "-m", "ucp.node"]
+"""The agent of the harness. Its program is forked, too. Any other agent is a program of its own."""
+
+
+class Nursery:
+    """The process that forks. Start it before the event loop."""
+
+    def __init__(self, *, user_namespace: bool) -> None:
+        self._requests, other_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        if os.fork() == 0:
+            self._requests.close()
+            end_with(partial(_serve, other_end, user_namespace))
+        other_end.close()
+
+    async def start(self, inside: socket.socket, directory: Path, command: Sequence[str]) -> ForkedProcess:
+        """Start `harness.play.remote.far_worker` in a private network. `inside` is its end of the socket to this
+        process.
+        """
+        order = json.dumps([str(directory), *command]).encode()
+        socket.send_fds(self._requests, [order], [inside.fileno()])
+        data, descriptors, _, _ = socket.recv_fds(self._requests, MAX_ORDER_BYTES, 1)
+        return ForkedProcess(int(data), descriptors[0])
+
+
+def _serve(requests: socket.socket, user_namespace: bool) -> None:
+    far_network.die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.dup2(os.open(os.devnull, os.O_RDWR), 0)  # the input of the parent shows that its worker lives
+    while True:
+        data, descriptors, _, _ = socket.recv_fds(requests, MAX_ORDER_BYTES, 1)
+        if not data:
+            return
+        _remove_ended_children()
+        pid = os.fork()
+        if pid == 0:
+            requests.close()
+            end_with(partial(_play, descriptors[0], json.loads(data), user_namespace))
+        os.close(descriptors[0])
+        descriptor = os.pidfd_open(pid)
+        socket.send_fds(requests, [str(pid).encode()], [descriptor])
+        os.close(descriptor)
+
+
+def _remove_ended_children() -> None:
+    try:
+        while os.waitpid(-1, os.WNOHANG)[0]:
+            pass
+    except ChildProcessError:
+        pass
+
+
+def _play(inside: int, words: list[str], user_namespace: bool) -> None:
+    """Play one incarnation as the first process of a private network."""
+    os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    far_network.become_first_process(user_namespace=user_namespace)
+    directory, *command = words
+    far_worker.play(inside, Path(directory), command, node.main if command == OWN_AGENT else None)
