@@ -10,6 +10,9 @@ traceback with the number of its flight. With any of them, the exit status is 1.
 
 import argparse
 import asyncio
+import base64
+import gzip
+import json
 import re
 import shutil
 import sys
@@ -221,6 +224,87 @@ def cut_capture(home: Path, draw: Random) -> None:
     path.write_bytes(data[: int(len(data) * draw.uniform(0.3, 0.95))])
 
 
+def _two_traces(home: Path, draw: Random) -> list[Path]:
+    traces = sorted(home.glob("*.trace.jsonl"))
+    if len(traces) < 2:
+        raise NotPossibleError
+    return draw.sample(traces, 2)
+
+
+def swap_names_of_traces(home: Path, draw: Random) -> None:
+    """Give the trace of one agent the file name of another agent, and the reverse."""
+    one, other = _two_traces(home, draw)
+    data = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(data)
+
+
+def add_cut_copy(home: Path, draw: Random) -> None:
+    """Add a copy of a trace that ends earlier."""
+    path = _a_trace(home, draw)
+    data = path.read_bytes()
+    (home / "backup.jsonl").write_bytes(data[: int(len(data) * draw.uniform(0.3, 0.98))])
+
+
+def add_other_mission(home: Path, draw: Random) -> None:
+    """Add the trace of an agent from another mission with the same roster."""
+    path = _a_trace(home, draw)
+    header, *lines = _lines(path)
+    document = json.loads(header)
+    document["initial_data"] = base64.b64encode(b"another mission").decode()
+    (home / "hover-test.jsonl").write_bytes(b"".join([json.dumps(document).encode() + b"\n", *lines]))
+
+
+def interleave_traces(home: Path, draw: Random) -> None:
+    """Write the lines of two agents alternately into one file, as two programs with one log do."""
+    one, other = _two_traces(home, draw)
+    lines = [_lines(one), _lines(other)]
+    mixed = []
+    while any(lines):
+        of_agent = draw.choice([each for each in lines if each])
+        mixed.append(of_agent.pop(0))
+    one.write_bytes(b"".join(mixed))
+    other.unlink()
+
+
+def set_clock_back(home: Path, draw: Random) -> None:
+    """Decrease all times of a trace from one line on, as a clock does that GPS or NTP corrects."""
+    path = _a_trace(home, draw)
+    lines = _lines(path)
+    start, by_s = draw.randrange(1, len(lines)), draw.uniform(0.5, 30.0)
+    for number in range(start, len(lines)):
+        entry = json.loads(lines[number])
+        if "t" in entry:
+            entry["t"] = round(entry["t"] - by_s, 6)
+            lines[number] = json.dumps(entry, separators=(",", ":")).encode() + b"\n"
+    path.write_bytes(b"".join(lines))
+
+
+def end_lines_as_windows(home: Path, draw: Random) -> None:
+    """End all lines of the text files with CR LF."""
+    for path in [*home.glob("*.trace.jsonl"), *home.glob("*.chain.json")]:
+        path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+
+
+def pack_half_a_line(home: Path, draw: Random) -> None:
+    """Pack a trace with gzip, in two parts, of which the second ends within a line."""
+    path = _a_trace(home, draw)
+    lines = _lines(path)
+    last = lines[-1][: len(lines[-1]) // 2]
+    middle = draw.randrange(1, len(lines) - 1)
+    packed = gzip.compress(b"".join(lines[:middle])) + gzip.compress(b"".join([*lines[middle:-1], last]))
+    path.with_name(f"{path.name}.gz").write_bytes(packed)
+    path.unlink()
+
+
+def cut_packed_trace(home: Path, draw: Random) -> None:
+    """Pack a trace with gzip, and cut the end of the file off."""
+    path = _a_trace(home, draw)
+    packed = gzip.compress(path.read_bytes())
+    path.with_name(f"{path.name}.gz").write_bytes(packed[: int(len(packed) * draw.uniform(0.3, 0.99))])
+    path.unlink()
+
+
 DAMAGES: dict[str, Damage] = {
     "undamaged": nothing,
     "line cut out": cut_line_out,
@@ -243,6 +327,14 @@ DAMAGES: dict[str, Damage] = {
     "exports and captures only": exports_and_captures_only,
     "export cut": cut_export,
     "capture cut, no traces": cut_capture,
+    "names of two traces swapped": swap_names_of_traces,
+    "second, cut copy of a trace": add_cut_copy,
+    "trace of another mission": add_other_mission,
+    "lines of two traces interleaved": interleave_traces,
+    "clock set back": set_clock_back,
+    "lines end with CR LF": end_lines_as_windows,
+    "packed trace with half a last line": pack_half_a_line,
+    "packed trace cut": cut_packed_trace,
 }
 
 
@@ -312,7 +404,8 @@ def bring_home(asked: Scenario, number: int, backend: BackendName, run: Path, ho
 # The commands
 
 ACCUSATION = re.compile(
-    r"deviates|behaves (only )?as with|did not react|^agent \d+ should have|expired too early|does not do what",
+    r"deviates|behaves (only )?as with|did not react|^agent \d+ should have|does not do what|"
+    r"expired too early(?!.*as if the clock had been set back)",
     re.IGNORECASE,
 )
 """A text of `reconstruct` that blames an agent."""

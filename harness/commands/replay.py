@@ -64,8 +64,9 @@ def replay_command(
 def _play(console: Console, records: Sequence[RecordedTrace], until: float | None, as_json: bool) -> NoReturn:
     """Replay complete records, and print the differences."""
     replayed_records, differ, judged = list[ReplayedRecord](), False, False
+    for sentence in dict.fromkeys(problem for record in records for problem in record.problems):
+        complain(sentence)
     for record in records:
-        _print_problems(record)
         names = ReplayNames(record)
         result = RecordPlayer(record, until).to_end()
         in_use = RecordPlayer(record, until, IN_USE).to_end()  # a debugger then stops in the handlers of `ucp`
@@ -84,7 +85,8 @@ def _step_through(
     console: Console, record: RecordedTrace, until: float | None, at_start: bool, breaks: Sequence[str], debug: bool
 ) -> NoReturn:
     """Let the user step through a record with commands. After the last command, replay the remaining steps."""
-    _print_problems(record)
+    for sentence in record.problems:
+        complain(sentence)
     names = ReplayNames(record)
     player = RecordPlayer(record, until, IN_USE if debug else REFERENCE)
     if debug:
@@ -116,11 +118,6 @@ def _in_use(in_use: ReplayResult, result: ReplayResult) -> list[Text]:
     first = in_use.first
     where = f"line {first.line}, in {first.handler}" if first.handler else f"line {first.line}"
     return [Text(f"The core of this installation{edited} first differs from the record in {where}.")]
-
-
-def _print_problems(record: RecordedTrace) -> None:
-    for sentence in record.problems:
-        complain(sentence)
 
 
 def _show(console: Console, lines: Iterable[Text]) -> None:

@@ -36,6 +36,7 @@ from harness.field.adapters.adapter import (
     TraceLine,
     Unusable,
 )
+from harness.field.depot.mission_files import SUFFIX as MISSION_SUFFIX
 from harness.field.ingest._file_owners import summarise_capture
 from harness.field.ingest._file_search import files_of
 from harness.field.ingest._ingest import FileRemark, Flight, IngestResult, UnusedPart
@@ -82,6 +83,7 @@ class ImportedFlight(BaseModel):
     roster: list[int]
     agents: dict[VehicleKey, ImportedAgent]
     more_captures: list[str] = []
+    mission_files: list[str] = []
 
 
 class ImportRemark(BaseModel):
@@ -182,6 +184,8 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
         for match in flight.flight_logs:
             if match.log.path == log and match.agent_id is not None:
                 agents.setdefault(match.agent_id, ImportedAgent()).flight_logs.append(copy)
+    for agent_id, mission_file in flight.mission_files.items():
+        _copy_file(mission_file, directory / AGENTS / f"{agent_id}{MISSION_SUFFIX}")
     if flight.public_keys is not None:
         from ucp.secure.bundle import write_public
 
@@ -197,6 +201,7 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
             _copy_capture(capture, directory, f"more-{number}")
             for number, capture in enumerate(flight.more_captures, 1)
         ],
+        mission_files=[f"{AGENTS}/{agent_id}{MISSION_SUFFIX}" for agent_id in flight.mission_files],
     )
 
 
@@ -235,9 +240,13 @@ def _copy_capture(capture: Path, directory: Path, name: str) -> str:
 def _copy_flight_log(log: Path, directory: Path, number: int) -> str:
     (directory / FLIGHT_LOGS).mkdir(exist_ok=True)
     path = f"{FLIGHT_LOGS}/{number}-{log.name}"
-    with open_plain_file(log) as file, (directory / path).open("wb") as copy:
-        shutil.copyfileobj(file, copy, _COPY_BYTES)
+    _copy_file(log, directory / path)
     return path
+
+
+def _copy_file(source: Path, path: Path) -> None:
+    with open_plain_file(source) as file, path.open("wb") as copy:
+        shutil.copyfileobj(file, copy, _COPY_BYTES)
 
 
 MAX_AGENTS = 1000

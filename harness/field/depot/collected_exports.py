@@ -88,7 +88,7 @@ class CollectedExports:
     roster: set[int] = field(default_factory=set)
     """The agents that other files of the mission name: mission files, traces, a manifest, or the record of the run."""
     traced: dict[int, list[str]] = field(default_factory=dict)
-    """Agent without an export -> hashes of the blocks that the agent completed, according to its trace."""
+    """Agent -> hashes of the blocks that the agent completed, according to its trace."""
     flight_logs: list[FlightLog] = field(default_factory=list)
     telemetry: bool = True
     """False if a file shows that the events are not telemetry of vehicles. True otherwise."""
@@ -193,7 +193,7 @@ def _is_flight_log(path: Path) -> bool:
 def _add_context(collected: CollectedExports, compared_files: Iterable[ComparedFile]) -> None:
     """Add facts from the other files of the mission: the roster, and whether the events are telemetry."""
     for each in compared_files:
-        if each.kind == "trace" and each.agent_id is not None and each.agent_id not in collected.latest:
+        if each.kind == "trace" and each.agent_id is not None:
             trace = read_trace(each.path, skim=True)
             collected.traced.setdefault(each.agent_id, []).extend(trace.completed() if trace else ())
             if unknown := unknown_names(trace.runs if trace else ()).get("operation"):

@@ -215,9 +215,11 @@ def _names(collected: CollectedExports) -> dict[str, str]:
             }
         )
     for agent_id, completed in collected.traced.items():
-        exports[agent_id] = Export.model_construct(
+        traced = Export.model_construct(
             agent_id=agent_id, completed=completed, chain=[], blocks_to_be_committed=[], reconcile_stack=[]
         )
+        known = exports.get(agent_id, traced)
+        exports[agent_id] = known.model_copy(update={"completed": list(dict.fromkeys([*completed, *known.completed]))})
     names = name_blocks(exports)
     edited = {true: f"{names.get(claimed, claimed[:12])} (edited)" for true, claimed in claims.items()}
     return {**edited, **names}
@@ -343,7 +345,7 @@ def _lost_blocks(
             )
     for agent_id, completed in collected.traced.items():
         for block_hash in completed:
-            if block_hash not in blocks:
+            if block_hash not in blocks and block_hash not in lost:
                 why = f"agent {agent_id} completed it according to its trace, but no export contains it"
                 lost[block_hash] = MissingItem(
                     agent_id=agent_id, block=names[block_hash], block_hash=block_hash, agents=[agent_id], why=why

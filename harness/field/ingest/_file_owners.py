@@ -1,6 +1,4 @@
-"""Find the mission of a packet capture, and the flight of a file with public keys. The files themselves name neither
-mission nor flight.
-"""
+"""Find the flights of files that do not name their flight: packet captures, public keys, and mission files."""
 
 import base64
 from collections.abc import Iterator, Sequence
@@ -12,6 +10,7 @@ from harness.archive.exports import ExportedBlock
 from harness.archive.packets.capture_reader import Capture, Datagram
 from harness.field.ingest._ingest import Flight, UnusedPart
 from ucp.block import Block
+from ucp.mission import Mission, MissionError, load_mission
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -92,6 +91,28 @@ def assign_keys(
                 break
     if any(signed.values()):
         left_out += [UnusedPart(path, "public keys of another mission, which sign no block here") for path in unused]
+
+
+def read_mission_file(path: Path, left_out: list[UnusedPart]) -> Mission | None:
+    """Return the mission in a mission file. If it is invalid, return None and add the reason to `left_out`."""
+    try:
+        return load_mission(path)
+    except MissionError as error:
+        left_out.append(UnusedPart(path, f"a mission file, but {str(error).removeprefix(f'{path}: ')}"))
+        return None
+
+
+def assign_mission_files(
+    flights: Sequence[Flight], found: Sequence[tuple[Path, Mission]], left_out: list[UnusedPart]
+) -> None:
+    """Assign each mission file to the flights of its mission. A flight without traces gets its roster."""
+    for path, mission in found:
+        of_mission = [flight for flight in flights if flight.initial_data == mission.initial_data]
+        for flight in of_mission:
+            flight.mission_files.setdefault(mission.agent_id, path)
+            flight.roster = flight.roster or mission.roster
+        if not of_mission:
+            left_out.append(UnusedPart(path, "a mission file of another mission, without other records"))
 
 
 def _signed(flight: Flight) -> Iterator[ExportedBlock]:

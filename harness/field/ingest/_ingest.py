@@ -47,7 +47,7 @@ class Flight:
     exports: dict[int, Export] = field(default_factory=dict)
     captures: dict[int, Path] = field(default_factory=dict)
     roster: tuple[int, ...] = ()
-    """The roster according to the traces. It is empty without traces."""
+    """The roster according to the traces or mission files. It is empty without them."""
     epoch_us: int | None = None
     """The time of mission second 0 in microseconds since the Unix epoch. None if no trace or capture contains it."""
     more_captures: list[Path] = field(default_factory=list)
@@ -58,6 +58,8 @@ class Flight:
     """Agent ID -> the files from which its trace was read."""
     flight_logs: list[MatchedLog] = field(default_factory=list)
     """The flight logs of the vehicles that carried these agents."""
+    mission_files: dict[int, Path] = field(default_factory=dict)
+    """Agent ID -> its mission file. It may be the only file of an agent that did not come home."""
     public_keys: "PublicKeys | None" = None
     """The public keys of a secured mission. None if no file contains them."""
 

@@ -13,6 +13,8 @@ from harness.field.ingest._file_owners import (
     PUBLIC_SCHEMA,
     CaptureSummary,
     assign_keys,
+    assign_mission_files,
+    read_mission_file,
     read_public_keys,
     summarise_capture,
 )
@@ -25,7 +27,10 @@ from harness.field.ingest._trace_incarnations import TraceIncarnation, read_inca
 from harness.gc_pause import gc_paused
 from ucp.events import LoggableEvent
 from ucp.export import SCHEMA as EXPORT_SCHEMA
+from ucp.mission import SCHEMA as MISSION_SCHEMA
+from ucp.mission import Mission
 from ucp.plain_file import parse_json_at
+from ucp.store import SCHEMA as STORE_SCHEMA
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
@@ -37,6 +42,7 @@ MAX_LISTED_ALIKE = 3
 """Maximum number of omitted files of one directory that are listed separately if they have the same reason."""
 _BAGS = (b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd")
 _ARCHIVES = (b"PK\x03\x04", b"7z\xbc\xaf", b"\xfd7zXZ", b"BZh", b"Rar!")
+_BEGINNING_CHARACTERS = 200
 _BLANK = " \t\r\n\0\ufeff"
 
 
@@ -67,6 +73,7 @@ class RecordSorter:
         self.logged: list[tuple[Path, int, LoggableEvent]] = []
         self.flight_logs: list[FlightLog] = []
         self._public_keys: list[tuple[Path, PublicKeys]] = []
+        self._mission_files: list[tuple[Path, Mission]] = []
         self._left_out = left_out
 
     def result(self) -> IngestResult:
@@ -75,6 +82,7 @@ class RecordSorter:
         flights = group_by_flight(self.incarnations, self.exports, self.captures, self.logged, self._left_out, remarks)
         assign_flight_logs(flights, self.flight_logs, self._left_out, remarks)
         assign_keys(flights, self._public_keys, self._left_out)
+        assign_mission_files(flights, self._mission_files, self._left_out)
         return IngestResult(flights, [*_summarise(self._left_out)], remarks)
 
     def add_file(self, path: Path) -> None:
@@ -110,8 +118,15 @@ class RecordSorter:
             text = data.decode("utf-8").strip(_BLANK)
         except UnicodeDecodeError:
             text = ""
+        if STORE_SCHEMA in text[:_BEGINNING_CHARACTERS]:
+            self._omit(path, "the store of an agent, with which it can reboot: only the agent reads it")
+            return
         if not text.startswith(("{", "[")):
             self._omit(path, _describe_content(data))
+            return
+        if MISSION_SCHEMA in text[:_BEGINNING_CHARACTERS]:
+            if (mission := read_mission_file(path, self._left_out)) is not None:
+                self._mission_files.append((path, mission))
             return
         if PUBLIC_SCHEMA in text:
             if (keys := read_public_keys(path, self._left_out)) is not None:

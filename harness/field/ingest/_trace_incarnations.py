@@ -77,12 +77,17 @@ class TraceIncarnation:
             return self.header.agent_id
         if self.agent is not None:
             return self.agent
+        if (sender := next(self.senders(), None)) is not None:
+            return sender
+        name = self.path.name.partition(".")[0]
+        return int(name) if name.isascii() and name.isdecimal() and len(name) <= 5 else None
+
+    def senders(self) -> Iterator[int]:
+        """Yield the agent ID in each sent datagram."""
         for run in self.runs:
             for sent in run.sent:
                 if sent.datagram is not None and (sender := _sender(sent.datagram.text)):
-                    return sender
-        name = self.path.name.partition(".")[0]
-        return int(name) if name.isascii() and name.isdecimal() and len(name) <= 5 else None
+                    yield sender
 
     def add(self, entry: HandlerRun | DroppedDatagram | CommandEntry, line: int) -> None:
         if isinstance(entry, HandlerRun):
@@ -249,12 +254,13 @@ class TraceReader:
         """Record lost lines that an earlier import of this trace already reported at this place."""
         if self.incarnations:
             self.incarnations[-1].add_gap(lines, lost_bytes)
-        what = "the part before this" if not lines else "1 line" if lines == 1 else f"{lines} lines"
+        what = "something here" if not lines else "1 line" if lines == 1 else f"{lines} lines"
         self._report(number, f"{what} {'were' if lines > 1 else 'was'} lost before this file was written")
 
     def finish(self, left_out: list[UnusedPart]) -> list[TraceIncarnation]:
         """Return the incarnations of the trace. If there are any, add descriptions of the damage to `left_out`."""
         incarnations = [life for life in self.incarnations if life.runs or life.asides or life.header]
+        incarnations = self._before_mixed_lines(incarnations, left_out)
         left_out += self._left_out() if incarnations else ()
         places = [place for incarnation in incarnations for place in incarnation.put_in_order()]
         left_out += places[:_MAX_LISTED]
@@ -262,6 +268,26 @@ class TraceReader:
             left_out.append(
                 UnusedPart(self.path, f"{len(places) - _MAX_LISTED} more places have lines in the wrong order")
             )
+        return incarnations
+
+    def _before_mixed_lines(
+        self, incarnations: list[TraceIncarnation], left_out: list[UnusedPart]
+    ) -> list[TraceIncarnation]:
+        """Return the incarnations up to the place from which on several agents wrote into the file at the same time.
+
+        Their lines do not name their agent. The datagrams in some lines show that these lines are of another agent
+        whose header is in the file, too.
+        """
+        agents = {life.header.agent_id for life in incarnations if life.header is not None}
+        for position, life in enumerate(incarnations if len(agents) > 1 else ()):
+            others = {*life.senders()} & agents - {life.agent_id}
+            if others:
+                for earlier in {before.agent_id: before for before in incarnations[:position]}.values():
+                    earlier.add_gap(0, 0)
+                mixed = ", ".join(map(str, sorted({*others, life.agent_id or 0} - {0})))
+                why = f"from here on, the lines of agents {mixed} are mixed, and none of them is used"
+                left_out.append(UnusedPart(self.path, why, life.first_line, self._counts))
+                return incarnations[:position]
         return incarnations
 
     def _left_out(self) -> Iterator[UnusedPart]:

@@ -47,6 +47,8 @@ KINDS = (
     "disk full in the middle",
     "incarnation missing",
     "exports and captures only",
+    "lines of two traces interleaved",
+    "clock set back",
 )
 """Some of the kinds of damage. The benchmark has all of them."""
 

@@ -1,5 +1,6 @@
 """Test the reading of many files: records are grouped by content, and every usable part is used."""
 
+import base64
 import gzip
 import json
 import os
@@ -11,6 +12,7 @@ import pytest
 
 from harness.archive.traces import MAX_LINE_BYTES, TraceGap, read_trace
 from harness.errors import FieldError
+from harness.field.adapters import import_records
 from harness.field.ingest import IngestResult, ingest_files
 from tests.harness.field.flights import flown, trace_of
 
@@ -137,6 +139,40 @@ def test_records_of_two_flights_are_separated(damaged_copy: Path, other_run: Pat
     assert result.flights[0].traces[1].runs == first.runs
     assert result.flights[1].traces[1].runs == second.runs
     assert "belong to another flight than the largest one" in report_of(result)
+
+
+def test_mixed_lines_of_two_agents_are_left_out(damaged_copy: Path) -> None:
+    one, other = trace_of(damaged_copy, 1), trace_of(damaged_copy, 2)
+    lines, others = lines_of(one), lines_of(other)
+    middle = len(lines) // 2
+    pairs = [line for pair in zip(lines[middle:], others[1:], strict=False) for line in pair]
+    one.write_bytes(b"".join([*lines[:middle], others[0], *pairs]))
+    other.unlink()
+    result = ingest_files([damaged_copy])
+    (flight,) = result.flights
+    assert len(flight.traces[1].runs) == middle - 1
+    assert flight.traces[1].gaps[-1].position == middle - 1
+    assert 2 not in flight.traces
+    assert f"line {middle + 1}: from here on, the lines of agents 1, 2 are mixed, and none" in report_of(result)
+
+
+def test_mission_file_gives_the_roster_of_exports(intact_run: Path, tmp_path: Path) -> None:
+    for path in intact_run.glob("agents/*.chain.json"):
+        shutil.copy(path, tmp_path)
+    network = {"address": "10.77.0.4", "broadcast": "10.79.255.255", "port": 14600}
+    mission = {"agent_id": 4, "roster": [1, 2, 3, 4], "initial_data": base64.b64encode(b"test, seed 1").decode()}
+    document = {"schema": "ucp-mission/1", **mission, "network": network, "events": {"source": "none"}, "seed": 1}
+    (tmp_path / "4.mission.json").write_text(json.dumps({**document, "speedup": 1}))
+    other = {**document, "initial_data": base64.b64encode(b"another").decode(), "speedup": 1}
+    (tmp_path / "other.mission.json").write_text(json.dumps(other))
+    result = ingest_files([tmp_path])
+    (flight,) = result.flights
+    assert flight.roster == (1, 2, 3, 4)
+    assert flight.mission_files == {4: tmp_path / "4.mission.json"}
+    assert "other.mission.json: a mission file of another mission" in report_of(result)
+    assert "4.mission.json" not in report_of(result)
+    import_records([tmp_path], [], tmp_path / "home")
+    assert json.loads((tmp_path / "home/agents/4.mission.json").read_text()) == {**document, "speedup": 1}
 
 
 def test_mission_flown_twice_gives_two_flights(damaged_copy: Path) -> None:

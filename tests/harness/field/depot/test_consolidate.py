@@ -143,6 +143,18 @@ def test_trace_lists_blocks_of_a_vehicle_without_export(tmp_path: Path) -> None:
     assert all(lost.block == names[str(lost.block_hash)] for lost in record.lost_blocks)
 
 
+def test_trace_lists_blocks_that_were_lost_with_a_disk(tmp_path: Path) -> None:
+    lossy = {"agents": 2, "duration_s": 300, "network": {"loss": 1.0}, "events": {"source": "random", "mean_s": 2}}
+    timeline = [{"at_s": 200, "reboot": [2], "down_s": 5, "disk": "lost"}]
+    path = write_scenario(tmp_path, **lossy, timeline=timeline)
+    harness("run", path, "--backend", "sim", "--out", tmp_path / "run")
+    record = consolidate(collect_exports([tmp_path / "run" / "agents"]))
+    assert record.missing == []
+    assert len(record.lost_blocks) > 2
+    assert [lost.block for lost in record.lost_blocks] == [f"2.{n}" for n in range(1, len(record.lost_blocks) + 1)]
+    assert f"2.{len(record.lost_blocks) + 1}" in record.names.values()
+
+
 def simulate_into(directory: Path) -> dict[int, Export]:
     """Write the run directory of three agents that lose most of their messages."""
     lossy = {"agents": 3, "duration_s": 400, "network": {"loss": 0.95}, "settle": {"limit_s": 1}}
