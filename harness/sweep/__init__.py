@@ -1,3 +1,3 @@
-"""Play many runs of a scenario: in a matrix of network conditions and other values, or with many seeds to search for
+"""Run a scenario many times: in a matrix of network conditions and other values, or with many seeds to search for
 violations.
 """

@@ -11,7 +11,7 @@ from harness.scenario.verdict_names import BAD_IN_WORDS
 from harness.sweep.explore._exploring import Explored, SearchProgress, ViolatingRun
 
 _MAX_SEEDS = 10
-"""Maximum number of seeds that a sentence names."""
+"""Maximum number of seeds that one sentence of the output lists."""
 LINE_EVERY_S = 10.0
 REDRAW_EVERY_S = 0.1
 CLEAR_LINE = "\r\x1b[2K"
@@ -19,7 +19,7 @@ CLEAR_LINE = "\r\x1b[2K"
 
 @contextlib.contextmanager
 def watching(console: Console) -> Iterator[SearchProgress]:
-    """Yield functions that print violations and the progress of the reduction.
+    """Yield functions that print each violation, and the progress of the search for a smaller scenario.
 
     On a terminal, the progress is one line that changes. Other outputs get a line every ten seconds.
     """

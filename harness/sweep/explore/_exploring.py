@@ -1,4 +1,6 @@
-"""Play seeds until a run violates a characteristic. Then record this run, reduce it, and write it as a scenario."""
+"""Run a scenario with many seeds until a run violates a characteristic. Then record this run, reduce the scenario, and
+write it to a file.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,29 +19,29 @@ from harness.sweep.explore._smaller import replays, scenario_of, shrink, size
 
 @dataclass(frozen=True, slots=True)
 class ViolatingRun:
-    """A run with bad verdicts: its seed, and the numbers or keys of the checks that failed."""
+    """A run with bad verdicts."""
 
     seed: int
     keys: tuple[str, ...]
+    """The numbers or keys of the checks with a bad verdict."""
 
 
 @dataclass
 class SearchResult:
-    """The result of a search for a violation.
-
-    `failed` maps a seed to the reason why its run has no verdict. `unfinished` contains the seeds of runs in which the
-    swarm only needed more time.
-    """
+    """The result of a search for a violation."""
 
     played: int = 0
     violation: ViolatingRun | None = None
     failed: dict[int, str] = field(default_factory=dict)
+    """Seed -> the reason why the run with this seed has no verdict."""
     unfinished: list[int] = field(default_factory=list)
+    """The seeds of runs in which the swarm only needed more time."""
     interrupted: bool = False
 
 
 def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> SearchResult:
-    """Play the seeds in order until a run violates a check. If a swarm only needs more time, this is no violation.
+    """Run the scenario with one seed after another until a run violates a check. If a swarm only needs more time, this
+    is no violation.
 
     The result is the first seed with a violation, regardless of the number of `jobs`. Ctrl-C ends the search early.
     Raises HarnessError if the scenario cannot be played.
@@ -70,31 +72,31 @@ def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: 
 
 MAX_RUNS = 5000
 SEEDS = 1000
-"""Default number of seeds that are played."""
+"""Default number of seeds with which the scenario is run."""
 
 
 @dataclass(frozen=True)
 class ShrunkScenario:
-    """The smallest scenario found that still violates the check: its file, and the number of steps of the reduction."""
+    """The smallest scenario found that still violates the check."""
 
     path: Path
+    """The file of the scenario."""
     seed: int
     violated: dict[str, Judgement]
     words: str
+    """A text that compares the size of the scenario before and after the reduction, with the number of runs."""
     replay: str
 
 
 @dataclass
 class Explored:
-    """The result of the command `explore`.
-
-    `shrunk` is the smallest scenario found. It is None if no run violated a check. `interrupted` is true if Ctrl-C
-    ended the search or the shrinking.
-    """
+    """The result of the command `explore`."""
 
     searched: SearchResult
     shrunk: ShrunkScenario | None = None
+    """The smallest scenario found. None if no run violated a check."""
     interrupted: bool = False
+    """True if Ctrl-C ended the search, or ended the attempts to make the scenario smaller."""
 
     @property
     def exit_status(self) -> int:
@@ -107,12 +109,11 @@ class Explored:
 
 @dataclass(frozen=True)
 class SearchProgress:
-    """Functions that report the progress. `on_step` is called with the number of runs so far, and the size of the
-    current scenario as text.
-    """
+    """Functions that show the progress to the user."""
 
     on_violation: Callable[[ViolatingRun], None] = field(default=lambda violation: None)
     on_step: Callable[[int, str], None] = field(default=lambda runs, words: None)
+    """Gets the number of runs so far, and a text with the size of the current scenario."""
     shown: bool = False
 
 
@@ -172,8 +173,8 @@ def smallest_of(
     max_runs: int,
     on_step: Callable[[int, str], None],
 ) -> tuple[Document, str, bool]:
-    """Return the smallest document found for which `still` returns true, a description of the reduction steps, and true
-    if the user interrupted the search.
+    """Return a tuple: the smallest document found for which `still` returns true, a text about the steps of the
+    reduction, and true if the user interrupted the search.
     """
     interrupted = False
     shrinker = Shrinker(

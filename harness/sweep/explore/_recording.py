@@ -26,7 +26,7 @@ from ucp.trigger import MessageTrigger
 
 @dataclass(frozen=True, slots=True)
 class RecordedEvent:
-    """An event that an agent logged. `completes` is true if the event completed a block."""
+    """An event that an agent logged in the recorded run. `completes` is true if the event completed a block."""
 
     at_s: float
     agent: int
@@ -36,23 +36,23 @@ class RecordedEvent:
 
 @dataclass(frozen=True, slots=True)
 class LostMessage:
-    """A message that `receiver` did not receive. `sender` sent it at `at_s`, as message number `count` of its type.
-
-    `by_quirk` is true if the message arrived but the receiver ignored it.
-    """
+    """A message that one receiver did not get."""
 
     at_s: float
+    """The mission second at which the message was sent."""
     message: str
     sender: int
     receiver: int
     count: int
+    """The number of the message among the messages of this type from this sender."""
     block: str | None
     by_quirk: bool = False
+    """True if the message arrived but the receiver ignored it."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A recorded run with its verdict. Its events and its lost messages are in order of time."""
+    """A recorded run with its verdict. Its logged events and its lost messages are in order of time."""
 
     result: Result
     logged: list[RecordedEvent]
@@ -72,8 +72,8 @@ class _EventRecorder(MemoryRecorder):
         self.events: list[RecordedEvent] = []
         self.lost: list[LostMessage] = []
         self.sent: dict[tuple[int, int], LostMessage] = {}
-        """(sender, sequence number) of each Commit Block -> its entry in `lost`, which is used if a receiver ignores
-        the message.
+        """(sender, sequence number) of a Commit Block -> the entry for this message in `lost`. The entry is used if a
+        receiver ignores the message.
         """
         self._last_of: dict[int, int] = {}
         self._counts: Counter[int] = Counter()
@@ -104,7 +104,9 @@ class _EventRecorder(MemoryRecorder):
 
 
 class _RecordingScript(FateScript):
-    """A fate script that records each message that is lost, by the script or by chance."""
+    """A script for the fates of messages. It also records each message that is lost, either because of the script or by
+    chance.
+    """
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _EventRecorder) -> None:
         super().__init__(fates, roster, name_of)

@@ -16,7 +16,7 @@ from harness.sweep.explore._recording import LostMessage, RecordedEvent
 Document = dict[str, Any]
 
 UNPLAYED = ("about", "speedup", "expect")
-"""Keys that have no effect in virtual time, or that only fit the original run."""
+"""Scenario keys that have no effect in virtual time, or that only make sense for the original run."""
 FLIGHT = ("vehicles", "flight", "network.radio")
 """Keys that only determine which messages are lost because of distance. They have no other effect in virtual time."""
 NEVER_IN_BURSTS = {"p": 0.0, "r": 1.0}
@@ -32,7 +32,9 @@ def document_of(scenario: Scenario) -> Document:
 
 
 def with_key(document: Document, key: str, value: Any) -> Document:
-    """Return the document with a new value for the key, which is a path with dots. An empty value removes it."""
+    """Return the document with a new value for a key. The key is a path with dots, such as `network.loss`. If the new
+    value is empty, the key is removed.
+    """
     first, _, rest = key.partition(".")
     if rest:
         value = with_key(document.get(first, {}), rest, value)
@@ -41,7 +43,9 @@ def with_key(document: Document, key: str, value: Any) -> Document:
 
 
 def at(document: Document, key: str) -> Any:
-    """Return the value of the key, which is a path with dots. Return None if the key is missing."""
+    """Return the value of a key, which is a path with dots, such as `network.loss`. Return None if the document does
+    not contain the key.
+    """
     value: Any = document
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None
@@ -49,8 +53,8 @@ def at(document: Document, key: str) -> Any:
 
 
 def with_script(document: Document, logged: list[RecordedEvent], drops: list[Document]) -> Document:
-    """Replace all random parts of the document: exactly these events are logged, and exactly these messages are
-    lost.
+    """Replace all random parts of the document. In the new document, agents log exactly these events, and the network
+    loses exactly these messages.
     """
     script = [event_of(event) for event in logged]
     document = _without_flight(document)
@@ -65,7 +69,7 @@ def with_script(document: Document, logged: list[RecordedEvent], drops: list[Doc
 
 
 def with_drops(document: Document, drops: list[Document]) -> Document:
-    """Replace the delivery rules of the document that lose messages. Rules with another effect remain."""
+    """Replace all delivery rules of the document that lose messages. Keep the rules with other effects."""
     others = [fate for fate in document.get("fates", []) if "drop" not in fate]
     return with_key(document, "fates", [*drops, *others])
 
@@ -118,8 +122,8 @@ def _silent(layer: Document) -> Document:
 
 
 def _silent_change(change: Document) -> Document:
-    """Return a change of the network without its message loss. The change is a timeline entry or the repeated part of a
-    schedule.
+    """Return a change of the network without its message losses. The change is a timeline entry or the repeated part of
+    a schedule.
     """
     silent = {**change, **_silent(change)}
     return {**silent, "network": _without_loss(change["network"])} if "network" in change else silent
@@ -139,7 +143,7 @@ def _with_networks(ramp: Document, change: Callable[[Document], Document]) -> Do
 
 
 def keep_agents(document: Document, kept: Collection[int]) -> Document:
-    """Return the document with only these agents. All parts that refer to other agents are removed."""
+    """Return the document with only these agents. All parts that mention other agents are removed."""
     document = {**document, "agents": sorted(kept)}
     document = with_key(document, "events.script", [event for event in script(document) if event["agent"] in kept])
     document = with_key(document, "fates", [fate for fate in document.get("fates", []) if _agents_in(fate) <= {*kept}])
@@ -161,7 +165,9 @@ def keep_agents(document: Document, kept: Collection[int]) -> Document:
 
 
 def _network(network: Document, kept: Collection[int]) -> Document:
-    """Return the network section that contains only the conditions of receivers and links among the kept agents."""
+    """Return a network section that only contains conditions for the kept agents: as receivers, or at both ends of a
+    link.
+    """
     receivers = {name: value for name, value in network.get("receivers", {}).items() if int(name) in kept}
     links = [_filter_lists(link, ("from", "to"), kept) for link in network.get("links", [])]
     network = with_key(network, "receivers", receivers)
@@ -169,7 +175,7 @@ def _network(network: Document, kept: Collection[int]) -> Document:
 
 
 def _schedule(schedule: Document, kept: Collection[int]) -> Document | None:
-    """Reduce a schedule to the kept agents. Return None if nothing remains."""
+    """Return a schedule without agents that are not kept. Return None if the schedule then has no effect."""
     if "repeat" in schedule:
         repeat = _keep_network_change(schedule["repeat"], kept)
         return {**schedule, "repeat": repeat} if repeat else None
@@ -181,7 +187,7 @@ def _schedule(schedule: Document, kept: Collection[int]) -> Document | None:
 
 
 def _keep_network_change(change: Document, kept: Collection[int]) -> Document:
-    """Reduce a network change in a timeline entry or schedule to the kept agents."""
+    """Return a network change of a timeline entry or a schedule without agents that are not kept."""
     groups = [[agent for agent in group if agent in kept] for group in change.get("partition", [])]
     change = with_key(change, "partition", [group for group in groups if group])
     return with_key(change, "network", _network(change.get("network", {}), kept))
@@ -193,7 +199,7 @@ def _agents_in(fate: Document) -> set[int]:
 
 
 def _entry(entry: Document, kept: Collection[int]) -> Document | None:
-    """Reduce a timeline entry to the kept agents. Return None if nothing remains."""
+    """Return a timeline entry without agents that are not kept. Return None if the entry then has no effect."""
     if "partition" in entry or "network" in entry:
         entry = _keep_network_change(entry, kept)
         return entry if "partition" in entry or "network" in entry else None
@@ -206,7 +212,9 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
 
 
 def _datagram(datagram: Document, kept: Collection[int]) -> Document:
-    """Return the datagram with only the kept receivers. If its source is not kept, return it without receivers."""
+    """Return an injected datagram that only has kept agents as receivers. If its source is an agent that is not kept,
+    return it without receivers.
+    """
     from_kept = datagram["source"] in kept
     reaches = {agent: at_s for agent, at_s in datagram["reaches"].items() if from_kept and int(agent) in kept}
     return {**datagram, "reaches": reaches}
@@ -236,13 +244,13 @@ def timeline(document: Document) -> list[Document]:
 
 
 def event_times(document: Document) -> list[float]:
-    """Return the times of all events and timeline entries, and the times at which temporary changes end, in order."""
+    """Return a sorted list of times: of all events, of all timeline entries, and of the ends of temporary changes."""
     passes = {entry["at_s"] + entry["for_s"] for entry in timeline(document) if "for_s" in entry}
     return sorted({entry["at_s"] for entry in (*script(document), *timeline(document))} | passes)
 
 
 def cut_after(document: Document, last_s: float) -> Document:
-    """Return the document with a mission that ends at `last_s`. Everything later is removed."""
+    """Return the document with a mission that ends at `last_s`. Everything after this time is removed."""
     document = {**document, "duration_s": max(1.0, last_s)}
     for key in ("events.script", "timeline"):
         before = [entry for entry in at(document, key) or [] if entry["at_s"] <= last_s]
@@ -256,13 +264,13 @@ def cut_after(document: Document, last_s: float) -> Document:
 
 
 def _limit_duration(entry: Document, last_s: float) -> Document:
-    """Make a temporary change permanent if it would end after `last_s`."""
+    """Make a temporary change permanent if it would end after the mission second `last_s`."""
     lasts = "for_s" in entry and entry["at_s"] + entry["for_s"] > last_s
     return with_key(entry, "for_s", None) if lasts else entry
 
 
 def move_times(document: Document, to: Callable[[float], float]) -> Document:
-    """Return the document with each time replaced by the result of `to` for this time."""
+    """Return the document with other times. For each time, the function `to` returns the new time."""
     for key in ("events.script", "timeline"):
         document = with_key(document, key, [_move_entry_times(entry, to) for entry in at(document, key) or []])
     document = with_key(document, "fates", [_move_fate_times(fate, to) for fate in document.get("fates", [])])
@@ -273,7 +281,9 @@ def move_times(document: Document, to: Callable[[float], float]) -> Document:
 
 
 def _move_fate_times(fate: Document, to: Callable[[float], float]) -> Document:
-    """Change the arrival times in a delivery rule. A rule without arrival times keeps the times at which it applies."""
+    """Change the arrival times in a delivery rule. If the rule has no arrival times, keep the times at which the rule
+    applies.
+    """
     if "arrivals" not in fate:
         return fate
     return {

@@ -21,20 +21,18 @@ from harness.sweep.explore._scenario_document import Document, at
 T = TypeVar("T")
 
 WORTH_FORKING_S = 0.03
-"""Minimum duration of a run in seconds for playing runs in parallel. For shorter runs, starting processes takes longer
-than the runs.
+"""Seconds. Runs that take less time are not run in parallel, because starting processes would take longer than the
+runs.
 """
 
 
 class BudgetSpentError(Exception):
-    """An error: the search has played its maximum number of runs."""
+    """An error: the search has reached its maximum number of runs."""
 
 
 class Shrinker:
-    """A search for smaller documents that still violate a check.
-
-    `best` is the smallest document so far for which `violates` returns true. `adopted` is called for each new smallest
-    document.
+    """A search for smaller documents that still violate a check. `best` is the smallest document so far for which
+    `violates` returned true. `adopted` is called with each new smallest document.
     """
 
     def __init__(
@@ -56,8 +54,8 @@ class Shrinker:
         self._pace_s = 1.0
 
     def first(self, candidates: Iterable[Document]) -> int | None:
-        """Play candidate scenarios, and adopt the first that still violates the check. Return its index, or None if no
-        candidate violates the check. Raises BudgetSpentError.
+        """Run candidate scenarios, and adopt the first one that still violates the check. Return the index of this
+        candidate. Return None if no candidate violates the check. Raises BudgetSpentError.
         """
         if self.runs >= self._max_runs:
             raise BudgetSpentError
@@ -93,7 +91,9 @@ class Shrinker:
                 continue
 
     def fewest(self, items: Sequence[T], with_items: Callable[[Sequence[T]], Document]) -> None:
-        """Remove ever smaller parts of `items`, until the violation needs each remaining item (ddmin, Zeller 2002)."""
+        """Remove smaller and smaller parts of `items`, until the violation does not occur without any of the remaining
+        items (ddmin, Zeller 2002).
+        """
         kept = list(items)
         if not kept or self.first([with_items([])]) is not None:
             return
@@ -123,9 +123,8 @@ def _key(document: Document) -> str:
 
 
 def file_of(document: Document, header: list[str], recording: Recording) -> str:
-    """Return the text of a scenario file.
-
-    `recording` is the recorded run of this document. Comments in the file contain its sending times.
+    """Return the text of a scenario file. `recording` is the recorded run of this scenario. Comments in the file
+    contain the times at which the run sent messages.
     """
     sent: dict[Any, LostMessage] = {
         (lost.message, lost.sender, lost.receiver, lost.count): lost for lost in recording.lost

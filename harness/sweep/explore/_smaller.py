@@ -34,11 +34,11 @@ from ucp.settings import Settings
 
 MAX_ROUNDS = 8
 MAX_PAIRED = 12
-"""Maximum number of agents for which all pairs of agents are tried."""
+"""Maximum number of agents in a scenario for which the search tries to remove each pair of agents."""
 DELAY_S = 0.02
 SLACKS_S = (0.3, 0.03)
 GAPS_S = (1, 2, 5, 10, 11, 15, 20, 30, 60)
-"""Times in seconds that are tried between two successive events, the shortest first."""
+"""Distances between two successive events in seconds, shortest first. The search tries each of them."""
 
 Record = Callable[[Document], Recording]
 
@@ -87,7 +87,7 @@ def _fates_by_count(shrinker: Shrinker, record: Record) -> None:
 
 
 def _shorten_mission(shrinker: Shrinker) -> None:
-    """End the mission as early as possible, soon after the last event."""
+    """End the mission as soon as possible after the last event."""
     moments = event_times(shrinker.best)
     low, high = -1, len(moments) - 1  # a violation is known up to `high`, none up to `low`
     while high - low > 1:
@@ -118,7 +118,7 @@ def _fewer_agents(shrinker: Shrinker) -> None:
 
 
 def _two_agents_fewer(shrinker: Shrinker, delay: Any) -> bool:
-    """Remove two agents in one step, because the violation may need an even number of voters. Return true on
+    """Try to remove two agents in one step, because the violation may need an even number of voters. Return true on
     success.
     """
     base = with_key(shrinker.best, "network.delay", delay)
@@ -165,8 +165,8 @@ def _use_defaults(shrinker: Shrinker) -> None:
 
 
 def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
-    """Change the scenario so that one event completes each block, at the time at which it was completed in the recorded
-    run.
+    """Change the scenario so that each block is completed by one event. The event occurs at the time at which the block
+    was completed in the recorded run.
     """
     document = shrinker.best
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes
@@ -203,12 +203,14 @@ def _reduce_gaps(shrinker: Shrinker) -> None:
 
 
 def _time_shift(moment: float, earlier: float) -> Callable[[float], float]:
-    """Return a function that moves the time `moment` to `earlier`, and all later times by the same amount."""
+    """Return a function that changes times. It replaces the time `moment` by `earlier`, and makes all later times
+    earlier by the same amount.
+    """
     return lambda at_s: round(at_s - moment + earlier, 6) if at_s >= moment else at_s
 
 
 def size(document: Document) -> str:
-    """Return the size of a scenario as text, such as "5 agents, 203 events, 61 fates"."""
+    """Return a text with the size of a scenario, such as "5 agents, 203 events, 61 fates"."""
     counts = {
         "agent": len(document["agents"]),
         "event": len(script(document)),

@@ -1,8 +1,8 @@
-"""Play runs of a matrix on another machine, and bring their directories to this machine.
+"""Carry out runs of a matrix on other machines, and copy their directories to this machine.
 
-A worker of a cluster plays a run with real programs in a scratch directory of its own. The directories of the runs that
-the matrix keeps come back with the results. They are small, because large traces are packed. The largest files are left
-out if a directory is still too large for a message.
+On a cluster, a worker carries out a run with real programs in its own temporary directory. If the matrix keeps the
+directory of the run, the worker returns the directory together with the results. They are small, because large traces
+are packed. The largest files are left out if a directory is still too large for a message.
 """
 
 import io
@@ -25,13 +25,17 @@ MAX_DIRECTORY_BYTES = 128 * 1024 * 1024
 
 @dataclass(frozen=True)
 class AwayRun:
-    """The outcome of a run on another machine. `archive` is its directory as a ZIP file, or empty."""
+    """The result of a run on another machine. `archive` is the run directory as a ZIP file. It is empty if no directory
+    is kept.
+    """
 
     outcome: Run | FailedTask | HarnessError
     archive: bytes
 
     def unpack(self, directory: Path) -> Run | FailedTask:
-        """Write the directory of the run, and return the outcome. Raises the HarnessError that would end the matrix."""
+        """Write the run directory to this machine, and return the result of the run. Raises HarnessError if an error in
+        the run ends the matrix.
+        """
         if self.archive:
             with zipfile.ZipFile(io.BytesIO(self.archive)) as archive:
                 archive.extractall(directory)
@@ -42,7 +46,7 @@ class AwayRun:
 
 @dataclass(frozen=True)
 class AwayPlayer:
-    """Plays any run in a worker of a Dask cluster. `play` would play it on this machine."""
+    """A function that carries out any run in a worker of a Dask cluster. On this machine, `play` would carry it out."""
 
     play: RunPlayer
 
@@ -64,7 +68,7 @@ class AwayPlayer:
 
 
 def _checked(play: RunPlayer) -> Callable[[MatrixTask], Run]:
-    """Return a function that plays a run if this machine can."""
+    """Return a function that checks whether this machine can carry out a run, and then carries it out."""
 
     def checked(task: MatrixTask) -> Run:
         play.refuse([task.point])
@@ -74,7 +78,9 @@ def _checked(play: RunPlayer) -> Callable[[MatrixTask], Run]:
 
 
 def _pack(scratch: Path, name: str) -> bytes:
-    """Return the directory `name` in `scratch` as a ZIP file. Return no bytes if the matrix does not keep it."""
+    """Return the directory `name` in `scratch` as a ZIP file. Return no bytes if the matrix does not keep the
+    directory.
+    """
     sizes = {path: path.stat().st_size for path in (scratch / name).rglob("*") if path.is_file()}
     if not sizes:
         return b""

@@ -1,9 +1,10 @@
 """Choose the order of runs if the time is not sufficient for all of them.
 
-A further run is most useful in the cell whose results are least certain. Every cell begins with two runs. After that,
-the next run belongs to the cell with the widest confidence interval. Two intervals are considered: that of the share of
-runs with one chain, and that of the messages per block relative to their mean. Cells with similar runs therefore get
-few runs, and cells with different runs get most of the time.
+A cell is a combination of values in the matrix. A further run is most useful in the cell whose results are least
+certain. First, every cell gets two runs. After that, the next run belongs to the cell with the widest confidence
+interval. Two intervals are considered: that of the share of runs with one chain, and that of the messages per block
+relative to their mean. Cells with similar runs therefore get few runs, and cells with different runs get most of the
+time.
 """
 
 import time
@@ -23,8 +24,8 @@ def informative(
     budget_s: float,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[MatrixTask]:
-    """Yield tasks until the time budget is used up. `runs` contains the finished results. The caller adds results
-    between two tasks.
+    """Yield tasks until the time budget is used up. `runs` contains the finished results. Whenever a run ends, the
+    caller adds its result to `runs`.
     """
     until = clock() + budget_s
     begun = Counter(task.point for task in runs)
@@ -40,8 +41,8 @@ def informative(
 
 
 def _information(point: MatrixPoint, runs: Mapping[MatrixTask, Run], begun: int) -> float:
-    """Return the width that the widest confidence interval of the cell will probably have after all runs that have
-    begun.
+    """Return the expected width of the widest confidence interval of a cell, after the end of all runs that
+    have begun.
     """
     if begun < _FIRST_RUNS:
         return float(2 * _FIRST_RUNS - begun)

@@ -29,22 +29,23 @@ class CellRecord(BaseModel):
 
 
 class Run(CellRecord):
-    """The result of one run: its numeric results, and its verdicts by number or key.
-
-    If a run has no verdict, `failed` or `unsupported` contains the reason: an error, or a feature that an agent lacks.
+    """The result of one run: its numeric results, and its verdicts by the number or the key of the check. If a run has
+    no verdict, `failed` contains the error, or `unsupported` names the feature that an agent lacks.
     """
 
     seed: int
     figures: dict[str, float | int | None] = {}
     verdicts: dict[str, Verdict] = {}
     deviates_in: str | None = None
-    """The handler of the first step that deviates. None without such a step."""
+    """The handler of the first step that deviates from the algorithms. None if no step deviates."""
     steps: str = ""
-    """The fingerprint of the run's handler runs. It exists in virtual time with traces. See `_run_steps`."""
+    """The fingerprint of the run's handler runs (see `_run_steps`). It is empty for real processes, and for runs
+    without traces.
+    """
     failed: str | None = None
     unsupported: str | None = None
     reached: Annotated[Any, Field(exclude=True)] = None
-    """A `harness.proof.coverage.ReachedStates` if coverage of this run was measured. The field is not written to
+    """If the coverage of this run was measured, a `harness.proof.coverage.ReachedStates`. This field is not written to
     files.
     """
 
@@ -58,12 +59,13 @@ class Run(CellRecord):
 
 
 class Cell(CellRecord):
-    """The summary of the runs with one combination of values. `failed` and `unsupported` count runs without numeric
-    results.
+    """The summary of all runs with one combination of values.
 
-    `estimates` contains an estimate for each metric. `verdicts` counts the verdicts of each check. `violated` contains
-    the seeds of the runs with a bad verdict, by check. `unfinished` contains the seeds of the runs in which the swarm
-    only needed more time. `deviations` counts the runs in which a step deviates, by the handler of the first such step.
+    `failed` and `unsupported` are numbers of runs without numeric results. `estimates` contains an estimate for each
+    metric. `verdicts` contains the number of runs with each verdict, for each check. `violated` contains the seeds of
+    runs with a bad verdict, for each check. `unfinished` contains the seeds of runs in which the swarm only needed more
+    time. In some runs, a step deviates from the algorithms. `deviations` counts these runs by the handler of the first
+    such step.
     """
 
     runs: int
@@ -77,14 +79,14 @@ class Cell(CellRecord):
 
     @property
     def finished(self) -> Estimate:
-        """The share of runs in which the swarm became idle, among all runs with a verdict on liveness."""
+        """The share of runs in which the swarm became idle. Runs without a verdict on liveness are not counted."""
         counts = self.verdicts.get("liveness", {})
         finished = counts.get("finished", 0)
         return estimate_share(finished, finished + counts.get("not finished", 0) + counts.get("never finishes", 0))
 
 
 def is_wrong(verdict: Verdict) -> bool:
-    """Return true for a bad verdict, unless the swarm only needs more time."""
+    """Return true for a bad verdict. Return false if the swarm only needs more time."""
     return kind_of(verdict) == "bad" and verdict != UNFINISHED
 
 

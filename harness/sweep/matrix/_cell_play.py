@@ -24,7 +24,9 @@ from harness.sweep.matrix._run_steps import fingerprint
 
 
 class JudgedRun(NamedTuple):
-    """A judged run. `steps` is the fingerprint of its handler runs. It is empty without traces."""
+    """A run with its verdicts. `steps` is the fingerprint of the run's handler runs. It is empty if there are no
+    traces.
+    """
 
     played: RunOutcome
     result: Result
@@ -32,7 +34,7 @@ class JudgedRun(NamedTuple):
 
 
 Judge = Callable[[Scenario, int], JudgedRun]
-"""A function that plays a scenario with a seed and judges the run."""
+"""A function that runs a scenario with a seed, and judges the run."""
 
 
 class RunFailedError(HarnessError):
@@ -43,7 +45,7 @@ class RunFailedError(HarnessError):
 
 @gc_paused()
 def simulated(scenario: Scenario, seed: int, *, tracing: bool = True) -> JudgedRun:
-    """Simulate a run in virtual time, and judge the run. Every step is judged if `tracing` is true."""
+    """Simulate a run in virtual time, and judge the run. If `tracing` is true, also judge every step of the agents."""
     from harness.run.simulate import simulate
 
     run = simulate(scenario, seed, tracing=tracing)
@@ -67,15 +69,15 @@ def _same_twice(scenario: Scenario, seed: int) -> None:
 
 @dataclass(frozen=True)
 class RunPlayer:
-    """A player for all runs of a matrix. Runs with real programs leave directories in `directory`. `judge` plays
-    simulated runs.
-    """
+    """A function that carries out any run of a matrix."""
 
     matrix: Matrix
     directory: Path
+    """The directory in which runs with real programs store their run directories."""
     judge: Judge = simulated
+    """The function that carries out and judges simulated runs."""
     covers: bool = False
-    """True if the coverage of each run is measured. In virtual time, `judge` is not used then."""
+    """True if the coverage of each run is measured. If it is true, `judge` is not used in virtual time."""
 
     def __call__(self, task: MatrixTask) -> Run:
         scenario = self.matrix.scenario_at(task.point)
@@ -107,15 +109,16 @@ class RunPlayer:
         )
 
     def refuse(self, points: Iterable[MatrixPoint]) -> None:
-        """Before the first run, check that all combinations of values can be played.
-
-        Raises HarnessError if a backend or this machine cannot play a combination.
+        """Before the first run, check for each combination of values that it can be run. Raises HarnessError if a
+        backend or this machine cannot run a combination.
         """
         for point in points:
             BACKENDS[point.backend].refuse(self.matrix.scenario_at(point))
 
     def _play_with_processes(self, scenario: Scenario, task: MatrixTask, reached: ReachedStates | None) -> JudgedRun:
-        """Play a run with real programs. Raises UnsupportedError, or RunFailedError that names the run directory."""
+        """Carry out a run with real programs. Raises UnsupportedError, or RunFailedError. The message of RunFailedError
+        names the run directory.
+        """
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # remains of an interrupted run
         try:
@@ -136,7 +139,7 @@ class RunPlayer:
 
 
 def _first_deviation(result: Result) -> str | None:
-    """Return the handler of the first step that deviates. Return None without such a step."""
+    """Return the handler of the first step that deviates from the algorithms. Return None if no step deviates."""
     steps = result.beside.get("steps")
     return steps.evidence[0].handler if steps is not None and steps.verdict == "deviates" else None
 

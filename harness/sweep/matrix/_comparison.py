@@ -24,10 +24,10 @@ from harness.sweep.matrix._run_steps import FirstChange
 
 
 class Change(CellRecord):
-    """A numeric result that has changed. `metric` is its name. Its old value is `before`, and its new value is `now`.
+    """A numeric result that has changed since an earlier night.
 
-    `difference` is the mean difference of the runs with the same seed, with its corrected interval. It is null if the
-    runs are not compared in pairs.
+    `metric` is its name, `before` its old value, and `now` its new value. `difference` is the mean difference between
+    runs with the same seed, with its corrected confidence interval. It is null if the runs are not compared in pairs.
     """
 
     metric: str
@@ -38,9 +38,10 @@ class Change(CellRecord):
 
 
 class ChangedRuns(CellRecord):
-    """The seeds of the simulated runs that differ from the same runs of the earlier night, among `pairs` compared runs.
+    """The simulated runs that differ from the same runs of the earlier night.
 
-    `first` contains the first changed handler run for at most `MAX_NAMED` of these runs.
+    `pairs` is the number of compared runs. `seeds` contains the seeds of the runs that differ. `first` contains the
+    first changed handler run of at most `MAX_NAMED` of these runs.
     """
 
     pairs: int
@@ -49,7 +50,9 @@ class ChangedRuns(CellRecord):
 
 
 class CulpritCommit(BaseModel):
-    """A commit, and the numeric result of a run before and after this commit."""
+    """A commit that changed a numeric result of a run. `before` is the result before this commit, and `after` is the
+    result after it.
+    """
 
     hash: str
     date: str
@@ -60,9 +63,8 @@ class CulpritCommit(BaseModel):
 
 
 class Culprit(CellRecord):
-    """The commits that made a numeric result worse, in the run with this seed. The oldest commit is first.
-
-    `problem` is the reason why the search did not find all of these commits, or null.
+    """The commits that made a numeric result worse, with the oldest commit first. `seed` is the seed of the run with
+    which they were found. `problem` is the reason why the search did not find all of these commits, or null.
     """
 
     metric: str
@@ -81,14 +83,14 @@ class Comparison(BaseModel):
     baseline: str
     started_at: str | None = None
     baseline_commit: str | None = None
-    """The commit of the code of that night, or null if it is unknown."""
+    """The commit of the code in the earlier night. Null if it is unknown."""
     cells: int = 0
     changes: list[Change]
     changed_runs: list[ChangedRuns] = []
     culprits: list[Culprit] = []
     """The commits that made numeric results worse, if a search for them was requested."""
     not_compared: list[str] = []
-    """A sentence for each difference between the two matrices that prevents the comparison of some cells."""
+    """A sentence for each difference between the two matrices because of which some cells cannot be compared."""
 
     @property
     def regressions(self) -> list[Change]:
@@ -96,7 +98,9 @@ class Comparison(BaseModel):
 
 
 def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
-    """Yield the changes in the order of `now`. Combinations of values that only one matrix has are omitted."""
+    """Yield the changes in the order of `now`. Combinations of values that occur in only one of the two matrices are
+    skipped.
+    """
     earlier = {cell.point: cell for cell in before}
     for cell in now:
         if cell.point not in earlier:
@@ -111,7 +115,7 @@ def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
 def compare_pairs(
     before: Sequence[Cell], now: Sequence[Cell], runs_before: Sequence[Run], runs_now: Sequence[Run]
 ) -> tuple[list[Change], list[ChangedRuns]]:
-    """Compare each pair of runs with the same seed, for all combinations of values that both matrices have."""
+    """Compare runs with the same seed in pairs, for all combinations of values that occur in both matrices."""
     earlier = {cell.point: cell for cell in before}
     runs = {run.task: run for run in runs_before}
     pairs: dict[MatrixPoint, list[tuple[Run, Run]]] = {}
@@ -147,13 +151,17 @@ def compare_pairs(
 
 
 def _differ(was: Run, run: Run) -> bool:
-    """Return true if the two runs differ. If a fingerprint is missing, compare only numeric results and verdicts."""
+    """Return true if the two runs differ. If a run has no fingerprint, only numeric results and verdicts are
+    compared.
+    """
     steps_differ = bool(was.steps and run.steps) and was.steps != run.steps
     return steps_differ or (was.figures, was.verdicts) != (run.figures, run.verdicts)
 
 
 def is_paired(point: MatrixPoint) -> bool:
-    """Return true if equal code always gives equal runs for this combination, so that single runs can be compared."""
+    """Return true if runs of this combination of values are always equal when the code is equal. Only such runs can be
+    compared one by one.
+    """
     return BACKENDS[point.backend].plays_in_memory
 
 
@@ -169,7 +177,7 @@ def _differences(metric: Metric, pairs: Sequence[tuple[Run, Run]]) -> list[float
 
 
 def _moved(before: Estimate, now: Estimate) -> str | None:
-    """Return the direction of the change if the confidence intervals do not overlap. Otherwise return None."""
+    """Return the direction of a change if the two confidence intervals do not overlap. Return None if they overlap."""
     if before.low is None or before.high is None or now.low is None or now.high is None:
         return None
     if now.high < before.low:

@@ -26,16 +26,16 @@ LIMIT_S = 600.0
 
 
 class _TimeIsUpError(Exception):
-    """An error: the time for the search is used up."""
+    """An error: the time limit for the search has passed."""
 
 
 def find_culprits(
     tonight: MatrixRecord, baseline: MatrixRecord, budget_s: float, report_progress: Callable[[str], None]
 ) -> list[Culprit]:
-    """Search for the commits that made numeric results worse, for each such cell in virtual time, until the time budget
-    is used up.
+    """Search for the commits that made numeric results worse, until the time budget is used up.
 
-    The search uses the clone from which the harness runs. Ctrl-C ends the search.
+    The search considers each cell in virtual time that has a worse result. It uses the code repository from which the
+    harness runs. Ctrl-C ends the search.
     """
     regressions = {change.point: change for change in reversed(_paired_regressions(tonight))}
     deadline, culprits = time.monotonic() + budget_s, []
@@ -61,7 +61,7 @@ def _paired_regressions(record: MatrixRecord) -> list[Change]:
 
 
 def _worst_seed(tonight: MatrixRecord, baseline: MatrixRecord, change: Change) -> int:
-    """Return the seed of the run whose numeric result became worse by the largest amount."""
+    """Return the seed of the run in which the numeric result became worse by the largest amount."""
     metric = BY_NAME[change.metric]
     sign = 1 if metric.worse == "higher" else -1
     before = {run.seed: metric.of(run.figures) for run in baseline.results if run.point == change.point}
@@ -70,7 +70,7 @@ def _worst_seed(tonight: MatrixRecord, baseline: MatrixRecord, change: Change) -
 
 
 class _CulpritSearch:
-    """A search for the commits that changed one run. The search appends these commits to the commits of `culprit`."""
+    """A search for the commits that changed one run. The search adds these commits to the list in `culprit`."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class _CulpritSearch:
             raise HarnessError("the run has the same figure at both commits, so no commit is named")
 
     def _first_after(self, good: str, bad: str, figure: float | None) -> str:
-        """Return the first commit after `good` at which the numeric result of the run differs from `figure`."""
+        """Return the first commit after `good` whose run has another numeric result than `figure`."""
         step = self._history.begin(good, bad)
         while not isinstance(step, SuspectCommits):
             try:
@@ -121,7 +121,7 @@ class _CulpritSearch:
         return step.first[0]
 
     def _figure(self, commit: str) -> float | None:
-        """Return the numeric result of the run at this commit."""
+        """Return the numeric result that the run has with the code of this commit."""
         if commit not in self._figures:
             if time.monotonic() > self._deadline:
                 raise _TimeIsUpError

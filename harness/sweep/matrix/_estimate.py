@@ -17,10 +17,8 @@ CONFIDENCE = 0.95
 
 
 class Estimate(BaseModel):
-    """The mean of a numeric result over `n` runs, with its confidence interval.
-
-    `low` and `high` are the limits of its 95 % interval. They are null for a single run. Without runs, all values are
-    null.
+    """The mean of a numeric result over `n` runs. `low` and `high` are the limits of its 95 % confidence interval. They
+    are null for a single run. If there are no runs, `mean` is null too.
     """
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
@@ -87,17 +85,16 @@ Figures = Mapping[str, float | int | None]
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A kind of numeric result of a run. `of` returns its value, or None if the run does not determine it.
-
-    `unit` is a share of the runs, a share in each run, or a number. `worse` is the direction that counts as worse. It
-    is None if neither direction does.
-    """
+    """A kind of numeric result of a run."""
 
     name: str
     label: str
     of: Callable[[Figures], float | None]
+    """Returns the value of the result, or None if the run does not determine the result."""
     unit: Literal["share of runs", "share", "number"] = "number"
+    """A share of the runs, a share in each run, or a number."""
     worse: Literal["lower", "higher"] | None = None
+    """The direction that counts as worse. None if neither direction is worse."""
 
     def estimate(self, runs: Iterable[Figures]) -> Estimate:
         values = [value for figures in runs if (value := self.of(figures)) is not None]
@@ -149,7 +146,5 @@ BEFORE_FINAL_RECONCILE = (
         worse="lower",
     ),
 )
-"""Metrics for scenarios with a final reconcile. After the final reconcile, the other metrics depend little on the
-network.
-"""
+"""Metrics for scenarios with a final reconcile. After this reconcile, other metrics hardly depend on the network."""
 BY_NAME = {metric.name: metric for metric in METRICS + BEFORE_FINAL_RECONCILE}

@@ -19,10 +19,10 @@ Load = Literal["any", "below 1", "from 1"]
 
 
 class Growth(BaseModel):
-    """A power law for the growth of the numeric result `metric`. It is fitted to single runs.
+    """A power law for the growth of the numeric result `metric`.
 
-    `backend`, `loss`, `duration_s`, `agents` and `load` (of the cell) describe these runs. A value of null stands for
-    all values.
+    It is fitted to single runs. `backend`, `loss`, `duration_s`, `agents` and `load` are the values that these runs
+    have in common. A value of null means that the runs have different values.
     """
 
     metric: str
@@ -79,8 +79,8 @@ def growths(matrix: Matrix, cells: Sequence[Cell], runs: Sequence[Run]) -> list[
 
 
 def _points(over: tuple[Variable, ...], metric: str, runs: Iterable[Run]) -> Iterable[tuple[list[float], float]]:
-    """Yield a point for each run, to which a power law is fitted. An unknown value becomes 0, so that `fit` excludes
-    and counts the run.
+    """Yield one point for each run. A power law is fitted to these points. An unknown value becomes 0, so that `fit`
+    omits the run and counts it.
     """
     for run in runs:
         values = {"agents": run.agents, "blocks": run.figures.get("blocks") or 0.0}

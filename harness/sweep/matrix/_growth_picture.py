@@ -57,7 +57,7 @@ ALSO_OVER_BLOCKS = ("messages", "bytes")
 
 @dataclass(frozen=True, slots=True)
 class ChartLineKey:
-    """The values that are the same along one line of a chart. The value that varies along the line is None."""
+    """The values that all points of a line in a chart have in common. The value that changes along the line is None."""
 
     backend: BackendName
     loss: float
@@ -67,7 +67,7 @@ class ChartLineKey:
 
 @dataclass(frozen=True, slots=True)
 class PanelLine:
-    """A line of a chart, with the number of its colour."""
+    """A line of a chart. The line has a number, which determines its colour."""
 
     number: int
     name: str
@@ -139,7 +139,7 @@ def _title(record: MatrixRecord, panel: GrowthPanel) -> str:
 
 
 def _legend(record: MatrixRecord) -> Markup:
-    """Draw the legend with the names of all lines."""
+    """Draw the legend, which contains the names of all lines."""
     parts = []
     x = svg.MARGIN + 4.0
     for line in _lines(record, panels_of(record.matrix)[0]):
@@ -191,7 +191,9 @@ def _place_of(item: Cell | Growth, panel: GrowthPanel) -> ChartLineKey:
 
 
 def _name(matrix: Matrix, losses: Sequence[float], place: ChartLineKey) -> str:
-    """Return the name of a line: the values, such as the loss rate, by which it differs from the other lines."""
+    """Return the name of a line. The name contains the values, such as the loss rate, by which the line differs from
+    the other lines.
+    """
     return ", ".join(
         [
             *([f"{words.percent(place.loss)} loss"] if len(losses) > 1 else []),
@@ -222,8 +224,8 @@ def _panel(record: MatrixRecord, panel: GrowthPanel, area: ChartArea) -> Markup:
 
 
 def _line(panel: GrowthPanel, line: PanelLine, across: Axis, up: Axis) -> Markup:
-    """Draw the points of a line with tooltips, and the fitted power law. Without a law, connect the points by straight
-    lines.
+    """Draw the points of a line, and the power law that fits them. The points have tooltips. If no power law was
+    fitted, connect the points by straight lines.
     """
     points = [(x, y, cell) for cell in line.cells if (x := _x(panel, cell)) and (y := _y(panel, cell)) is not None]
     ends = _ends(panel, line) or [(x, y) for x, y, _ in points]
@@ -246,7 +248,9 @@ def _power(panel: GrowthPanel, line: PanelLine, law: Law, prefix: str, x: float,
 
 
 def _ends(panel: GrowthPanel, line: PanelLine) -> list[tuple[float, float]]:
-    """Return the two end points of the power law's line: at the first and the last point of the data."""
+    """Return the two end points of the line that represents a power law. They are at the first and the last point of
+    the data.
+    """
     xs = [x for cell in line.cells if (x := _x(panel, cell)) and _y(panel, cell)]
     if not line.law or not xs:
         return []
@@ -255,7 +259,9 @@ def _ends(panel: GrowthPanel, line: PanelLine) -> list[tuple[float, float]]:
 
 
 def _across(panel: GrowthPanel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
-    """Return the horizontal axis. For numbers of agents, its ticks are these numbers if there is enough space."""
+    """Return the horizontal axis of a chart. If the axis shows numbers of agents and has enough space, each number of
+    agents gets a tick.
+    """
     xs = sorted({x for line in lines for cell in line.cells if (x := _x(panel, cell))}) or [1.0, 10.0]
     if panel.over == "blocks":
         return svg.log_axis(xs[0], xs[-1], area.across)
@@ -276,7 +282,9 @@ def _up(panel: GrowthPanel, lines: Sequence[PanelLine], area: ChartArea) -> Axis
 
 
 def _x(panel: GrowthPanel, cell: Cell) -> float | None:
-    """Return the value of a cell on the horizontal axis. Return None if a logarithmic axis cannot show the value."""
+    """Return the value that a cell has on the horizontal axis. Return None if a logarithmic axis cannot show
+    the value.
+    """
     return float(cell.agents) if panel.over == "agents" else _mean("blocks", cell) or None
 
 

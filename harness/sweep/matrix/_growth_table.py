@@ -34,8 +34,8 @@ EXPLANATION = (
 
 @dataclass(frozen=True, slots=True)
 class GrowthTables:
-    """The tables for one loss rate and backend: a table of means, and a table of power laws. The second has a row for
-    each group of runs and each variable.
+    """The tables for one loss rate and one backend: a table of means, and a table of power laws. The second table has a
+    row for each group of runs and each variable.
     """
 
     name: str
@@ -67,7 +67,7 @@ def _rows(growths: Iterable[Growth]) -> list[tuple[str, Variable, dict[str, Law]
 
 
 def runs_of(growth: Growth) -> str:
-    """Return a name for the runs to which a power law is fitted, such as "600 s, load < 1" or "both"."""
+    """Return a name for the runs to which a power law was fitted, such as "600 s, load < 1" or "both"."""
     names = []
     if growth.over == ("agents", "blocks"):
         names.append("both")
@@ -81,7 +81,7 @@ def runs_of(growth: Growth) -> str:
 
 
 def label(name: str) -> str:
-    """Return the title of a column. A hyphen marks where a narrow column may break it."""
+    """Return the title of a column. A hyphen shows where the title may be divided in a narrow column."""
     return "idle at end" if name == "finished" else BY_NAME[name].label
 
 
@@ -90,7 +90,7 @@ def in_one_line(label: str) -> str:
 
 
 def size_row(cell: Cell) -> list[str]:
-    """Return the means in a summary, in the order of `SIZE_METRICS`."""
+    """Return the means of a summary, in the order of `SIZE_METRICS`."""
     share = Metric("finished", "", lambda _: None, "share of runs")
     return [
         say(share, cell.finished) if name == "finished" else say(BY_NAME[name], cell.estimates.get(name, Estimate(n=0)))
@@ -99,7 +99,9 @@ def size_row(cell: Cell) -> list[str]:
 
 
 def law_row(variable: Variable, laws: dict[str, Law]) -> list[tuple[str, str]]:
-    """Return the exponents of `variable` in the order of `LAW_METRICS`, each with the quality of its power law."""
+    """Return the exponents of `variable` in the order of `LAW_METRICS`. Each exponent comes with the quality of its
+    power law.
+    """
     return [
         (say_exponent(law.exponents[variable]), say_quality(law)) if (law := laws.get(name)) else (UNKNOWN, "")
         for name in LAW_METRICS
@@ -132,14 +134,14 @@ def place(record: MatrixRecord, cell: Cell) -> list[str]:
 
 
 def say_exponent(exponent: Exponent) -> str:
-    """Format an exponent as text, with half the width of its confidence interval."""
+    """Return a text with an exponent and half the width of its confidence interval."""
     margin = (exponent.high - exponent.low) / 2
     return f"{exponent.value:.2f}\u00b1" + (f"{margin:.2f}".lstrip("0") if margin < 0.995 else f"{margin:.2g}")
 
 
 def say_quality(law: Law) -> str:
-    """Format the explained share of the variance as text. If runs were omitted, the text includes the number of
-    points.
+    """Return a text with the share of the variance that a power law explains. If runs were omitted, the text also
+    contains the number of points.
     """
     explained = "" if law.r_squared is None else f"R\u00b2\u00a0{law.r_squared:.2f}".replace("0.", ".")
     return explained + (f" n\u00a0{law.n}" if law.left_out else "")

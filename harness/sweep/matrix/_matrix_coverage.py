@@ -12,11 +12,13 @@ from harness.sweep.matrix._cell import CellRecord
 from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 
 MOST_AGENTS, MOST_BLOCKS = 3, 3
-"""Numbers of agents and blocks of the proof with whose states the coverage is compared."""
+"""The numbers of agents and blocks of a proof. The coverage of the runs is compared with the states of this proof."""
 
 
 class CellCoverage(CellRecord):
-    """The coverage by the runs with one combination of values, as far as this command has played these runs."""
+    """The coverage of the runs with one combination of values. It only contains runs that this command has
+    carried out.
+    """
 
     local_states: int
     pairs: int
@@ -24,7 +26,7 @@ class CellCoverage(CellRecord):
 
 
 class MatrixCoverage(BaseModel):
-    """The coverage by all examined runs. `all_cells` is a `ucp-coverage/1` document."""
+    """The coverage of all examined runs. `all_cells` is a `ucp-coverage/1` document."""
 
     runs: int
     all_cells: dict[str, Any]
@@ -32,7 +34,7 @@ class MatrixCoverage(BaseModel):
 
 
 class CoverageTally:
-    """A sum of the coverage of all runs."""
+    """The sum of the coverage of all runs."""
 
     def __init__(self) -> None:
         self._runs = 0
@@ -45,9 +47,8 @@ class CoverageTally:
         self._by_point[point].add(reached)
 
     def tried(self, matrix: Matrix, runs: int) -> MatrixCoverage:
-        """Return the coverage by the runs so far.
-
-        `runs` counts all runs, including those of earlier commands, whose coverage is unknown.
+        """Return the coverage of the runs so far. `runs` is the number of all runs. It includes runs of earlier
+        commands, whose coverage is unknown.
         """
         if runs > self._runs:
             self._reached.untold = f"an earlier command played {runs - self._runs} of {runs} runs"

@@ -18,7 +18,9 @@ from ucp.short_value import shown
 MAX_SEEDS = 10_000
 MAX_SEED = 2**32 - 1
 SIZES_FOR_GROWTH = 3
-"""Number of swarm sizes or mission lengths from which on power laws are fitted. Two points would match any law."""
+"""Minimum number of swarm sizes or mission lengths for which power laws are fitted. Any power law would fit
+two points.
+"""
 
 
 class MatrixPoint(NamedTuple):
@@ -31,7 +33,9 @@ class MatrixPoint(NamedTuple):
 
     @property
     def file_name(self) -> str:
-        """The name for files and directories of this combination. It is the same for all backends."""
+        """The name of this combination of values in the names of files and directories. It does not depend on the
+        backend.
+        """
         length = "" if self.duration_s is None else f"-duration-{self.duration_s}"
         return f"loss-{self.loss}-agents-{self.agents}{length}"
 
@@ -70,7 +74,7 @@ class Matrix(StrictModel):
     duration_s: (
         Annotated[list[Annotated[Seconds, Field(le=MAX_DURATION_S)]], Field(min_length=1, max_length=100)] | None
     ) = None
-    """Mission lengths in mission seconds. By default, the length of the scenario."""
+    """Mission lengths in mission seconds. By default, the mission length of the scenario."""
     backend: Annotated[list[BackendName], Field(min_length=1, default_factory=lambda: ["sim"])]
     """Backends, by default `sim`."""
     keep: Literal["violated", "all"] = "violated"
@@ -85,7 +89,7 @@ class Matrix(StrictModel):
 
     @property
     def needs_processes(self) -> bool:
-        """True if any run needs real processes, inside or outside of containers."""
+        """True if any run of the matrix needs real processes. They may be inside or outside of containers."""
         return any(not BACKENDS[backend].plays_in_memory for backend in self.backend)
 
     @property
@@ -112,7 +116,9 @@ class Matrix(StrictModel):
 
     @property
     def duration_axis(self) -> Sequence[float | None]:
-        """The mission lengths of the combinations. It contains only None if all runs have the same mission length."""
+        """The different mission lengths of the matrix. The list contains only None if all runs have the same mission
+        length.
+        """
         return self.duration_s or [None]
 
     @property
@@ -122,12 +128,12 @@ class Matrix(StrictModel):
 
     @property
     def grows_with_agents(self) -> bool:
-        """True if the matrix has enough numbers of agents to fit power laws."""
+        """True if the matrix has enough different numbers of agents to fit power laws."""
         return len(self.agents or ()) >= SIZES_FOR_GROWTH
 
     @property
     def grows_with_length(self) -> bool:
-        """True if the matrix has enough mission lengths to fit power laws."""
+        """True if the matrix has enough different mission lengths to fit power laws."""
         return len(self.duration_s or ()) >= SIZES_FOR_GROWTH
 
     @property
@@ -137,9 +143,10 @@ class Matrix(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _scenario_takes_from_the_matrix(cls, document: Any) -> Any:
-        """Set the scenario's name, number of agents and mission length to the first values of the matrix.
+        """Fill in the name, the number of agents and the mission length of the scenario.
 
-        These values are used to check the keys of the scenario that contain agent IDs or times.
+        The number and the length are the first values of the matrix. They are used to check the keys of the scenario
+        that contain agent IDs or times.
         """
         if not isinstance(document, dict):
             return document

@@ -25,7 +25,7 @@ HEAD, SERIES_HEAD, PANEL_HEIGHT, FOOT = 74, 26, 218, 26
 
 @dataclass(frozen=True, slots=True)
 class ChartPanel:
-    """The contents of a chart: its numeric results, with the names of their lines."""
+    """The contents of a chart: several numeric results, with a name for the line of each."""
 
     title: str
     lines: tuple[tuple[str, str], ...]
@@ -65,7 +65,7 @@ class PlacedPanel:
 
 @dataclass(frozen=True, slots=True)
 class PanelRow:
-    """A row of charts with its name above it. `name` is empty if the picture has only one row."""
+    """A row of charts with a title above it. `name` is the title, or empty if the picture has only one row."""
 
     name: str
     cells: list[Cell]
@@ -106,12 +106,16 @@ def _heading(name: str, top: float) -> Markup:
 
 
 def _series(record: MatrixRecord) -> list[list[Cell]]:
-    """Return the rows of results, each sorted by loss rate, or one empty row if no run has ended."""
+    """Return the results for the rows of the picture. Each row is sorted by loss rate. If no run has ended, return one
+    empty row.
+    """
     return [sorted(cells, key=lambda cell: cell.loss) for cells in series(record)] or [[]]
 
 
 def _name(record: MatrixRecord, cells: Sequence[Cell]) -> str:
-    """Return the name of a row: the values by which it differs from the other rows."""
+    """Return the title of a row of charts. The title contains the values by which the row differs from the
+    other rows.
+    """
     return ", ".join(series_name(record.matrix, cells[0].point)) if cells else ""
 
 
@@ -179,9 +183,8 @@ def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axi
 
 
 def curve(number: int, dots: Sequence[LinePoint], across: Axis, up: Axis) -> tuple[Markup, list[tuple[float, float]]]:
-    """Draw line `number` of a chart with its band of confidence intervals. Return the drawing and the points.
-
-    Unknown means are omitted.
+    """Draw the line `number` of a chart with its band of confidence intervals. Return the drawing and the points. The
+    line has no points for unknown means.
     """
     known = [dot for dot in dots if dot.estimate.mean is not None]
     bounded = [(dot.x, dot.estimate.low, dot.estimate.high) for dot in known]

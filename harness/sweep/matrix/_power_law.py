@@ -22,7 +22,7 @@ effects of the two variables cannot be separated.
 
 
 class Exponent(BaseModel):
-    """An exponent with its 95 % confidence interval."""
+    """The exponent of a variable in a power law. `low` and `high` are the limits of its 95 % confidence interval."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -97,8 +97,8 @@ def _centred(values: Sequence[float]) -> list[float]:
 
 
 def _unexplained(values: Sequence[float], by: Sequence[float]) -> list[float]:
-    """Return the residuals of `values`: the part that a regression on another variable, which may be constant, does not
-    explain.
+    """Return the residuals of `values`. A residual is the part of a value that a regression on another variable does
+    not explain. The other variable may be constant.
     """
     if max(by) - min(by) < 1e-12:
         return _centred(values)

@@ -25,14 +25,14 @@ SCHEMA = "ucp-matrix-results/1"
 
 
 class MatrixResults:
-    """The finished runs of a matrix, at most one for each task."""
+    """A list of the finished runs of a matrix. It contains at most one result for each task."""
 
     def __init__(self, directory: Path, started_at: str, runs: dict[MatrixTask, Run], file: BinaryIO) -> None:
         self.directory, self.started_at, self.runs = directory, started_at, runs
         self._file = file
 
     def add(self, run: Run) -> None:
-        """Append a run to the file. Raises MachineError if it cannot be written."""
+        """Append the result of a run to the file. Raises MachineError if the file cannot be written."""
         line = _line(run.model_dump(mode="json"))
         try:
             if self._file.write(line) < len(line):
@@ -80,8 +80,8 @@ def _header(matrix: Matrix) -> dict[str, object]:
 
 
 def _start_time(line: bytes, matrix: Matrix, directory: Path) -> str:
-    """Return the start time of the matrix in `directory`. Raises RunDirectoryError if the directory belongs to a
-    different matrix.
+    """Return the time at which the matrix in `directory` was started. Raises RunDirectoryError if the directory
+    contains the results of another matrix.
     """
     try:
         header = parse_json(line)

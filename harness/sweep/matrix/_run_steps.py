@@ -26,7 +26,7 @@ _BYTES = 2
 
 
 class HandlerStep(NamedTuple):
-    """A handler run together with the agent that ran it."""
+    """A handler run, with the ID of the agent that ran the handler."""
 
     t: float
     agent_id: int
@@ -36,8 +36,7 @@ class HandlerStep(NamedTuple):
 class FirstChange(BaseModel):
     """The first handler run at which the run with this seed differs from the same run of the earlier night.
 
-    `handler` is null if the fingerprint of the run does not include this handler run, or if the new run ended before
-    this handler run.
+    `handler` is null in two cases: the fingerprint does not include this handler run, or the new run ended before it.
     """
 
     seed: int
@@ -54,7 +53,9 @@ def fingerprint(traces: Mapping[int, Trace]) -> str:
 
 
 def first_changed(before: str, now: str) -> int | None:
-    """Return the position of the first handler run that differs. Return None if the fingerprints are equal."""
+    """Return the position of the first handler run that differs between the two fingerprints. Return None if the
+    fingerprints are equal.
+    """
     if before == now:
         return None
     was, is_now = base64.b64decode(before), base64.b64decode(now)
@@ -77,7 +78,7 @@ def name_change(scenario: Scenario, seed: int, position: int) -> FirstChange:
 
 
 def _steps(traces: Mapping[int, Trace]) -> list[HandlerStep]:
-    """Return the handler runs of all agents that had an effect, in the order of mission time."""
+    """Return the handler runs that had an effect, of all agents, in the order of mission time."""
     steps = [
         HandlerStep(run.t, agent_id, run)
         for agent_id, trace in sorted(traces.items())

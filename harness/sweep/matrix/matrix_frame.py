@@ -14,7 +14,7 @@ _TYPES = {
     "failed": pl.String,
     "unsupported": pl.String,
 }
-"""Types of the table columns other than the numeric results."""
+"""Types of the table columns that are not numeric results."""
 
 
 def matrix_frame(finished: Finished) -> pl.DataFrame:

@@ -96,15 +96,15 @@ def _cell_row(cell: Cell) -> dict[str, object]:
 
 
 def _place(point: MatrixPoint) -> dict[str, object]:
-    """Return the table columns that name a combination of values. If all runs have the same mission length, the mission
-    length has no column.
+    """Return the names of the table columns that identify a combination of values. If all runs have the same mission
+    length, there is no column for it.
     """
     return {axis: value for axis, value in point._asdict().items() if value is not None}
 
 
 def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
-    """Yield a row of `runs.csv` for each run: its values and seed, then its numeric results and verdicts, or the reason
-    why it has none.
+    """Yield a row of `runs.csv` for each run. It contains the values of the matrix, the seed, the numeric results and
+    the verdicts. For a run without results, it contains the reason.
     """
     figures = list(dict.fromkeys(name for run in runs for name in run.figures if name != "agents"))
     for run in runs:
@@ -120,7 +120,7 @@ def run_rows(runs: Sequence[Run]) -> Iterator[dict[str, Any]]:
 
 
 def to_csv(rows: Iterable[dict[str, Any]]) -> str:
-    """Return the rows as CSV. An unknown value is an empty field."""
+    """Return the rows as CSV. The field of an unknown value is empty."""
     file = io.StringIO()
     writer: csv.DictWriter[str] | None = None
     for row in rows:

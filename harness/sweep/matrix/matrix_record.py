@@ -19,7 +19,7 @@ SCHEMA = "ucp-matrix/1"
 
 
 class RunWithoutResult(CellRecord):
-    """A run without a result, and the reason."""
+    """A run without a result, with the reason why it has none."""
 
     seed: int
     reason: str
@@ -48,16 +48,16 @@ class MatrixRecord(BaseModel):
     cells: list[Cell]
     failed: list[RunWithoutResult] = []
     unsupported: list[RunWithoutResult] = []
-    """Runs in which an agent did not support a required feature."""
+    """Runs in which an agent did not support a feature that the scenario needs."""
     against: Comparison | None = None
     results: list[Run] = []
     """The judged runs in virtual time. A later night can compare its runs with these runs, in pairs with the same
     seed.
     """
     tried: MatrixCoverage | None = None
-    """The share of the protocol that the runs covered, if requested."""
+    """The share of the protocol that the runs covered. Null if the user did not ask for it."""
     growths: list[Growth] = []
-    """Power laws, if the matrix has several sizes of swarm or mission."""
+    """Power laws. They exist only if the matrix has several numbers of agents or several mission lengths."""
 
     @property
     def runs(self) -> int:

@@ -1,4 +1,4 @@
-"""Play all runs of a matrix on this machine or on a cluster, and summarise them."""
+"""Carry out all runs of a matrix on this machine or on a cluster, and summarise their results."""
 
 import time
 from collections import defaultdict
@@ -34,13 +34,13 @@ Spread = Callable[[Iterable[MatrixTask], RunPlayer], AbstractContextManager[Outc
 
 
 MAX_NAMED = 50
-"""Maximum number of changed runs in a cell for which the first changed handler run is named."""
+"""Maximum number of changed runs in a cell for which the first changed handler run is determined."""
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A matrix whose runs have ended or were interrupted: its results, and its runs, sorted by their values and
-    seeds.
+    """A matrix whose runs have ended or were interrupted. It consists of the summarised results, and the runs in the
+    order of their values and seeds.
     """
 
     record: MatrixRecord
@@ -211,8 +211,8 @@ def name_culprits(
 
 
 def _effort(scenario: Scenario) -> float:
-    """Estimate the relative time that a run takes. The time grows with the number of messages and with the number of
-    agents.
+    """Return an estimate of the time that a run takes, in arbitrary units. The time grows with the number of messages
+    and with the number of agents.
     """
     agents = len(scenario.roster)
     return agents**2 * (scenario.duration_s + min(scenario.settle.limit_s, 30 * agents))

@@ -58,7 +58,9 @@ def describe_coverage(tried: MatrixCoverage) -> Iterator[str]:
 
 
 def verdict(record: MatrixRecord) -> str:
-    """Return the headline: numbers of runs, violations, failures and worsened numeric results."""
+    """Return the headline. It contains the numbers of runs, of violations, of failures, and of numeric results that
+    became worse.
+    """
     runs = sum(cell.runs for cell in record.cells)
     parts = [f"{text.value(runs)} runs"]
     if record.outcome == "interrupted":

@@ -17,7 +17,9 @@ from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 from harness.sweep.matrix.matrix_record import MatrixRecord
 
 NAMED = 5
-"""Maximum number of runs of a cell that the table names. It only counts further runs. matrix.json names all."""
+"""Maximum number of seeds that the table lists for a cell. The table only counts the other runs. matrix.json contains
+all seeds.
+"""
 
 
 def render(record: MatrixRecord) -> RenderableType:
@@ -50,7 +52,7 @@ def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:
 
 
 def series(record: MatrixRecord) -> list[list[Cell]]:
-    """Group the summaries. The summaries of one group differ only by their loss rate."""
+    """Divide the summaries into groups. Summaries in the same group differ only in their loss rates."""
     groups: dict[tuple[object, ...], list[Cell]] = {}
     for cell in record.cells:
         groups.setdefault((cell.backend, cell.duration_s, cell.agents), []).append(cell)
@@ -58,9 +60,8 @@ def series(record: MatrixRecord) -> list[list[Cell]]:
 
 
 def axes(matrix: Matrix) -> dict[str, Callable[[MatrixPoint], str]]:
-    """Return the values that vary in the matrix, by name, with the loss rate first.
-
-    Each name has a function that formats the value of a combination.
+    """Return the values that differ within the matrix, with the loss rate first. Each value has a name, and a function
+    that formats the value of a combination.
     """
     named: dict[str, Callable[[MatrixPoint], str]] = {"loss": lambda point: words.percent(point.loss)}
     if len(matrix.agents or ()) > 1:
@@ -136,7 +137,7 @@ def unjudged(record: MatrixRecord) -> str:
 
 
 def violated(cell: Cell) -> int:
-    """Return the number of runs with a bad verdict."""
+    """Return the number of runs that have a bad verdict."""
     return len({seed for seeds in cell.violated.values() for seed in seeds})
 
 
@@ -163,13 +164,15 @@ def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
 
 
 def _first_deviations(cell: Cell) -> str:
-    """Return the handlers of the first steps that deviate, each with the number of its runs."""
+    """Return the handlers of the first steps that deviate from the algorithms, with the number of runs for each
+    handler.
+    """
     handlers = [f"{handler} ({count})" for handler, count in cell.deviations.items()]
     return f"; first in {', '.join(handlers)}" if handlers else ""
 
 
 def unsupported(record: MatrixRecord, cell: Cell) -> Iterable[str]:
-    """Return the features that agents lack for these runs, each once."""
+    """Return the features that these runs need and that agents lack, without duplicates."""
     return dict.fromkeys(run.reason for run in record.unsupported if run.point == cell.point)
 
 
@@ -218,7 +221,7 @@ def _say_culprit(culprit: Culprit) -> Iterable[str]:
 
 
 def _first_changes(changed: ChangedRuns) -> str:
-    """Return the handlers of the first handler runs that changed, and the earliest of these runs."""
+    """Return the handlers of the first handler runs that changed, and the run in which a change comes first."""
     known = [each for each in changed.first if each.handler is not None]
     if not known:
         return ""
@@ -239,7 +242,9 @@ def _say_change(change: Change) -> str:
 
 
 def _say_difference(change: Change) -> str:
-    """Format the mean difference of paired runs with its confidence interval as text, in percent if possible."""
+    """Return a text with the mean difference between runs with the same seed, and its confidence interval. The text
+    shows percentages if possible.
+    """
     metric, difference, before = BY_NAME[change.metric], change.difference, change.before.mean
     assert difference is not None, "the change is one of pairs"
     factor, unit = (1.0, "") if metric.unit == "number" else (100.0, "\u00a0points")

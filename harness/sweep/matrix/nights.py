@@ -16,7 +16,7 @@ from ucp.plain_file import json_problem, read_json
 from ucp.short_value import shown
 
 MAX_REASONS = 10
-"""Maximum number of differences between two matrices that are listed."""
+"""Maximum number of differences between two matrices that a message lists."""
 _IRRELEVANT_KEYS: Any = {"name": True, "about": True, "keep": True, "scenario": {"name", "about"}}
 
 
@@ -26,20 +26,21 @@ class OtherVersionError(ScenarioError):
 
 @dataclass(frozen=True, slots=True)
 class BaselineNight:
-    """An earlier night, with which results are compared. `not_compared` contains the reasons why some combinations of
-    values are not compared.
-
-    `record` is None if another version of the harness wrote the file and this version cannot read it.
-    """
+    """An earlier night, with which results are compared."""
 
     path: Path
     record: MatrixRecord | None
+    """The results of the night. None if another version of the harness wrote the file and this version cannot
+    read it.
+    """
     points: frozenset[MatrixPoint]
     not_compared: list[str]
+    """The reasons why some combinations of values are not compared."""
 
 
 def load_baseline(path: Path, matrix: Matrix) -> BaselineNight:
-    """Load a night for a comparison. If its matrix differs, some combinations of values are not compared.
+    """Load an earlier night for a comparison. If the matrix of that night is different, some combinations of values are
+    not compared.
 
     Raises ScenarioError if the file does not contain the results of a finished matrix, or if the matrix has only one
     seed.
@@ -81,7 +82,9 @@ def _differing(before: Any, now: Any, key: str) -> Iterator[str]:
 
 
 def load_night(path: Path, matrix: Matrix) -> MatrixRecord:
-    """Load matrix.json. Raises ScenarioError unless it contains finished results of the same matrix."""
+    """Load matrix.json. Raises ScenarioError if the file does not contain the results of a finished run of the same
+    matrix.
+    """
     record = _load(path)
     before, now = (side.model_dump(mode="json", exclude=_IRRELEVANT_KEYS) for side in (record.matrix, matrix))
     differing = [f"`{key}`" for key in now if before[key] != now[key]]
@@ -125,7 +128,9 @@ def _load(path: Path) -> MatrixRecord:
 
 
 LAST = 60
-"""Maximum number of nights that are read. File names begin with the date, and the last files in order are read."""
+"""Maximum number of files of nights that are read. The names of the files begin with the date, and the last files in
+alphabetical order are read.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +163,9 @@ def opened(directory: Path) -> Path:
 
 
 def keep(record: MatrixRecord, directory: Path) -> None:
-    """Store a finished night. Do nothing if it is already stored. Raises MachineError if the file cannot be written."""
+    """Store a finished night. If the night is already stored, do nothing. Raises MachineError if the file cannot be
+    written.
+    """
     if record.outcome != "completed":
         return
     path = directory / f"{re.sub('[^0-9TZ]', '', record.started_at)}.json"

@@ -25,7 +25,9 @@ SIGNIFICANT_DIGITS = 4
 
 @dataclass(frozen=True)
 class ComparedValue:
-    """A kind of value that is compared for each pair of runs. `of` returns None if the value of a run is unknown."""
+    """A kind of value that is compared between two runs with the same seed. `of` returns None if the value of a run is
+    unknown.
+    """
 
     label: str
     of: Callable[[Run], float | None]
@@ -71,7 +73,9 @@ COMPARED = (
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """One line of the page: the mean of the original, the mean of the variant, and the mean difference of the pairs."""
+    """One line of the page. It contains the mean of the original, the mean of the variant, and the mean difference
+    between runs with the same seed.
+    """
 
     compared: ComparedValue
     original: float | None
@@ -126,7 +130,7 @@ class VariantComparison:
 
 
 def compare_runs(variant: Variant, matrix: Matrix, original: Finished, changed: Finished) -> VariantComparison:
-    """Compare all pairs of runs that have ended, and return the result."""
+    """Compare all pairs of runs that have ended, and return the results."""
     before = {run.task: run for run in original.runs if run.judged}
     pairs: dict[MatrixPoint, list[tuple[Run, Run]]] = {}
     for run in changed.runs:

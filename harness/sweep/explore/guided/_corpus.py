@@ -35,7 +35,7 @@ from ucp.plain_file import open_plain_file, parse_json, read_plain_file
 
 SCHEMA = "ucp-corpus/1"
 MOST_BYTES = 256 * 1024
-"""Maximum size in bytes of the file of a stored run."""
+"""Maximum size of the file for a stored run, in bytes."""
 MOST_FINDINGS = 500
 MOST_NIGHTS = 400
 MOST_STATES = 10**12
@@ -58,7 +58,7 @@ CHANGED = frozenset(
         "name",
     )
 )
-"""Scenario keys in which a stored run may differ from the scenario of the corpus. None of these keys affects this
+"""Scenario keys in which a stored run may differ from the scenario of the directory. None of these keys affects this
 machine.
 """
 LONGEST_S = 3600.0
@@ -82,7 +82,7 @@ class Finding(BaseModel):
     first: NightName
     last: NightName
     words: Annotated[list[Text], Field(max_length=20)] = []
-    """Lines of text with the evidence for the finding."""
+    """Lines of text that contain the evidence for the finding."""
 
     @property
     def identity(self) -> FindingIdentity:
@@ -90,7 +90,7 @@ class Finding(BaseModel):
 
     @property
     def file(self) -> str:
-        """The name of the file with the scenario of the finding."""
+        """The name of the file that contains the scenario of the finding."""
         digest = sha256(repr((self.key, self.verdict, self.handler, self.shape)).encode()).hexdigest()[:8]
         slug = re.sub(r"[^a-z0-9]+", "_", f"{self.key} {self.verdict} {self.handler}".lower()).strip("_")[:60]
         return f"{slug}_{digest}.yaml"
@@ -105,8 +105,8 @@ class _FindingsFile(BaseModel):
 
 @dataclass
 class Corpus:
-    """An open corpus directory (stored scenarios and findings), locked against other commands. `left_out` contains a
-    sentence for each unused file.
+    """An open corpus (a directory with stored scenarios and findings). The directory is locked against other commands.
+    `left_out` contains a sentence for each file that is not used.
     """
 
     directory: Path
@@ -120,7 +120,7 @@ class Corpus:
             self._lock.close()
 
     def runs(self) -> list[CandidateRun]:
-        """Return the stored runs without duplicates, in the order of their names."""
+        """Return the stored runs in the order of their file names, without duplicates."""
         paths = sorted((self.directory / "runs").iterdir())
         if len(paths) > 2 * MOST_KEPT:
             self.left_out.append(f"{len(paths) - 2 * MOST_KEPT} of {len(paths)} files in {self.directory / 'runs'}")
@@ -163,7 +163,7 @@ class Corpus:
             return []
 
     def scenario_of(self, finding: Finding) -> Document | None:
-        """Return the scenario of a finding. Return None if its file is missing or invalid."""
+        """Return the scenario of a finding. Return None if the file of the scenario is missing or invalid."""
         path = self.directory / "findings" / finding.file
         return self._document(path) if path.exists() else None
 
@@ -256,7 +256,7 @@ def opened(directory: Path, scenario: Scenario, limits: MutationLimits) -> Corpu
 
 
 def check_fits(document: Any, base: Document, limits: MutationLimits) -> Document:
-    """Return the document if changes of the base scenario can produce it. Otherwise raise ScenarioError."""
+    """Return the document if it could result from changes of the base scenario. Otherwise raise ScenarioError."""
     if not isinstance(document, dict):
         raise ScenarioError("it is not a scenario")
     document = {"agents": base["agents"], **document}

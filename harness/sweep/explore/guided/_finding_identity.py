@@ -1,4 +1,6 @@
-"""Identify a finding independently of the run: by its verdict, its handler, and the form of its endless cycle."""
+"""Identify a finding in a way that does not depend on the run: by the verdict, the handler, and the form of the endless
+cycle.
+"""
 
 import dataclasses
 from collections import Counter, defaultdict
@@ -16,7 +18,7 @@ from ucp.settings import Settings
 CAUSED_BY_LIVELOCK = frozenset(("5", "6"))
 """Characteristics that every livelock violates, because agents in a livelock commit no further blocks."""
 TIMERS = {ON_TIMER[timer].name: timer for timer in ("voting", "phase one", "phase two", "phase three")}
-"""Handler of a timer expiry -> the timer."""
+"""Name of the handler of a timer expiry -> name of the timer."""
 ORDER = [*TIMERS.values()]
 MAX_FORM = 250
 """Maximum number of characters in the description of a cycle. A longer description is omitted."""
@@ -25,13 +27,13 @@ SIZE_SETTINGS = frozenset(("max_block_bytes", "max_event_bytes"))
 
 @dataclass(frozen=True, order=True)
 class FindingIdentity:
-    """The identity of a finding. `key` is the key of the check with a bad verdict. `handler` is empty if the evidence
-    names no handler.
-    """
+    """The identity of a finding."""
 
     key: str
+    """The key of the check with a bad verdict."""
     verdict: str
     handler: str = ""
+    """The handler that the evidence names. Empty if the evidence names no handler."""
     shape: str = ""
 
     def __str__(self) -> str:
@@ -40,9 +42,8 @@ class FindingIdentity:
 
 
 def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple[FindingIdentity, ...]:
-    """Return the identity of the finding that each bad verdict shows.
-
-    The identity includes the settings that differ from the thesis.
+    """Return the identity of the finding for each bad verdict. An identity also contains the settings that differ from
+    the thesis.
     """
     settings = _changed_settings(scenario.settings)
     return tuple(
@@ -80,9 +81,8 @@ def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) 
 
 
 def _form(cycle: Cycle) -> list[str]:
-    """Return the sequences of timers that agents repeat in the endless cycle. Equal sequences occur once in the result.
-
-    `prove` compares livelocks in the same way.
+    """Return the sequences of timers that agents repeat in an endless cycle, without duplicates. The command `prove`
+    compares livelocks in the same way.
     """
     patterns = defaultdict[int, list[str]](list)
     for step in cycle.steps:
@@ -92,7 +92,9 @@ def _form(cycle: Cycle) -> list[str]:
 
 
 def _one_repetition(pattern: Sequence[str]) -> Sequence[str]:
-    """Return one repetition of a sequence of timers. It starts with the vote timer if the sequence contains it."""
+    """Return one repetition of a sequence of timers. If the sequence contains the vote timer, the repetition starts
+    with it.
+    """
     length = len(pattern)
     divisors = (part for part in range(1, length + 1) if length % part == 0)
     once = next(part for part in divisors if [*pattern[:part]] * (length // part) == pattern)

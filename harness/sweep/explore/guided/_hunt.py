@@ -30,13 +30,13 @@ from harness.sweep.explore.guided._hunt_trial import (
 from harness.sweep.explore.guided._mutation import MutationLimits, mutate
 
 BITS = 1 << 28
-"""Size of the bit field in bits (32 MiB). If the field stores ten million numbers, about one new number in 30 is
-mistaken for a known number.
+"""Size of the bit field in bits (32 MiB). If the field contains ten million numbers, it mistakes about one of 30 new
+numbers for a known number.
 """
 
 
 class DigestSet:
-    """A set of numbers, stored as a bit field. `count` is a lower limit for the number of its members."""
+    """A set of numbers in the form of a bit field. `count` is a lower limit for the number of members."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -47,7 +47,7 @@ class DigestSet:
         return bool(self._bits[place >> 3] >> (place & 7) & 1)
 
     def add(self, number: int) -> None:
-        """Add a number that is not yet in the set."""
+        """Add a number to the set. The set must not contain the number yet."""
         place = number % BITS
         self._bits[place >> 3] |= 1 << (place & 7)
         self.count += 1
@@ -56,60 +56,64 @@ class DigestSet:
 ROUND = 64
 """Number of runs in a round."""
 MOST_KEPT = 3000
-"""Maximum number of stored documents. Above it, the documents with the lowest expected benefit are removed."""
+"""Maximum number of stored documents. If there are more, the document with the lowest expected benefit is removed."""
 MOST_FAILED = 100
 MAX_PATTERNS = 100_000
-"""Maximum number of stored patterns of failed votes, which take 50 MB. Further patterns do not count as new."""
+"""Maximum number of patterns of failed votes that are stored. These patterns take 50 MB. Further patterns do not count
+as new.
+"""
 WORTH_OF_PATTERN = 100
-"""Number of new local states that a new pattern of failed votes is worth."""
+"""A new pattern of failed votes is worth as much as this number of new local states."""
 NEWEST = 24
 NEAR_LIVELOCK = 0.6
 SEEDS = 1 << 16
 
 
 class CandidateRun(NamedTuple):
-    """A scenario document to play with a seed. Each run of the document gets an additional phase at its end, so that
-    the swarm can become idle.
+    """A scenario document, and a seed with which it is run. At the end of the run, the swarm gets an additional phase
+    in which it can become idle.
     """
 
     document: Document
     seed: int
 
     def scenario(self) -> Scenario:
-        """Return the scenario to play. Raises ValidationError if it is invalid."""
+        """Return the scenario of this candidate. Raises ValidationError if the scenario is invalid."""
         return Scenario.model_validate(with_liveness_phase(self.document))
 
 
 @dataclass
 class KeptRun:
-    """A stored scenario document. Its run has `steps` handler runs and reached `new_states` new agent states. A new
-    pattern of failed votes counts as WORTH_OF_PATTERN new states.
-    """
+    """A stored scenario document, with the results of its run."""
 
     candidate: CandidateRun
     new_states: int
+    """The number of agent states that no earlier run had reached. A new pattern of failed votes counts as
+    WORTH_OF_PATTERN new states.
+    """
     steps: int
+    """The number of handler runs."""
     failed: int
-    """Number of successive failed votes in the run's pattern, if the pattern was new."""
+    """The number of successive failed votes in the pattern of the run. 0 if the pattern was not new."""
     timers_ended_s: tuple[float, ...]
     picked: int = 0
 
     @property
     def worth(self) -> float:
-        """The expected benefit of playing changes of this document."""
+        """The expected benefit of running changed copies of this document."""
         return (1 + self.new_states) / (1 + self.picked) / (100 + self.steps)
 
     @property
     def nearness(self) -> float:
-        """The expected benefit of this document in the search for an endless cycle. It is 0 if its run had no new
-        sequence of failed votes.
+        """The expected benefit of this document for the search for an endless cycle. It is 0 if the run of the document
+        had no new pattern of failed votes.
         """
         return self.failed**2 / (1 + self.picked) / (100 + self.steps)
 
 
 @dataclass(frozen=True)
 class NewCoverage:
-    """The parts of a run's coverage that no earlier run reached, and the findings of the run."""
+    """The parts of a run's coverage that are new, because no earlier run reached them, and the findings of the run."""
 
     reached: ReachedStates
     found: tuple[FindingIdentity, ...]
@@ -139,39 +143,39 @@ class Hunt:
     reached: ReachedStates = field(default_factory=ReachedStates)
     states_overflow: DigestSet = field(default_factory=DigestSet)
     pairs_overflow: DigestSet = field(default_factory=DigestSet)
-    """Digests of the pairs (state, input) that were reached after `reached` was full."""
+    """Digests of the pairs (state, input) that runs reached after the collection `reached` was full."""
     kept: list[KeptRun] = field(default_factory=list)
     runs: int = 0
     found: dict[FindingIdentity, CandidateRun] = field(default_factory=dict)
-    """Findings, each with the first run that showed it."""
+    """Finding -> the first run that showed the finding."""
     shown: Counter[FindingIdentity] = field(default_factory=Counter)
-    """Number of runs that showed each finding."""
+    """Finding -> the number of runs that showed the finding."""
     unfinished: int = 0
     """Number of runs without a bad result in which the swarm only needed more time."""
     failures: int = 0
     failed: list[tuple[CandidateRun, str]] = field(default_factory=list)
-    """The first runs without a verdict, each with the reason. `failures` counts all runs without a verdict."""
+    """The first runs that have no verdict, with the reasons. `failures` is the number of all runs without a verdict."""
     _dropped: list[CandidateRun] = field(default_factory=list)
     _known_divergences: set[Divergence] = field(default_factory=set)
-    """Known differences between the chains of an idle swarm. The first run with each difference is played again with a
-    final reconcile.
+    """The known ways in which the chains of an idle swarm differ. The first run with a new difference is run again with
+    a final reconcile.
     """
     _known_patterns: set[TimerPatterns] = field(default_factory=set)
-    """Known patterns of failed votes. The first run with each pattern is stored."""
+    """The known patterns of failed votes. The first run with a new pattern is stored."""
     _to_reconcile: list[CandidateRun] = field(default_factory=list)
 
     def begin(self, candidates: Iterable[CandidateRun], jobs: int) -> Iterator[tuple[CandidateRun, bool]]:
-        """Play these candidates unchanged. Yield each played run, and true if it is stored."""
+        """Run these candidates without changes. Yield each run, and true if the run is stored."""
         yield from self._play(list(candidates), jobs)
 
     def round(self, jobs: int) -> Iterator[tuple[CandidateRun, bool]]:
-        """Change stored documents and play them. Yield each played run, and true if it is stored."""
+        """Change stored documents at random, and run the results. Yield each run, and true if the run is stored."""
         to_reconcile, self._to_reconcile = self._to_reconcile, []
         worth = list(accumulate(kept.worth for kept in self.kept))
         yield from self._play([*to_reconcile, *(self._next(worth) for _ in range(ROUND))], jobs)
 
     def dropped(self) -> list[CandidateRun]:
-        """Return the documents that were removed since the last call."""
+        """Return the documents that were removed since the last call of this method."""
         dropped, self._dropped = self._dropped, []
         return dropped
 
@@ -250,8 +254,8 @@ class Hunt:
         return CandidateRun(document, kept.candidate.seed if rng.random() < 0.8 else rng.randrange(SEEDS))
 
     def _pick(self, worth: Sequence[float]) -> KeptRun:
-        """Choose a stored document. Half of the choices are among the newest documents, and the other choices prefer
-        documents with a high expected benefit.
+        """Choose a stored document at random. In half of all cases, choose one of the newest documents. In the other
+        cases, prefer documents with a high expected benefit.
 
         `worth` contains cumulative sums of the expected benefits.
         """
@@ -265,9 +269,7 @@ class Hunt:
 
 
 def _count_new(numbers: Iterable[int], exact: Collection[int], overflow: DigestSet) -> int:
-    """Return how many of the numbers are in neither collection. If `exact` is full, add the new numbers to
-    `overflow`.
-    """
+    """Count the numbers that are in neither collection. If `exact` is full, add the new numbers to `overflow`."""
     new = [number for number in numbers if number not in exact and number not in overflow]
     if len(exact) >= MOST:
         for number in new:

@@ -34,14 +34,14 @@ from ucp.trigger import TimerTrigger
 
 APPROVED = (ON_TIMER["voting"].name, "approved")
 MOST = 16
-"""Maximum number of timers in a pattern. Only the last timers are kept."""
+"""Maximum number of timers in a pattern. A longer pattern is reduced to its last timers."""
 
 TimerPatterns = tuple[tuple[str, ...], ...]
-"""The timers of each agent that expired, in order."""
+"""The timers that expired in each agent, in order of time."""
 
 
 class TimerEnd(NamedTuple):
-    """The expiry of a timer, and the branch that its handler took."""
+    """The expiry of a timer, with the branch that the handler of this expiry took."""
 
     at_s: float
     agent_id: int
@@ -61,8 +61,8 @@ def timers_ended(evidence: Evidence) -> list[TimerEnd]:
 
 
 def failed_votes(timer_ends: Iterable[TimerEnd]) -> TimerPatterns:
-    """Return the longest sequence of timer expiries without an approved vote, divided by agent. The result is empty if
-    fewer than two votes failed in this sequence.
+    """Return the longest sequence of timer expiries in which no vote was approved, as one list for each agent. The
+    result is empty if fewer than two votes failed in the sequence.
     """
     longest: Sequence[TimerEnd] = ()
     for approved, stretch in groupby(timer_ends, lambda each: (each.handler, each.branch) == APPROVED):
@@ -81,16 +81,16 @@ MOST_BLOCKS = 12
 nothing about the value of a run.
 """
 LAST_S = 240.0
-"""Lower limit for the mission second up to which blocks are completed."""
+"""Lower limit for the mission second up to which agents complete blocks."""
 CLEARED_S = 0.001
-"""Number of seconds before the end of the mission at which network conditions are removed."""
+"""Seconds between the removal of all network conditions and the end of the mission."""
 LONGEST_GAP_S = 40.0
-"""Maximum number of seconds between two events. A vote and a reconcile end within this time."""
+"""Maximum number of seconds between two events. A vote or a reconcile takes less time than this."""
 
 
 Divergence = tuple[tuple[int, int], ...]
-"""The differences between chains. For each different chain: the number of agents that hold it, and the number of its
-blocks after the mutual chain. The pairs are sorted.
+"""The differences between the chains of a swarm, as a sorted list of pairs. There is one pair for each different chain:
+the number of agents that hold the chain, and the number of its blocks after the mutual chain.
 """
 
 
@@ -101,18 +101,22 @@ class PlayedRun:
     reached: ReachedStates
     found: tuple[FindingIdentity, ...]
     divergence: Divergence | None = None
-    """The differences between the chains of the idle swarm, for a run without a final reconcile."""
+    """The differences between the chains of the idle swarm. Only for a run without a final reconcile."""
     timers_ended_s: tuple[float, ...] = ()
-    """Times of the timer expiries before the liveness phase, in order."""
+    """The times of the timer expiries before the liveness phase, in order. The liveness phase is the end of the run, in
+    which the swarm can become idle.
+    """
     failed_votes: TimerPatterns = ()
-    """The longest pattern of failed votes in the liveness phase."""
+    """The longest pattern of failed votes in the liveness phase (the end of the run, in which the swarm can become
+    idle).
+    """
     unfinished: bool = False
-    """True if the run has no bad result but the swarm needed more time."""
+    """True if the run has no bad result, and the swarm only needed more time."""
 
 
 @gc_paused()
 def play_trial(scenario: Scenario, seed: int) -> PlayedRun:
-    """Play a scenario, and return the result. Raises HarnessError if it cannot be played."""
+    """Run a scenario, and return the result. Raises HarnessError if the scenario cannot be run."""
     watcher = CoverageWatcher()
     simulated = simulate_watched(scenario, seed, watcher.step)
     result, evidence = simulated.result, simulated.evidence
@@ -140,8 +144,8 @@ def findings_of(scenario: Scenario, seed: int) -> tuple[FindingIdentity, ...]:
 
 
 def with_liveness_phase(document: Document) -> Document:
-    """Return the document with entries that remove all network conditions at the end of the mission, so that the swarm
-    can become idle.
+    """Return the document with additional timeline entries. They remove all network conditions at the end of the
+    mission, so that the swarm can become idle.
     """
     ends_s = float(document.get("duration_s", 1200.0))
     fates = [_until(fate, ends_s) for fate in document.get("fates", []) if fate.get("from_s", 0.0) < ends_s]
@@ -158,7 +162,7 @@ def with_liveness_phase(document: Document) -> Document:
 
 
 def without_liveness_phase(document: Document) -> Document:
-    """Return the document without the entries that `with_liveness_phase` added."""
+    """Return the document without the timeline entries that `with_liveness_phase` added."""
     last_s = float(document.get("duration_s", 1200.0)) - 3 * CLEARED_S
     return with_key(document, "timeline", [entry for entry in timeline(document) if entry["at_s"] < last_s])
 
@@ -180,7 +184,7 @@ def _until(fate: Document, ends_s: float) -> Document:
 
 
 def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[MutationLimits, list[tuple[Document, int]]]:
-    """Return the limits for changes, and short documents with which the search begins."""
+    """Return two results: the limits for random changes, and short documents with which the search begins."""
     initial, last_s = [], LAST_S
     for seed in seeds:
         completing = [event for event in record(scenario, seed).logged if event.completes]
@@ -191,17 +195,16 @@ def initial_documents(scenario: Scenario, seeds: Iterable[int]) -> tuple[Mutatio
 
 
 def _as_json(document: Document) -> Document:
-    """Return the document in the form that it has after it was written to a JSON file and read again. Keys that are
-    numbers become text.
+    """Return the document as it would be after it was written to a JSON file and read again. Keys that are numbers
+    become texts.
     """
     copy: Document = json.loads(json.dumps(document))
     return copy
 
 
 def _initial_document(scenario: Scenario, completing: Sequence[RecordedEvent]) -> Document:
-    """Return a document in which each of these blocks is completed by a single event.
-
-    All other parts come from the scenario. Losses and latencies stay random.
+    """Return a document in which one event completes each of these blocks. All other parts come from the scenario, so
+    message losses and latencies stay random.
     """
     document = document_of(scenario)
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes

@@ -18,35 +18,33 @@ MOST_ENTRIES = 6
 """Maximum number of entries in the timeline of a changed scenario."""
 ALIGN_PROBABILITY = 0.6
 AFTER_LAST_S = 30.0
-"""Number of seconds between the last event and the end of a changed scenario. A vote and a reconcile end within this
-time.
-"""
+"""Seconds between the last event and the end of a changed scenario. A vote or a reconcile takes less time than this."""
 FEW_BLOCKS = 4
 MESSAGES = get_args(MessageName)
 READINGS = {name: choice.values[1:] for name, choice in CHOICES.items() if choice.is_reading}
-"""Settings that choose an interpretation of the thesis -> their values other than the default."""
+"""Name of a setting that chooses an interpretation of the thesis -> all values except the default."""
 TIMERS_S = tuple(
     getattr(Settings(), name) for name in ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s")
 )
 NEAR_S = 0.03
-"""Maximum number of seconds between two moments at which a message that was sent at the first can arrive after the
-second.
+"""Maximum number of seconds between two moments for the following change: a message that is sent at the first moment
+arrives after the second moment.
 """
 DELAYS_S = (0.0, 0.06, 0.2, 1.0, 4.99, 5.02, 9.99, 10.02, 15.0, 20.0)
-"""Delays of single messages in seconds. They let the message arrive after the next message, after a timer expiry, or
-after a whole round.
+"""Delays for single messages in seconds. They are long enough for the message to arrive after the next message, after a
+timer expiry, or after a whole round.
 """
 LATE_S = (0.001, 0.01, 0.03, 0.06, 0.2, 0.5)
-"""Delays of timers in seconds. They let the timer expire after a message or another timer. The longest one is within
-the limits for a correct machine.
+"""Delays for timers in seconds. They are long enough for the timer to expire after a message or after another timer.
+The longest delay is allowed for a correct machine.
 """
 
 Change = Callable[[Document, Random], Document]
 
 
 class MutationLimits(NamedTuple):
-    """The limits of changes: the agents that may take part, the maximum number of blocks, and the latest time of a
-    block.
+    """The limits for random changes: the agents that may take part, the maximum number of blocks, and the latest time
+    of a block.
     """
 
     roster: Sequence[int]
@@ -57,9 +55,10 @@ class MutationLimits(NamedTuple):
 def mutate(
     document: Document, other: Document, limits: MutationLimits, rng: Random, timers_ended_s: Sequence[float] = ()
 ) -> Document:
-    """Return the document with one to eight random changes. Some changes take parts of `other`.
+    """Return the document with one to eight random changes.
 
-    `timers_ended_s` contains the times of timer expiries in the document's run.
+    Some changes copy parts of the document `other`. `timers_ended_s` contains the times at which timers expired in the
+    document's run.
     """
     if timers_ended_s and rng.random() < ALIGN_PROBABILITY:
         document = _align_with_timer(document, timers_ended_s, rng)
@@ -74,7 +73,7 @@ def mutate(
 
 
 def _limited(document: Document, limits: MutationLimits) -> Document:
-    """Return the document, cut to the limits. Its mission ends soon after the last event."""
+    """Return the document without everything that exceeds the limits. The mission ends soon after the last event."""
     events = [event for event in script(document) if event["at_s"] <= limits.last_s][: limits.blocks]
     last_s = max((event["at_s"] for event in events), default=0.0)
     document = with_events(document, events)
@@ -117,7 +116,7 @@ def _reassign_event(document: Document, rng: Random) -> Document:
 
 
 def _align_two_events(document: Document, rng: Random) -> Document:
-    """Let two agents complete a block at the same time."""
+    """Change the document so that two agents complete a block at the same time."""
     events = list(script(document))
     if len(events) < 2:
         return _add_event(document, rng)
@@ -130,7 +129,9 @@ def _align_two_events(document: Document, rng: Random) -> Document:
 
 
 def _align_with_timer(document: Document, timers_ended_s: Sequence[float], rng: Random) -> Document:
-    """Move events to the time of a timer expiry: new events of some agents, one event, or all later events."""
+    """Change the document so that events occur at the time of a timer expiry. These are new events of some agents, one
+    existing event, or all later events.
+    """
     moment = rng.choice(timers_ended_s)
 
     def near() -> float:
@@ -148,7 +149,7 @@ def _align_with_timer(document: Document, timers_ended_s: Sequence[float], rng: 
 
 
 def with_events(document: Document, events: Sequence[Document]) -> Document:
-    """Return the document with these events in order of time, and with a mission that is long enough for them."""
+    """Return the document with these events in order of time. Make the mission longer if the events need it."""
     ordered = sorted(events, key=lambda event: (event["at_s"], event["agent"]))
     document = {**document, "events": {"source": "scripted", **({"script": ordered} if ordered else {})}}
     last = max((event["at_s"] for event in ordered), default=0.0)
@@ -167,7 +168,7 @@ def _delay_message(document: Document, rng: Random) -> Document:
 
 
 def _silence_agent(document: Document, rng: Random) -> Document:
-    """Lose all messages to or from one agent for some time."""
+    """Change the document so that all messages to one agent, or from one agent, are lost for some time."""
     from_s = _moment(document, rng)
     whom = {rng.choice(("sender", "receiver")): rng.choice(document["agents"])}
     until_s = round(from_s + rng.choice((1.0, 6.0, 12.0, 30.0)), 3)
@@ -191,7 +192,7 @@ def _retarget_fate(document: Document, rng: Random) -> Document:
 
 
 def _with_target(fate: Document, which: Document) -> Document:
-    """Return a delivery rule with the effect of `fate` that applies to randomly chosen messages."""
+    """Return a delivery rule that has the effect of `fate` and applies to randomly chosen messages."""
     return {**which, **{key: fate[key] for key in ("drop", "delay_s") if key in fate}}
 
 
@@ -204,8 +205,8 @@ def _with_fate(document: Document, fate: Document, rng: Random) -> Document:
 
 
 def _choose_messages(document: Document, rng: Random) -> Document:
-    """Choose at random the messages to which a delivery rule applies: type, sender, number or time, and one receiver or
-    all.
+    """Choose the messages to which a delivery rule applies, at random: the type of the messages, the sender, a number
+    or a time, and one receiver or all.
     """
     which: Document = {
         "message": rng.choice(MESSAGES),
@@ -309,7 +310,9 @@ def _change_duplication(document: Document, rng: Random) -> Document:
 
 
 def _change_clock(document: Document, rng: Random) -> Document:
-    """Set an agent's clock to a time that differs from the other clocks, so that its blocks seem older or younger."""
+    """Set the clock of an agent to a different time than the other clocks. The blocks of this agent then seem older or
+    younger than they are.
+    """
     clocks = dict(document.get("clocks", {}))
     agent = str(rng.choice(document["agents"]))
     clocks.pop(agent, None)
@@ -333,8 +336,8 @@ def _change_agents(document: Document, roster: Sequence[int], rng: Random) -> Do
 
 
 def _splice(document: Document, other: Document, rng: Random) -> Document:
-    """Replace randomly chosen parts of a document by the same parts of another document: delivery rules, timeline,
-    lateness, network, clocks, settings or events.
+    """Copy randomly chosen parts from another document: delivery rules, timeline, lateness of timers, network, clocks,
+    settings or events.
     """
     if document["agents"] != other["agents"]:
         return document
@@ -345,7 +348,9 @@ def _splice(document: Document, other: Document, rng: Random) -> Document:
 
 
 def _moment(document: Document, rng: Random) -> float:
-    """Choose a mission second: at or between known times, or at the expiry of a timer that starts at a known time."""
+    """Choose a mission second at random. It is one of the known times, lies between two of them, or is the expiry of a
+    timer that starts at a known time.
+    """
     known = [event["at_s"] for event in script(document)]
     known += [entry["at_s"] for entry in timeline(document)]
     last = max(known, default=20.0)

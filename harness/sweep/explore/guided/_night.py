@@ -1,6 +1,7 @@
-"""Spend a night on the search: play known findings again, then continue from the stored runs until the time is over.
+"""Search for new findings for one night.
 
-New coverage and findings are written immediately, so an interruption loses only the runs in progress.
+First, the scenarios of known findings are run again. Then the search continues from the stored runs until the time is
+over. New coverage and new findings are written immediately. An interruption therefore only loses the current runs.
 """
 
 import resource
@@ -38,38 +39,40 @@ SCHEMA = "ucp-exploration/1"
 INITIAL_RUNS = 4
 """Number of runs of the scenario from which the first documents are created."""
 SEEDS = 20
-"""Number of seeds with which a finding is played, to measure how often it occurs."""
+"""Number of seeds with which the scenario of a finding is run, to measure how often the finding occurs."""
 RARE = 0.5
-"""Limit for rare findings. A finding that occurs with a smaller share of the seeds is rare."""
+"""Limit for rare findings, as a share of the seeds. A finding that occurs with fewer seeds is rare."""
 SHRINKING_RUNS = 400
 MOST_AGENTS, MOST_BLOCKS = 3, 3
-"""Numbers of agents and blocks of the proof with whose states the coverage is compared."""
+"""The numbers of agents and blocks of a proof. The coverage of the search is compared with the states of this proof."""
 SAMPLES = 200
 
 
 @dataclass(frozen=True)
 class NightProgress:
-    """Functions that report the progress. `on_progress` receives the numbers of runs, agent states and findings.
-    `on_event` receives a text.
-    """
+    """Functions that show the progress to the user."""
 
     on_progress: Callable[[int, int, int], None] = lambda runs, states, findings: None
+    """Gets the numbers of runs, agent states and findings."""
     on_event: Callable[[str], None] = lambda words: None
+    """Gets a text about an event."""
 
 
 @dataclass
 class NightFinding:
-    """A finding and its status in this night. The finding occurred with `shown` of `of` seeds."""
+    """A finding, with the status that it has in this night."""
 
     finding: Finding
     status: Status
     shown: int
+    """Number of seeds with which the finding occurred."""
     of: int
+    """Number of seeds with which the scenario of the finding was run."""
     path: Path | None
 
     @property
     def replay(self) -> str | None:
-        """The command that plays the finding again. None if no command can."""
+        """The command that runs the scenario of the finding again. None if there is no such command."""
         return None if self.path is None else f"ucp-harness run {self.path} --backend sim --seed {self.finding.seed}"
 
     def to_json(self) -> dict[str, object]:
@@ -86,9 +89,7 @@ class NightFinding:
 
 @dataclass
 class NightResult:
-    """The results of a night. Each element of `growth` is a number of runs, and the number of agent states known after
-    them.
-    """
+    """The results of a night."""
 
     scenario: Scenario
     directory: Path
@@ -96,6 +97,7 @@ class NightResult:
     started_at: str
     findings: list[NightFinding] = field(default_factory=list)
     growth: list[tuple[int, int]] = field(default_factory=list)
+    """Pairs of a number of runs, and the number of agent states that were known after these runs."""
     interrupted: bool = False
     seconds: float = 0.0
     processor_s: float = 0.0
@@ -104,7 +106,7 @@ class NightResult:
     report: Path | None = None
 
     def grow(self) -> None:
-        """Add an element to `growth`. In a long night, only every second, fourth or eighth one is stored."""
+        """Add an entry to `growth`. In a long night, only every second, fourth or eighth entry is kept."""
         self.growth.append((self.hunt.runs, self.hunt.local_states))
         if len(self.growth) > 2 * SAMPLES:
             del self.growth[1::2]
@@ -204,7 +206,7 @@ class _NightRun:
         return night
 
     def _replay(self) -> None:
-        """Play known findings again, and count the seeds with which they occur."""
+        """Run the scenarios of known findings again, and count the seeds with which each finding occurs."""
         for identity, finding in self._known.items():
             document = self._corpus.scenario_of(finding)
             if document is None:
@@ -223,9 +225,9 @@ class _NightRun:
             return sum(outcome is True for _, outcome in outcomes), len(seeds)
 
     def _hunt(self, initial: list[CandidateRun]) -> None:
-        """Continue the search from the runs in the corpus.
+        """Continue the search from the stored runs.
 
-        If there was time to play all runs of the corpus, runs that reach no new states any more are removed.
+        If there was enough time to repeat all stored runs, remove the runs that no longer reach new states.
         """
         hunt, before = self._night.hunt, self._corpus.runs()
         kept = set(map(id, self._kept_runs(hunt.begin([*initial, *before], self._jobs))))
@@ -246,7 +248,7 @@ class _NightRun:
         return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
 
     def _kept_runs(self, runs: Iterator[tuple[CandidateRun, bool]]) -> Iterator[CandidateRun]:
-        """Yield the runs to store. The method writes each of these runs and each new finding immediately."""
+        """Yield the runs that are stored. Before that, write each of these runs and each new finding to its file."""
         night, hunt = self._night, self._night.hunt
         for candidate, is_kept in runs:
             night.grow()
@@ -304,7 +306,7 @@ class _NightRun:
             self._shown[identity] = self._count_seeds(identity, smallest, finding.seed)
 
     def _finish(self) -> None:
-        """Determine the status of all findings, and write the results."""
+        """Determine the status of each finding, and write all results of the night."""
         night, corpus = self._night, self._corpus
         for identity, finding in {**self._known, **self._new}.items():
             shown, of = self._shown.get(identity, (0, 0))

@@ -20,7 +20,8 @@ MOST_BRANCHES = 100
 def to_html(night: dict[str, Any], nights: Sequence[dict[str, Any]]) -> str:
     """Return the page about a night as HTML.
 
-    `night` is the JSON of this night. `nights` contains the JSON of all stored nights, including this one.
+    `night` contains the results of this night as JSON. `nights` contains the results of all stored nights, including
+    this night.
     """
     last = list(nights)[-MOST_NIGHTS:]
     return html.render(
@@ -52,7 +53,9 @@ def unfinished_in_words(runs: int) -> str:
 
 
 def headline(night: dict[str, Any]) -> str:
-    """Return the headline of the page: the numbers of findings by status, of runs, and of agent states."""
+    """Return the headline of the page. It contains the number of findings with each status, the number of runs, and the
+    number of agent states.
+    """
     counts = dict.fromkeys(("new", "ongoing", "rare", "resolved"), 0)
     for finding in night["findings"]:
         counts[finding["status"]] += 1

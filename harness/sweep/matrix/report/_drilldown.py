@@ -22,21 +22,22 @@ MAX_ROWS = 12_000
 
 @dataclass(frozen=True, slots=True)
 class RunRow:
-    """A table row about one run. `href` links to the report of the run if it was kept. `failed` or `unsupported`
-    explains missing verdicts.
-    """
+    """A table row about one run."""
 
     seed: int
     href: str | None
+    """The link to the report of the run. None if the run directory was not kept."""
     verdicts: list[str]
     figures: list[str]
     failed: str | None
+    """The error because of which the run has no verdicts, or None."""
     unsupported: str | None
+    """The feature that an agent lacks, so the run has no verdicts, or None."""
 
 
 @dataclass(frozen=True, slots=True)
 class CellRuns:
-    """The runs behind one summary. `left_out` is the number of runs without a table row."""
+    """The runs of one summary. `left_out` is the number of runs for which the table has no row."""
 
     anchor: str
     name: str
@@ -48,7 +49,7 @@ class CellRuns:
 
 
 def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
-    """Return the runs behind all summaries. `directory` is the place of the page, for links."""
+    """Return the runs of all summaries. `directory` is the directory of the page. Links start there."""
     by_point = [(point, list(runs)) for point, runs in groupby(finished.runs, key=lambda run: run.point)]
     room = MAX_ROWS // max(1, len(by_point))
     cells = []

@@ -52,10 +52,8 @@ class HeatmapFigure:
 
 
 def known_figures(cells: Iterable[Cell]) -> list[HeatmapFigure]:
-    """Return the numeric results that are known for at least one run. Results from before the final reconcile come
-    first.
-
-    "violated" is always included.
+    """Return the numeric results that are known for at least one run. The results before the final reconcile come
+    first. The entry "violated" is always included.
     """
     cells = list(cells)
     names = {name for cell in cells for name, estimate in cell.estimates.items() if estimate.n}
@@ -83,7 +81,7 @@ STYLE = (
 
 @dataclass(frozen=True, slots=True)
 class TileMark:
-    """A note in a tile of the heatmap. `kind` is "bad" or "good", and selects the style of the note."""
+    """A short note in a cell of the heatmap. `kind` is "bad" or "good", and determines the style of the note."""
 
     sign: str
     text: str
@@ -92,7 +90,7 @@ class TileMark:
 
 @dataclass(frozen=True, slots=True)
 class HeatmapTile:
-    """A tile of the heatmap. `shade` is None for an unknown value, and `href` is None for a cell without runs."""
+    """A field of the heatmap. `shade` is None if the value is unknown. `href` is None if there are no runs."""
 
     shade: int | None
     mean: str
@@ -104,7 +102,9 @@ class HeatmapTile:
 
 @dataclass(frozen=True, slots=True)
 class HeatmapGrid:
-    """The tiles for one backend and mission length. Each row is for a number of agents, each column for a loss rate."""
+    """The fields of the heatmap for one backend and one mission length. Each row shows one number of agents, and each
+    column shows one loss rate.
+    """
 
     name: str
     losses: list[str]
@@ -113,7 +113,7 @@ class HeatmapGrid:
 
 @dataclass(frozen=True, slots=True)
 class Heatmap:
-    """A heatmap. `lowest` and `highest` are the values of the first and the last shade."""
+    """A heatmap. `lowest` is the value with the first shade, and `highest` is the value with the last shade."""
 
     figure: HeatmapFigure
     lowest: str
@@ -122,7 +122,7 @@ class Heatmap:
 
 
 def anchor(point: MatrixPoint) -> str:
-    """Return the HTML ID of the section with the runs for a combination of values."""
+    """Return the HTML ID of the section that lists the runs with a combination of values."""
     return f"{point.file_name}-{point.backend}"
 
 
@@ -145,8 +145,8 @@ def heatmap(record: MatrixRecord, figure: HeatmapFigure) -> Heatmap:
 
 
 def _scale(figure: HeatmapFigure, record: MatrixRecord) -> tuple[float, float]:
-    """Return the values for the first and the last shade: 0 and 1 for shares, otherwise the smallest and the largest
-    mean.
+    """Return the values that have the first and the last shade. For shares, these are 0 and 1. Otherwise, they are the
+    smallest and the largest mean.
     """
     if figure.metric.unit != "number":
         return 0.0, 1.0

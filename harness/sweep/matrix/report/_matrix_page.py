@@ -36,9 +36,8 @@ _STYLE, _GROWTH_STYLE = (_TEMPLATE.with_name(f"{name}.css").read_text(encoding="
 
 
 def to_html(finished: Finished, directory: Path, nights: StoredNights | None = None) -> str:
-    """Return the page as HTML.
-
-    `directory` will contain the page and the kept runs. `nights` includes this night if it is finished.
+    """Return the page as HTML. `directory` is the directory into which the page is written, and which contains the kept
+    runs. If this night is finished, `nights` contains it too.
     """
     record = finished.record
     shown = _heatmap.known_figures(record.cells)
@@ -85,8 +84,8 @@ def to_html(finished: Finished, directory: Path, nights: StoredNights | None = N
 
 
 def _changed(record: MatrixRecord) -> Iterator[tuple[str, ChangedRuns, str]]:
-    """Yield an entry for each cell with changed runs: its name, the changed runs, and a command that compares one of
-    these runs in detail.
+    """Yield an entry for each cell with changed runs. An entry contains the name of the cell, the changed runs, and a
+    command that compares one of these runs in detail.
     """
     against = record.against
     for changed in against.changed_runs if against else ():
@@ -97,8 +96,8 @@ def _changed(record: MatrixRecord) -> Iterator[tuple[str, ChangedRuns, str]]:
 
 
 def _choosing(shown: list[_heatmap.HeatmapFigure]) -> str:
-    """Return the CSS that shows only the heatmaps of the chosen numeric result on a screen. On paper, all heatmaps are
-    shown.
+    """Return the CSS that shows the heatmaps of the chosen numeric result and hides the others. On paper, all heatmaps
+    are visible.
     """
     others = [
         f"main:has(#show-{figure.metric.name}:checked) {{}} .figure:not(.of-{figure.metric.name})" for figure in shown
@@ -108,7 +107,9 @@ def _choosing(shown: list[_heatmap.HeatmapFigure]) -> str:
 
 
 def _kind(record: MatrixRecord) -> str:
-    """Return the result of the matrix as the name of a page style. It is never "holds" for an interrupted matrix."""
+    """Return the CSS class of the page, which depends on the result of the matrix. If the matrix was interrupted, the
+    class is never "holds".
+    """
     if record.outcome == "interrupted":
         return "violated" if record.failed or any(cell.violated for cell in record.cells) else "unknown"
     return {0: "holds", CANNOT_HERE: "unknown"}.get(record.exit_status, "violated")

@@ -11,7 +11,7 @@ from harness.sweep.matrix.matrix_table import name_of, violated
 
 @dataclass(frozen=True, slots=True)
 class NightColumn:
-    """The heading of the column of a night: its date, and the commit of the code."""
+    """The heading of a table column about one night: the date of the night, and the commit of the code."""
 
     date: str
     commit: str
@@ -35,7 +35,7 @@ def columns(nights: Sequence[MatrixRecord]) -> list[NightColumn]:
 
 
 def rows(nights: Sequence[MatrixRecord], tonight: MatrixRecord) -> list[tuple[str, list[NightCell]]]:
-    """Return the name of each cell of tonight's matrix, with a field for each night."""
+    """Return the name of each cell in the matrix of this night, with one table field for each night."""
     return [
         (name_of(tonight.matrix, point), [_field(night, point) for night in nights]) for point in tonight.matrix.points
     ]

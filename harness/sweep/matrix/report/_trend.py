@@ -20,20 +20,22 @@ from harness.sweep.matrix.report._heatmap import HeatmapFigure
 
 COLUMNS, PANEL_HEIGHT, FOOT = 4, 158, 4
 MAX_DOTS = 12_000
-"""Maximum number of dots on a page. If there were more, fewer nights would be drawn."""
+"""Maximum number of dots on a page. If there are more, the page shows fewer nights."""
 LARGEST = 1e12
-"""Upper limit of a plausible value. Larger values in a file are ignored."""
+"""Upper limit of a plausible value. If a file contains larger values, they are ignored."""
 
 
 def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures: int) -> Sequence[MatrixRecord]:
-    """Return the latest nights. Their number is limited so that all dots together are at most `MAX_DOTS`, but it is at
-    least two.
+    """Return the latest nights. All charts together must have at most `MAX_DOTS` dots. At least two nights are
+    returned, even if they have more dots.
     """
     return nights[-max(2, MAX_DOTS // max(1, len(tonight.cells) * figures)) :]
 
 
 def trend(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figure: HeatmapFigure) -> list[tuple[str, Markup]]:
-    """Return a drawing for each number of agents and backend. The drawings have names if there are several."""
+    """Return a drawing with charts for each number of agents and each backend. If there are several drawings, each has
+    a name.
+    """
     of_night = [{cell.point: figure.of(cell) for cell in night.cells} for night in nights]
     begun = [text.started(night.started_at)[:16] for night in nights]
     commits = [f"commit {night.versions.get('commit', 'unknown')}" for night in nights]
@@ -81,8 +83,8 @@ def _panel(
 
 
 def _value_axis(figure: HeatmapFigure, estimates: Sequence[Estimate], area: ChartArea) -> Axis:
-    """Return a vertical axis for all confidence intervals. The axis has a minimum length, so that small changes look
-    small.
+    """Return a vertical axis that covers all confidence intervals. The axis has a minimum length, so that small changes
+    look small.
     """
     bounds = [
         bound for estimate in estimates for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None
