@@ -30,6 +30,7 @@ from harness.errors import (
     RunDirectoryError,
     ScenarioError,
 )
+from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
@@ -209,6 +210,7 @@ class RunRecording:
             keys_fingerprint=self.directory.keys_fingerprint,
         )
 
+    @gc_paused()
     def end(self, played: RunOutcome, report_progress: ReportProgress = lambda step: None) -> Run:
         """Check the run, and write its record and report. `report_progress` is called with the name of each long step.
 
