@@ -54,6 +54,16 @@ def test_correct_agent_agrees_with_the_reference(correct_run: Path) -> None:
         assert sentences(ended.stderr) == []
 
 
+def test_replay_prints_a_remark_on_the_files_once(correct_run: Path, tmp_path: Path) -> None:
+    for agent in (1, 2, 3):
+        shutil.copy(trace_of(correct_run, agent), tmp_path)
+    (tmp_path / "notes.jsonl").write_text("wind from the west\n")
+    ended = harness("replay", tmp_path)
+    assert ended.returncode == 0
+    assert ended.stdout.count("no difference") == 3
+    assert ended.stderr.count("notes.jsonl") == 1
+
+
 def test_first_difference_names_handler_and_source_line(wrong_run: Path) -> None:
     ended = harness("replay", trace_of(wrong_run, 2))
     assert ended.returncode == 1
