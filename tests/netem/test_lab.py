@@ -153,6 +153,25 @@ def test_program_gets_exactly_the_given_environment_folder_and_files(tmp_path: P
     in_lab(tmp_path, story)
 
 
+@pytest.mark.parametrize(
+    ("how", "status", "error"),
+    [("end", 0, ""), ("fail", 1, "one sentence\n"), ("crash", 1, "ValueError: unexpected\n")],
+)
+def test_forked_module_runs_as_in_a_new_interpreter(tmp_path: Path, how: str, status: int, error: str) -> None:
+    async def story(lab: Lab) -> None:
+        argv = [sys.executable, "-P", "-m", "tests.netem.forked_module", how]
+        files = {"stdout": tmp_path / "out", "stderr": tmp_path / "err"}
+        one = await lab.spawn(2, argv, cwd=tmp_path, env={"ONLY": "this"}, max_file_bytes=9999, fork=True, **files)
+        assert await asyncio.wait_for(one.wait(), DEADLINE_S) == status
+        assert (tmp_path / "err").read_text().endswith(error)
+        lines = (tmp_path / "out").read_text().splitlines()
+        # The fourth file is the folder that the module reads.
+        own = [how, str(tmp_path), "{'ONLY': 'this'}", "['0', '1', '2', '3']", "True", "9999"]
+        assert lines == [*own, f"net:[{lab.networks[2]}]"]
+
+    in_lab(tmp_path, story)
+
+
 def test_output_is_appended_to_what_was_there(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         (tmp_path / "out").write_text("first\n")

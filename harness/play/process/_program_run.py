@@ -188,7 +188,7 @@ class ProgramRun:
             await self._channel.start(self._lab.network)
             self._watchers.start(self._channel.watch())
         await self.apply(first)
-        self._remote.when_cut_off = lambda: self._watchers.start(self._cut_off())
+        self._remote.when_cut_off = self._start_cut_off
         if self.scenario.capture:
             self._capture = await LiveCapture.start(self._lab.network, self.rundir.capture(), self.scenario.roster)
             self._watchers.start(self._capture.watch())
@@ -369,6 +369,10 @@ class ProgramRun:
         controlled = partial(self._remote.program, agent_id)
         command = self._remote.stand_in_command(agent_id)
         return AgentProcess(agent_id, self.rundir, command, self.clock.now, controlled=controlled)
+
+    def _start_cut_off(self) -> None:
+        with contextlib.suppress(RuntimeError):  # a failure is already ending the mission
+            self._watchers.start(self._cut_off())
 
     async def _cut_off(self) -> None:
         """Cut off the vehicles whose connections are lost, and connect the vehicles whose connections are back."""
