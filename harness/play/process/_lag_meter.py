@@ -1,6 +1,7 @@
 """Start and stop a program that measures how late this machine runs programs during a mission."""
 
 import asyncio
+import contextlib
 import json
 import sys
 from collections.abc import Mapping
@@ -44,5 +45,6 @@ class LagMeter:
         try:
             await asyncio.wait_for(self._process.wait(), END_LIMIT_S)
         except TimeoutError:
-            self._process.kill()
+            with contextlib.suppress(ProcessLookupError):  # it may end at this moment
+                self._process.kill()
             await self._process.wait()
