@@ -50,7 +50,9 @@ class ManifestInception(BaseModel):
 
 
 class Manifest(BaseModel):
-    """The manifest of a mission."""
+    """The manifest of a mission. `files` maps each agent ID to the mission file of the agent, which is in the same
+    directory. `settings_sha256` is the SHA-256 hash of the settings.
+    """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -59,11 +61,9 @@ class Manifest(BaseModel):
     roster: list[AgentId]
     inception: ManifestInception
     settings_sha256: Hash
-    """The SHA-256 hash of the settings."""
     broadcast: str
     port: Annotated[int, Field(ge=1, le=65535)]
     files: dict[VehicleKey, str]
-    """Agent ID -> the mission file of the agent, in the same directory."""
 
     def to_json(self) -> dict[str, Any]:
         return self.model_dump(mode="json", by_alias=True)

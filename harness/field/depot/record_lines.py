@@ -103,18 +103,17 @@ class Fork(RecordLine):
 
 
 class Holding(RecordLine):
-    """A place at which some agents hold a block, and the IDs of these agents."""
+    """A place at which some agents hold a block, and the IDs of these agents.
+
+    The place `current block` means that the agent had not completed the block yet. The place `earlier export` means
+    that only an older export of the agent contains the block. `position` counts from 1: in a chain from the inception
+    block, in a deque from the front, in a stack from the bottom. Blocks with the same `chain_hash` have the same
+    predecessors.
+    """
 
     place: Place
-    """The place. `current block` means that the agent had not completed the block yet. `earlier export` means that only
-    an older export of the agent contains the block.
-    """
     position: Number | None
-    """The position of the block, counted from 1: in a chain from the inception block, in a deque from the front, in a
-    stack from the bottom.
-    """
     chain_hash: Hash | None
-    """The chain hash at the block. Blocks with the same chain hash have the same predecessors."""
     agents: list[AgentId]
 
 
