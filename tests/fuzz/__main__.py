@@ -83,9 +83,9 @@ def _guided(name: str, seconds: int, limit: int | None) -> bool:
         left = [path.name for path in Path(scratch).iterdir() if not path.name.startswith("fuzz-")]
     if left and not problem:
         problem = f"leaves {left[0]} behind"
-    told = log.read_text(errors="replace")
-    inputs = int((re.findall(r"stat::number_of_executed_units: (\d+)", told) or ["0"])[-1])
-    edges = (re.findall(r"cov: (\d+)", told) or ["0"])[-1]
+    log_text = log.read_text(errors="replace")
+    inputs = int((re.findall(r"stat::number_of_executed_units: (\d+)", log_text) or ["0"])[-1])
+    edges = (re.findall(r"cov: (\d+)", log_text) or ["0"])[-1]
     _tell(name, inputs, time.monotonic() - began, f"{edges} edges", f"{problem}, see {log}" if problem else "")
     return not problem
 

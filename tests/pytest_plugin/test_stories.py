@@ -201,6 +201,6 @@ def test_foreign_agents_follow_the_story_in_virtual_time(pytester: pytest.Pytest
 def test_mistake_in_a_story_is_reported_in_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
     path = tmp_path / "wrong.story"
     path.write_text(text)
-    with pytest.raises(ScenarioError) as told:
+    with pytest.raises(ScenarioError) as error:
         read_story(path)
-    assert sentence in str(told.value) and str(told.value).startswith(f"{path}: ")
+    assert sentence in str(error.value) and str(error.value).startswith(f"{path}: ")

@@ -175,7 +175,7 @@ def test_queries_change_nothing_and_the_run_can_be_played_again(pytester: pytest
         swarm.heal()
         swarm.run_for(100)
 
-    pytestmark = pytest.mark.swarm(name="told", final_reconcile=True)
+    pytestmark = pytest.mark.swarm(name="action", final_reconcile=True)
     def test_looking(swarm): tell(swarm, True)
     def test_not_looking(swarm): tell(swarm, False)
     """)
@@ -278,7 +278,7 @@ def test_end_of_a_test_waits_for_temporary_changes(pytester: pytest.Pytester) ->
 
 
 @pytest.mark.parametrize(
-    ("told", "sentence"),
+    ("action", "sentence"),
     [
         ("swarm.partition([1], [9])", "partition[[]1]: unknown vehicle 9; allowed is any of 1, 2, 3, 4, 5"),
         ("swarm.loss(2)", "`loss` is 2: *"),
@@ -297,12 +297,12 @@ def test_end_of_a_test_waits_for_temporary_changes(pytester: pytest.Pytester) ->
     ],
 )
 def test_impossible_action_is_reported_at_the_line_of_the_test(
-    pytester: pytest.Pytester, told: str, sentence: str
+    pytester: pytest.Pytester, action: str, sentence: str
 ) -> None:
-    pytester.makepyfile(f"def test_mistake(swarm):\n    {told}")
+    pytester.makepyfile(f"def test_mistake(swarm):\n    {action}")
     result = run(pytester)
     result.assert_outcomes(failed=1)
-    shown = f">   *{told.split('; ')[0]}*".replace("[", "[[]")
+    shown = f">   *{action.split('; ')[0]}*".replace("[", "[[]")
     result.stdout.fnmatch_lines([shown, f"E   *Error: {sentence}", "*.py:2: *Error"])
     no_internals(result)
 

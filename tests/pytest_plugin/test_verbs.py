@@ -18,8 +18,8 @@ pytest_plugins = "pytester"
 def record(pytester: pytest.Pytester) -> dict[str, Any]:
     """Return the record of the only stored run."""
     (kept,) = run_directories(pytester)
-    told: dict[str, Any] = json.loads((kept / "run.json").read_text())
-    return told
+    document: dict[str, Any] = json.loads((kept / "run.json").read_text())
+    return document
 
 
 def given(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -29,9 +29,9 @@ def given(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def is_played_again_alike(pytester: pytest.Pytester, directory: Path) -> None:
     """Check that the recorded scenario leads to the same chain when it is played again."""
     (kept,) = run_directories(pytester)
-    told = record(pytester)
-    play(parse(told["scenario"]), told["seed"], directory, SilentProgress(), "sim")
-    for agent in told["agents"]:
+    run_record = record(pytester)
+    play(parse(run_record["scenario"]), run_record["seed"], directory, SilentProgress(), "sim")
+    for agent in run_record["agents"]:
         first, again = (read_export(path / "agents" / f"{agent}.chain.json") for path in (kept, directory))
         assert first.chain == again.chain
 
@@ -149,8 +149,8 @@ def test_conditions_last_as_long_as_their_block(pytester: pytest.Pytester, tmp_p
             swarm.run_for(20)
     """)
     run(pytester, "--ucp-keep", "kept").assert_outcomes(passed=1)
-    told = record(pytester)
-    assert [(fault["what"], fault["detail"]) for fault in told["faults"]] == [
+    run_record = record(pytester)
+    assert [(fault["what"], fault["detail"]) for fault in run_record["faults"]] == [
         ("loss", "loss 30 %"),
         ("network", "loss 30 %, loss 100 % from 1 to 2 3"),
         ("undone", "loss 30 %"),
@@ -159,7 +159,7 @@ def test_conditions_last_as_long_as_their_block(pytester: pytest.Pytester, tmp_p
         ("network", "loss 0 %, delay 200 ms, loss 90 % from 4 to 5, loss 90 % from 5 to 4"),
         ("undone", "loss 0 %, loss 90 % from 4 to 5, loss 90 % from 5 to 4"),
     ]
-    assert [entry.get("for_s") for entry in given(told["scenario"]["timeline"])] == [100.004, 50.001, None, 5]
+    assert [entry.get("for_s") for entry in given(run_record["scenario"]["timeline"])] == [100.004, 50.001, None, 5]
     is_played_again_alike(pytester, tmp_path / "again")
 
 
@@ -182,25 +182,27 @@ INJECTIONS = """
 def test_late_rogue_node_knows_earlier_messages(pytester: pytest.Pytester, tmp_path: Path) -> None:
     pytester.makepyfile(INJECTIONS)
     run(pytester, "--ucp-keep", "kept").assert_outcomes(passed=1)
-    told = record(pytester)
+    run_record = record(pytester)
     names = ["replay", "duplicate", "delay", "corrupt", "forge", "flood"]
-    assert [fault["what"] for fault in told["faults"]] == names
-    assert [injection["what"] for injection in told["rogue"]] == names
-    assert all(injection["sent"] for injection in told["rogue"])
+    assert [fault["what"] for fault in run_record["faults"]] == names
+    assert [injection["what"] for injection in run_record["rogue"]] == names
+    assert all(injection["sent"] for injection in run_record["rogue"])
     is_played_again_alike(pytester, tmp_path / "again")
 
 
 @pytest.mark.lab
-@pytest.mark.parametrize("told", ["hold('Commit Block')", "replay('Commit Block')"])
+@pytest.mark.parametrize("action", ["hold('Commit Block')", "replay('Commit Block')"])
 @pytest.mark.any_user
-def test_action_that_needs_virtual_time_is_refused_and_the_run_continues(pytester: pytest.Pytester, told: str) -> None:
+def test_action_that_needs_virtual_time_is_refused_and_the_run_continues(
+    pytester: pytest.Pytester, action: str
+) -> None:
     pytester.makepyfile(f"""
     import pytest
 
     @pytest.mark.swarm(agents=2, backend="process", speedup=100, events={{"source": "random"}})
     def test_processes(swarm):
         with pytest.raises(Exception, match="use --backend sim$"):
-            swarm.{told}
+            swarm.{action}
         with swarm.link(1, 2, loss=0.5):
             swarm.run_for(20)
     """)
@@ -210,7 +212,7 @@ def test_action_that_needs_virtual_time_is_refused_and_the_run_continues(pyteste
 
 
 @pytest.mark.parametrize(
-    ("told", "sentence"),
+    ("action", "sentence"),
     [
         ("swarm.wait_for('commit')", "ScenarioError: no handler 'commit': use one of build_data_block, *"),
         (
@@ -251,11 +253,11 @@ def test_action_that_needs_virtual_time_is_refused_and_the_run_continues(pyteste
     ],
 )
 def test_impossible_action_is_reported_at_the_line_of_the_test(
-    pytester: pytest.Pytester, told: str, sentence: str
+    pytester: pytest.Pytester, action: str, sentence: str
 ) -> None:
-    pytester.makepyfile(f"def test_mistake(swarm):\n    {told}")
+    pytester.makepyfile(f"def test_mistake(swarm):\n    {action}")
     result = run(pytester)
     result.assert_outcomes(failed=1)
-    shown = f">   *{told.split('; ')[0]}*".replace("[", "[[]")
+    shown = f">   *{action.split('; ')[0]}*".replace("[", "[[]")
     result.stdout.fnmatch_lines([shown, f"E   *{sentence}", "*.py:2: *Error"])
     no_internals(result)

@@ -64,7 +64,7 @@ class Field:
 
         return await eventually(receive)
 
-    async def told(self, sysid: int) -> bytes:
+    async def next_command(self, sysid: int) -> bytes:
         return await eventually(lambda: self.vehicles[sysid].recv(65536))
 
     def tell(self, data: bytes) -> None:
@@ -112,7 +112,7 @@ def test_command_reaches_its_vehicle_and_is_recorded() -> None:
     async def story() -> None:
         async with in_field() as field:
             field.tell(land(4))
-            assert await field.told(4) == land(4)
+            assert await field.next_command(4) == land(4)
             assert field.taken_over == [14]
             with pytest.raises(BlockingIOError):
                 field.vehicles[3].recv(1)
@@ -128,7 +128,7 @@ def test_requests_do_not_take_over_a_vehicle() -> None:
             parameter = mavlink.MAVLink_param_set_message(3, 1, b"RTL_ALT", 5.0, 9)
             for frame in (HEARTBEAT.pack(GCS), ask(0), parameter.pack(GCS)):
                 field.tell(bytes(frame))
-                await field.told(3)
+                await field.next_command(3)
             assert field.taken_over == []
             assert [command["message"] for command in field.station.to_json()["commands"]] == ["PARAM_SET"]
 

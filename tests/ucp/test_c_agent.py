@@ -144,8 +144,8 @@ def test_c_agent_passes_generated_vectors(agent: Path) -> None:
         while way[-1]["after"] is not None:
             way.append(by_number[way[-1]["after"]])
         played += reversed(way)
-    told = "".join(json.dumps(step["in"]) + "\n" for step in played)
-    done = subprocess.run([agent, "--virtual"], input=told, capture_output=True, text=True, check=True)
+    inputs = "".join(json.dumps(step["in"]) + "\n" for step in played)
+    done = subprocess.run([agent, "--virtual"], input=inputs, capture_output=True, text=True, check=True)
     answers = [json.loads(answer) for answer in done.stdout.splitlines()]
     assert len(ends) > 500
     for step, answer in zip(played, answers, strict=True):
@@ -206,22 +206,22 @@ def test_c_agent_refuses_a_mission_in_one_sentence(
 def test_hostile_lines_do_not_harm_the_c_agent(checked: Path) -> None:
     """The agent answers damaged input lines, and leaks no memory."""
     random = Random(1)
-    told = []
+    lines = []
     for transcript in sorted(INDEX.parent.glob("*.jsonl")):
         for line in transcript.read_text(encoding="ascii").splitlines():
             given = bytearray(json.dumps(json.loads(line)["input"]).encode())
-            told.append(bytes(given))
+            lines.append(bytes(given))
             for _ in range(random.randrange(4)):
                 at = random.randrange(len(given))
                 given[at : at + random.randrange(3)] = random.choice([b"", b'"', b"9", b"\\u0", b"\xff", b"[[[", b"{"])
-            told.append(bytes(given))
-    told += [b"", b"[" * 100_000, b'{"t": 1e999, "timer": true}', b'{"t": 1e300, "timer": true}']
-    sent = b"".join(line + b"\n" for line in told)
+            lines.append(bytes(given))
+    lines += [b"", b"[" * 100_000, b'{"t": 1e999, "timer": true}', b'{"t": 1e300, "timer": true}']
+    sent = b"".join(line + b"\n" for line in lines)
     done = subprocess.run([checked, "--virtual"], input=sent, capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
     answers = [json.loads(answer) for answer in done.stdout.splitlines()]
-    assert len(answers) == len(told)
-    assert 0 < sum("error" in answer for answer in answers) < len(told)
+    assert len(answers) == len(lines)
+    assert 0 < sum("error" in answer for answer in answers) < len(lines)
 
 
 def test_c_agents_and_our_agent_agree_in_virtual_time(agent: Path, tmp_path: Path) -> None:
@@ -245,11 +245,13 @@ def test_c_agent_without_keys_reports_the_missing_feature(agent: Path) -> None:
 def test_secured_c_agent_drops_the_datagrams_of_the_vectors(secured: Path) -> None:
     vectors = json.loads((VECTORS / "secured.json").read_text(encoding="ascii"))
     drops = vectors["drops"]
-    told = mission(roster=drops["roster"], features=["secured"], security={"bundle": "7.bundle.json"})
+    mission_document = mission(roster=drops["roster"], features=["secured"], security={"bundle": "7.bundle.json"})
     with Player([str(secured)]) as player:
-        begun = player.give({"t": drops["now"], "mission": told, "boot": vectors["boot"], "bundle": {"schema": "x"}})
+        begun = player.give(
+            {"t": drops["now"], "mission": mission_document, "boot": vectors["boot"], "bundle": {"schema": "x"}}
+        )
         assert "bundle" in begun["error"]
-        begun = {"t": 0.0, "mission": told, "boot": vectors["boot"], "bundle": vectors["bundles"]["7"]}
+        begun = {"t": 0.0, "mission": mission_document, "boot": vectors["boot"], "bundle": vectors["bundles"]["7"]}
         assert "error" not in player.give(begun)
         player.give({"t": 0.0, "datagram": ""})
         for case in drops["datagrams"]:
@@ -280,8 +282,8 @@ def test_secured_c_agent_sends_the_same_bytes_as_our_agent(secured: Path) -> Non
     assert {agent: export.model_dump() for agent, export in exports[0].items()} == {
         agent: export.model_dump() for agent, export in exports[1].items()
     }
-    assert {agent: told.dropped for agent, told in played.played.agents.items()} == {
-        agent: told.dropped for agent, told in among_ours.played.agents.items()
+    assert {agent: player.dropped for agent, player in played.played.agents.items()} == {
+        agent: player.dropped for agent, player in among_ours.played.agents.items()
     }
     assert not played.result.bad
 

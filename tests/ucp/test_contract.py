@@ -61,10 +61,10 @@ def test_vector_files_are_up_to_date() -> None:
 
 def test_page_lists_each_handler_with_its_number_and_branches() -> None:
     chapters = re.split(r"^(?=\d+ +[a-z_0-9]+\()", PAGE, flags=re.MULTILINE)
-    told = {chapter.split("(")[0]: chapter.split("```")[0] for chapter in chapters[1:]}
-    assert set(told) == {f"{handler.algorithm:<2} {handler.name}" for handler in HANDLERS.values()}
+    chapter_texts = {chapter.split("(")[0]: chapter.split("```")[0] for chapter in chapters[1:]}
+    assert set(chapter_texts) == {f"{handler.algorithm:<2} {handler.name}" for handler in HANDLERS.values()}
     for handler in HANDLERS.values():
-        branches = re.findall(r'"([^"]+)"', told[f"{handler.algorithm:<2} {handler.name}"])
+        branches = re.findall(r'"([^"]+)"', chapter_texts[f"{handler.algorithm:<2} {handler.name}"])
         assert {*branches} == {*handler.branches}, handler.name
 
 
@@ -104,8 +104,8 @@ def test_mission_file_on_the_page_is_valid() -> None:
 def left(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Document]]]:
     """Return the inputs of an agent, its outputs, and its files."""
     directory = tmp_path_factory.mktemp("agent")
-    told = mission()
-    agent = AgentUnderTest(directory, told)
+    document = mission()
+    agent = AgentUnderTest(directory, document)
     exchanges = []
 
     def ask(command: str, **arguments: Any) -> None:
@@ -127,7 +127,7 @@ def left(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Do
     agent.process.terminate()
     assert agent.process.wait(10) == 0
     yield {
-        "mission": [told],
+        "mission": [document],
         "control": exchanges,
         "chain-export": [json.loads((directory / "7.chain.json").read_text())],
         "trace": [json.loads(line) for line in (directory / "7.trace.jsonl").read_text().splitlines()],
@@ -150,10 +150,10 @@ def test_mission_files_fit_their_schema_and_name_needed_features() -> None:
             "events": {"source": "mavlink"},
         }
     )
-    told = {"address": "10.0.0.1", "broadcast": "10.0.0.255"}
-    without = mission_file(1, plain, 0, b"", with_vehicle=False, **told)
+    addresses = {"address": "10.0.0.1", "broadcast": "10.0.0.255"}
+    without = mission_file(1, plain, 0, b"", with_vehicle=False, **addresses)
     with_all = mission_file(
-        1, rich, 0, seal_to(b"", bytes(32)), with_vehicle=True, store="1.store", bundle="1.bundle.json", **told
+        1, rich, 0, seal_to(b"", bytes(32)), with_vehicle=True, store="1.store", bundle="1.bundle.json", **addresses
     )
     assert (without["contract"], without["features"]) == (2, [])
     assert with_all["features"] == [*FEATURES] == needed_features(with_all)
@@ -171,17 +171,17 @@ Change = Callable[[Document], object]
 
 REFUSED: dict[str, tuple[Change, ...]] = {
     "mission": (
-        lambda told: told.update(schema="ucp-mission/2"),
-        lambda told: told.pop("roster"),
-        lambda told: told.update(roster=[]),
-        lambda told: told.update(agent_id=0),
-        lambda told: told.update(initial_data="!"),
-        lambda told: told.update(speedup=0),
-        lambda told: told["network"].update(port=65536),
-        lambda told: told.update(settings={"vote_timeout_s": -1}),
-        lambda told: told.update(settings={"phase1_tie": "both"}),
-        lambda told: told["events"].update(source="dice"),
-        lambda told: told.update(features="store"),
+        lambda document: document.update(schema="ucp-mission/2"),
+        lambda document: document.pop("roster"),
+        lambda document: document.update(roster=[]),
+        lambda document: document.update(agent_id=0),
+        lambda document: document.update(initial_data="!"),
+        lambda document: document.update(speedup=0),
+        lambda document: document["network"].update(port=65536),
+        lambda document: document.update(settings={"vote_timeout_s": -1}),
+        lambda document: document.update(settings={"phase1_tie": "both"}),
+        lambda document: document["events"].update(source="dice"),
+        lambda document: document.update(features="store"),
     ),
     "chain-export": (
         lambda export: export.pop("completed"),

@@ -176,9 +176,9 @@ def modules_of(directory: Path, document: dict[str, Any]) -> set[str]:
         assert time.monotonic() < deadline, "it never began"
         time.sleep(0.005)
     process.terminate()
-    _, told = process.communicate(timeout=DEADLINE_S)
-    assert process.returncode == 0, told
-    return {line.rpartition("|")[2].strip() for line in told.splitlines()}
+    _, errors = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 0, errors
+    return {line.rpartition("|")[2].strip() for line in errors.splitlines()}
 
 
 def test_agent_exports_on_command_while_it_runs(agent: AgentUnderTest) -> None:

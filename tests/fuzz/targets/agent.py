@@ -148,9 +148,9 @@ class _Driven:
             case 5:
                 return ChainHashSuccessorQuery(chain_hash)
             case 6:
-                told = program.byte()
+                choice = program.byte()
                 return NextInSequenceResponse(
-                    chain_hash, block_hash if told & 1 else None, _TIMES_US[told // 2 % len(_TIMES_US)]
+                    chain_hash, block_hash if choice & 1 else None, _TIMES_US[choice // 2 % len(_TIMES_US)]
                 )
             case 7:
                 return RequestForBlock(block_hash)
@@ -196,8 +196,8 @@ class _Driven:
                 self.held.replay(run)
                 require(self.held.impossible is None, f"its trace: {self.held.impossible}")
                 summary, size = run.state, self.held.size
-                told = summary.chain, summary.deque, summary.stack
-                require(told == (size["chain"], size["deque"], size["stack"]), "its trace says not all changes")
+                lengths = summary.chain, summary.deque, summary.stack
+                require(lengths == (size["chain"], size["deque"], size["stack"]), "its trace says not all changes")
         require(set(self.held.completed) == {done.hex() for done in self.agent.state.completed}, "completed otherwise")
 
     def judge(self) -> None:

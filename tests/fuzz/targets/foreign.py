@@ -80,7 +80,7 @@ class _OwnAgentProgram(LineProgram):
 
 
 def run(data: bytes) -> None:
-    replaced = {int(told[1]): told[2] + b"\n" for line in data.split(b"\n") if (told := _REPLACED.fullmatch(line))}
+    replaced = {int(match[1]): match[2] + b"\n" for line in data.split(b"\n") if (match := _REPLACED.fullmatch(line))}
     _play(replaced)
 
 

@@ -52,12 +52,12 @@ def _read(home: Path, path: Path) -> None:
     kept = KeyDirectory(home)
     for read in (lambda: inspect(path), lambda: kept.bundles(), lambda: kept.revoke([1]), lambda: load_depot_key(home)):
         try:
-            told = read()
+            document = read()
         except KeysError as error:
             sound(str(error))
             continue
-        if isinstance(told, list):
-            for facts in told:
+        if isinstance(document, list):
+            for facts in document:
                 sound(in_words(facts))
     try:
         bundle = load_bundle(path)

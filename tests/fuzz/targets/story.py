@@ -27,7 +27,7 @@ def run(data: bytes) -> None:
         path.write_text(anew, encoding="utf-8")
         again = read_story(path)
         require(again.scenario == story.scenario, "a story that was written anew is another")
-        seconds = [[(section.from_s, section.until_s) for section in told.sections] for told in (story, again)]
+        seconds = [[(section.from_s, section.until_s) for section in read.sections] for read in (story, again)]
         require(seconds[0] == seconds[1], "a story that was written anew has other sections")
         require(again.with_answers([["answered"] for _ in again.sections]) == anew, "written twice, it differs")
     _ = story.in_virtual_time

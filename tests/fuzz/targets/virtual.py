@@ -48,11 +48,11 @@ def _judge(line: bytes, answer: dict[str, Any]) -> None:
         decode(base64.b64decode(sent, validate=True))
     for entry in answer.get("trace", ()):
         require(not isinstance(parse_line(json.dumps(entry).encode()), TraceHeader), "a header among what it did")
-    told = answer.get("answer", {})
-    if "schema" in told:
-        parse_export(Path("told"), told)
-    if "store" in told:
-        boots = {**json.loads(_MISSION), "store": told["store"]}
+    reply = answer.get("answer", {})
+    if "schema" in reply:
+        parse_export(Path("reply"), reply)
+    if "store" in reply:
+        boots = {**json.loads(_MISSION), "store": reply["store"]}
         require("error" not in json.loads(_answers(json.dumps(boots).encode())[0]), "it does not boot from its store")
 
 

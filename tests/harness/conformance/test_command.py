@@ -48,9 +48,9 @@ def test_reference_agent_passes_in_virtual_time(phase_one: list[VectorSet], tmp_
     results = conform(
         ConformanceRequest(OURS, None, None, virtual=True), tmp_path, lambda count, total: None, phase_one
     )
-    told = results.to_json()
-    assert sum(row["passed"] for row in told["algorithms"]) == len(phase_one[0].wanted) + 1
-    assert results.exit_status == 0 and [case["verdict"] for case in told["cases"]] == ["passed"]
+    document = results.to_json()
+    assert sum(row["passed"] for row in document["algorithms"]) == len(phase_one[0].wanted) + 1
+    assert results.exit_status == 0 and [case["verdict"] for case in document["cases"]] == ["passed"]
     assert "<testsuite " in to_junit(results)
 
 

@@ -210,8 +210,8 @@ def counts_too_few_bytes() -> None:
 @mistake
 def counts_drops_as_handled() -> None:
     def status(old: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
-        told = old(*arguments)
-        return {**told, "handled": told["handled"] + sum(told["dropped"].values()), "dropped": {}}
+        report = old(*arguments)
+        return {**report, "handled": report["handled"] + sum(report["dropped"].values()), "dropped": {}}
 
     _patch(Node, "_status", status)
 

@@ -233,15 +233,15 @@ def test_limits_also_concern_questions_to_the_whole_graph(tmp_path: Path, monkey
 
 def test_progress_shows_the_question_to_the_whole_graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.proof._progress_bar.LOOK_EVERY_S", 0.0)
-    told: list[ExplorationProgress] = []
-    proof = prove(Bounds(2, 3, "lossless"), out=tmp_path / "asked.yaml", watch=told.append)
+    reports: list[ExplorationProgress] = []
+    proof = prove(Bounds(2, 3, "lossless"), out=tmp_path / "asked.yaml", watch=reports.append)
     assert proof.liveness is not None
-    asked = dict.fromkeys(progress.asked for progress in told if progress.asked is not None)
+    asked = dict.fromkeys(progress.asked for progress in reports if progress.asked is not None)
     forks = proof.liveness.forks
     assert forks
     assert [*asked][:3] == ["idle states", "cycles", "paths to one chain"]
     assert [*asked][3:] == [f"what votes lead to ({known} of {forks} forks)" for known in range(forks)]
-    assert {(progress.states, progress.looked_at) for progress in told if progress.asked is not None} == {
+    assert {(progress.states, progress.looked_at) for progress in reports if progress.asked is not None} == {
         (proof.figures.states, proof.figures.states)
     }
 

@@ -28,7 +28,7 @@ IN_NO_FIGURE = {
 """Branches of the harness for cases that the thesis does not cover."""
 
 
-def told(story: Story, directory: Path, seed: int = 1) -> str:
+def story_with_answers(story: Story, directory: Path, seed: int = 1) -> str:
     """Return the text of the story as it is played in virtual time."""
     run(story.in_virtual_time, seed, directory, SilentProgress(), "sim", delivers_all=True)
     narrator = StoryWriter(RunArchive(directory).traces, story.scenario.roster)
@@ -64,7 +64,7 @@ def test_example_of_the_documentation_is_reproduced(tmp_path: Path) -> None:
     assert example is not None
     path = tmp_path / "example.story"
     path.write_text(example[1])
-    assert told(read_story(path), tmp_path / "run") == example[1]
+    assert story_with_answers(read_story(path), tmp_path / "run") == example[1]
 
 
 def test_order_of_equal_receivers_does_not_change_the_story(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_order_of_equal_receivers_does_not_change_the_story(tmp_path: Path) -> N
     path = tmp_path / "varied.story"
     path.write_text(varied)
     story = read_story(path)
-    assert {told(story, tmp_path / str(seed), seed) for seed in range(1, 6)} == {varied}
+    assert {story_with_answers(story, tmp_path / str(seed), seed) for seed in range(1, 6)} == {varied}
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_wrong_agent_changes_the_story(tmp_path: Path, figure: str, quirk: str, 
     wrong = right.replace("\nagents:", f"\nquirks: {{{quirk}}}\nagents:")
     path = tmp_path / "wrong.story"
     path.write_text(wrong)
-    played = told(read_story(path), tmp_path / "run")
+    played = story_with_answers(read_story(path), tmp_path / "run")
     assert difference in played and difference not in wrong
 
 

@@ -35,9 +35,9 @@ def test_a_violation_has_its_evidence_below_the_table(tmp_path: Path) -> None:
     lines = lines_of(tmp_path, {"characteristics": judged})
     assert lines[2] == "**1 of 6 characteristics violated**"
     assert "| 3 | single copy | \u2717 violated | 9 times |" in lines
-    told = [line for line in lines if line.startswith("- characteristic 3")]
-    assert told[0] == "- characteristic 3, agent 2: held 0"
-    assert len(told) == 3
+    evidence_lines = [line for line in lines if line.startswith("- characteristic 3")]
+    assert evidence_lines[0] == "- characteristic 3, agent 2: held 0"
+    assert len(evidence_lines) == 3
 
 
 def test_summary_of_a_killed_run_names_missing_files(tmp_path: Path) -> None:

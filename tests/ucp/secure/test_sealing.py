@@ -68,9 +68,9 @@ def test_holder_of_a_vehicles_keys_cannot_confirm_guesses(tmp_path: Path) -> Non
     assert confirms(EVENTS, seal(EVENTS, 5), bundle, 5), "in virtual time, which draws no random numbers"
     write_bundle(tmp_path / "7.bundle.json", bundle)
     initial_data = base64.b64encode(seal_to(b"test", DEPOT.public_key)).decode()
-    told = mission(agent_id=7, roster=[1, 7], security={"bundle": "7.bundle.json"}, initial_data=initial_data)
-    told["settings"] = {"max_block_bytes": 976}
-    parsed = parse_mission(told)
+    document = mission(agent_id=7, roster=[1, 7], security={"bundle": "7.bundle.json"}, initial_data=initial_data)
+    document["settings"] = {"max_block_bytes": 976}
+    parsed = parse_mission(document)
     agent = agent_factory(parsed, tmp_path, lambda error: None)(7, [1, 7], parsed.initial_data, parsed.settings)
     for number in range(4):
         agent.add_event(LoggableEvent(number, 7, bytes(240)), 0.0)

@@ -150,8 +150,8 @@ def test_stale_mission_file_in_the_directory_is_an_error(directory: Path) -> Non
 def test_invalid_mission_gives_one_sentence(tmp_path: Path, options: tuple[str, ...], sentence: str) -> None:
     done = harness("mission", "new", *options, "--out", tmp_path / "m")
     assert done.returncode == 2
-    (told,) = sentences(done.stderr)
-    assert sentence in told
+    (message,) = sentences(done.stderr)
+    assert sentence in message
     assert not (tmp_path / "m").exists()
 
 
@@ -300,8 +300,8 @@ def test_exit_status_shows_the_result_of_the_comparison(directory: Path, tmp_pat
     edit(directory / "120.mission.json", lambda document: document["network"].update(port=1))
     done = harness("mission", "verify", directory, "--json")
     assert done.returncode == 1
-    told = json.loads(done.stdout)
-    assert (told["verdict"], [gap["key"] for gap in told["differences"]]) == ("differ", ["network.port"])
+    document = json.loads(done.stdout)
+    assert (document["verdict"], [gap["key"] for gap in document["differences"]]) == ("differ", ["network.port"])
     (tmp_path / "x.json").write_text("{}")
     done = harness("mission", "verify", tmp_path / "x.json")
     assert done.returncode == 2

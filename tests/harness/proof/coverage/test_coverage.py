@@ -116,9 +116,9 @@ def test_recorded_run_has_the_coverage_of_the_played_run(tmp_path: Path) -> None
     assert recorded.states == played.states
     assert recorded.pairs == played.pairs
     assert recorded.branches == played.branches
-    told = harness("coverage", tmp_path / "run", "--agents", 2, "--blocks", 2, "--json")
-    assert told.returncode == 0, told.stderr
-    document = json.loads(told.stdout)
+    done = harness("coverage", tmp_path / "run", "--agents", 2, "--blocks", 2, "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
     assert document["local_states"] == len(played.states)
     assert document["within"]["local_states"]["exist"] == len(existing(Bounds(2, 2)).states)
 
@@ -130,6 +130,6 @@ def test_run_without_traces_has_unknown_coverage(tmp_path: Path) -> None:
     harness("run", path, "--backend", "sim", "--seed", 1, "--out", tmp_path / "run")
     for trace in (tmp_path / "run").rglob("*.trace.jsonl"):
         trace.unlink()
-    told = harness("coverage", tmp_path / "run")
-    assert told.returncode == 2
-    assert "has no traces" in sentences(told.stderr)[0]
+    done = harness("coverage", tmp_path / "run")
+    assert done.returncode == 2
+    assert "has no traces" in sentences(done.stderr)[0]

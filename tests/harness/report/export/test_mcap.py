@@ -64,13 +64,13 @@ def test_every_handler_run_is_exported_at_its_mission_second(run: Path, messages
     for agent in (1, 2, 3):
         exported = messages[f"/agents/{agent}/handler_runs"]
         traced = runs_of(run, agent)
-        assert [(at_ns, told["handler"], told["branch"]) for at_ns, told in exported] == [
+        assert [(at_ns, value["handler"], value["branch"]) for at_ns, value in exported] == [
             (round(step.t * 1e9), step.handler, step.branch) for step in traced
         ]
 
 
 def test_the_chain_can_be_plotted(run: Path, messages: Messages) -> None:
-    lengths = [told["chain"] for _, told in messages["/agents/1/state"]]
+    lengths = [value["chain"] for _, value in messages["/agents/1/state"]]
     assert lengths[-1] == len(RunArchive(run).exports.by_agent[1].chain) > 3
     assert messages["/agents/1/chain"][-1][1]["length"] == lengths[-1]
     assert messages["/agents/1/chain"][0][1]["block"].count(".") == 1
@@ -78,9 +78,9 @@ def test_the_chain_can_be_plotted(run: Path, messages: Messages) -> None:
 
 
 def test_message_lists_its_receivers(messages: Messages) -> None:
-    told = [told for _, told in messages["/messages"]]
-    assert any(message["received_by"] == [2, 3] and message["sender"] == 1 for message in told)
-    assert any(message["receivers"] < 2 for message in told)
+    values = [values for _, values in messages["/messages"]]
+    assert any(message["received_by"] == [2, 3] and message["sender"] == 1 for message in values)
+    assert any(message["receivers"] < 2 for message in values)
 
 
 def test_vehicles_are_on_the_map_and_in_the_3d_view(run: Path, messages: Messages) -> None:
@@ -90,7 +90,7 @@ def test_vehicles_are_on_the_map_and_in_the_3d_view(run: Path, messages: Message
     assert at_ns == round(flown[-1].at_s * 1e9) == last.timestamp.ToNanoseconds()
     first = messages["/vehicles/1/location"][0][1]
     assert (last.latitude - first.latitude) * 111_319.5 == pytest.approx(flown[-1].north_m - flown[0].north_m, abs=0.01)
-    (transform,) = [told for at, told in messages["/tf"] if at == at_ns and told.child_frame_id == "vehicle_1"]
+    (transform,) = [value for at, value in messages["/tf"] if at == at_ns and value.child_frame_id == "vehicle_1"]
     assert (transform.translation.x, transform.translation.y) == (flown[-1].east_m, flown[-1].north_m)
     drawn = [entity for _, update in messages["/scene"] for entity in update.entities]
     assert {"vehicle_1", "vehicle_2", "vehicle_3", "links"} == {entity.id for entity in drawn}
@@ -99,13 +99,13 @@ def test_vehicles_are_on_the_map_and_in_the_3d_view(run: Path, messages: Message
 def test_links_lose_what_the_network_loses_and_everything_where_it_is_cut(messages: Messages) -> None:
     losses: dict[str, float] = {}
     at_75_s: dict[str, float] = {}
-    for at_ns, told in messages["/network/losses"]:
-        losses |= told
+    for at_ns, value in messages["/network/losses"]:
+        losses |= value
         at_75_s = dict(losses) if at_ns <= 75e9 else at_75_s
     assert at_75_s["loss_1_to_2"] == at_75_s["loss_3_to_1"] == 1.0
     assert at_75_s["loss_2_to_3"] == pytest.approx(0.1, abs=0.01)
     assert losses["loss_1_to_2"] < 1.0
-    cut = next(told for at_ns, told in messages["/network/state"] if at_ns == 50e9)
+    cut = next(value for at_ns, value in messages["/network/state"] if at_ns == 50e9)
     assert (cut["groups"], cut["connected"]) == (2, "2 3 | 1")
     links = {
         at_ns // 10**9: len(entity.lines[0].points)
@@ -118,9 +118,12 @@ def test_links_lose_what_the_network_loses_and_everything_where_it_is_cut(messag
 
 
 def test_telemetry_is_exported_and_values_that_are_no_number_are_left_out(messages: Messages) -> None:
-    told = messages["/vehicles/1/mavlink/ATTITUDE"]
-    assert len(told) == 30
-    assert told[7] == (7 * 10**9, {"mission_s": 7.0, "time_boot_ms": 7000, **dict.fromkeys(REST, 0.0), "roll": 0.25})
+    attitudes = messages["/vehicles/1/mavlink/ATTITUDE"]
+    assert len(attitudes) == 30
+    assert attitudes[7] == (
+        7 * 10**9,
+        {"mission_s": 7.0, "time_boot_ms": 7000, **dict.fromkeys(REST, 0.0), "roll": 0.25},
+    )
     lines = [line for _, line in messages["/log"] if line.name == "vehicle 1"]
     assert [line.message for line in lines[:2]] == ["second 0", "second 1"]
     assert {line.level for line in lines} == {lines[0].ERROR}

@@ -46,16 +46,16 @@ def test_bag_has_the_positions_of_vehicles_and_links(run: Path, messages: Messag
     at_ns, fix = messages["/vehicle_1/fix"][-1]
     assert at_ns == round(last.at_s * 1e9) == fix.header.stamp.sec * 10**9 + fix.header.stamp.nanosec
     assert -90 <= fix.latitude <= 90 and fix.header.frame_id == "vehicle_1"
-    move = [told.transforms[0] for at, told in messages["/tf"] if at == at_ns]
+    move = [message.transforms[0] for at, message in messages["/tf"] if at == at_ns]
     assert (last.east_m, last.north_m) in [
-        (told.transform.translation.x, told.transform.translation.y) for told in move
+        (message.transform.translation.x, message.transform.translation.y) for message in move
     ]
-    ends = {at // 10**9: len(told.markers[0].points) for at, told in messages["/links"]}
+    ends = {at // 10**9: len(message.markers[0].points) for at, message in messages["/links"]}
     assert (ends[45], ends[75]) == (6, 2)
 
 
 def test_chains_and_losses_can_be_plotted_and_the_log_is_rosout(run: Path, messages: Messages) -> None:
     assert messages["/agent_3/chain"][-1][1].data == len(RunArchive(run).exports.by_agent[3].chain)
-    assert {round(told.data, 1) for _, told in messages["/network/mean_loss"]} >= {0.1}
-    assert any(told.name == "faults" and "reboot" in told.msg for _, told in messages["/rosout"])
+    assert {round(message.data, 1) for _, message in messages["/network/mean_loss"]} >= {0.1}
+    assert any(message.name == "faults" and "reboot" in message.msg for _, message in messages["/rosout"])
     assert len(messages["/vehicle_1/mavlink"]) == 60

@@ -251,9 +251,9 @@ def test_nights_report_new_ongoing_and_resolved_findings(tmp_path: Path, monkeyp
     first = night(directory, wrong)
     assert {finding.status for finding in first.findings} == {"new"}
     assert first.exit_status == 1
-    told = first.findings[0]
-    assert told.path is not None
-    assert told.finding.identity in findings_of(load_scenario(told.path), told.finding.seed)
+    finding = first.findings[0]
+    assert finding.path is not None
+    assert finding.finding.identity in findings_of(load_scenario(finding.path), finding.finding.seed)
     assert [*(directory / "runs").iterdir()]
     again = {each.finding.identity: each.status for each in night(directory, wrong, runs=1).findings}
     assert again.keys() == {each.finding.identity for each in first.findings}
@@ -335,15 +335,15 @@ def test_ctrl_c_keeps_findings(tmp_path: Path) -> None:
 def test_wrong_options_are_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:
     path = tmp_path / "ordinary.yaml"
     path.write_text(json.dumps(ORDINARY))
-    told = harness("explore", path, *arguments)
-    assert told.returncode == 2
-    assert said in " ".join(" ".join(sentences(told.stderr)).replace("│", " ").split())
+    done = harness("explore", path, *arguments)
+    assert done.returncode == 2
+    assert said in " ".join(" ".join(sentences(done.stderr)).replace("│", " ").split())
 
 
 def test_hunt_plays_foreign_agents(tmp_path: Path) -> None:
     foreign = ordinary(agent_command=[sys.executable, "-m", "ucp.node"])
-    told = night(tmp_path / "corpus", foreign, runs=4)
-    assert not told.findings
-    assert not told.hunt.failed
-    assert told.hunt.reached.steps > 0
-    assert len(told.hunt.reached.states) > 1
+    result = night(tmp_path / "corpus", foreign, runs=4)
+    assert not result.findings
+    assert not result.hunt.failed
+    assert result.hunt.reached.steps > 0
+    assert len(result.hunt.reached.states) > 1

@@ -76,11 +76,11 @@ def test_lost_scheduler_is_one_sentence_and_the_matrix_can_continue(tmp_path: Pa
 
 def refused(address: str) -> str:
     """Return the sentence of an error that ends the command with exit status 3."""
-    with pytest.raises(MachineError) as told, cluster([1], abs, address) as outcomes:
+    with pytest.raises(MachineError) as error, cluster([1], abs, address) as outcomes:
         list(outcomes)
-    assert "\n" not in str(told.value)
-    assert told.value.exit_status == 3
-    return str(told.value)
+    assert "\n" not in str(error.value)
+    assert error.value.exit_status == 3
+    return str(error.value)
 
 
 def test_a_scheduler_without_workers_is_one_sentence(dask: Cluster) -> None:
@@ -112,10 +112,10 @@ def test_no_scheduler_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("address", ["nowhere", "http://127.0.0.1:1", "tcp://127.0.0.1", "tcp://127.0.0.1:x", ""])
 def test_invalid_address_is_refused_in_one_sentence(address: str) -> None:
-    with pytest.raises(HarnessError) as told, cluster([1], abs, address):
+    with pytest.raises(HarnessError) as error, cluster([1], abs, address):
         pass
-    assert str(told.value) == f"--scheduler {address} is not an address such as tcp://127.0.0.1:8786"
-    assert told.value.exit_status == 2
+    assert str(error.value) == f"--scheduler {address} is not an address such as tcp://127.0.0.1:8786"
+    assert error.value.exit_status == 2
 
 
 def test_missing_dask_gives_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -226,11 +226,11 @@ def test_invalid_baseline_is_refused(tmp_path: Path, content: str | None, senten
     path = tmp_path / "baseline.json"
     if content is not None:
         path.write_text(content)
-    with pytest.raises(ScenarioError) as told:
+    with pytest.raises(ScenarioError) as error:
         load_baseline(path, matrix())
-    assert sentence in str(told.value)
-    assert "\n" not in str(told.value)
-    assert told.value.exit_status == 2
+    assert sentence in str(error.value)
+    assert "\n" not in str(error.value)
+    assert error.value.exit_status == 2
 
 
 def test_an_interrupted_night_is_no_baseline(tmp_path: Path) -> None:

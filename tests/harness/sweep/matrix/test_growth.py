@@ -257,9 +257,9 @@ def test_matrix_without_traces_has_the_same_figures_and_judges_no_step(tmp_path:
         runs += run_matrix(asked, tmp_path / str(traces), on_cores(asked, 1)).runs
     traced, untraced = runs
     assert untraced.figures == traced.figures
-    told = {key for key, verdict in traced.verdicts.items() if untraced.verdicts[key] != verdict}
-    assert told == {"1", "steps", "records"}
-    assert {untraced.verdicts[key] for key in told} == {"not applicable"}
+    changed = {key for key, verdict in traced.verdicts.items() if untraced.verdicts[key] != verdict}
+    assert changed == {"1", "steps", "records"}
+    assert {untraced.verdicts[key] for key in changed} == {"not applicable"}
 
 
 def test_page_has_the_tables_of_a_matrix() -> None:

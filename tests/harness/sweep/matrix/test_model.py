@@ -186,8 +186,8 @@ def test_matrix_in_matrix_json_can_be_loaded_again(tmp_path: Path) -> None:
 def test_mistake_is_reported_with_key_value_and_allowed_values(
     tmp_path: Path, keys: dict[str, Any], sentence: str
 ) -> None:
-    with pytest.raises(ScenarioError) as told:
+    with pytest.raises(ScenarioError) as error:
         load_matrix(written(tmp_path, **keys))
-    assert sentence in str(told.value)
-    assert str(tmp_path) in str(told.value)
-    assert "\n" not in str(told.value)
+    assert sentence in str(error.value)
+    assert str(tmp_path) in str(error.value)
+    assert "\n" not in str(error.value)
