@@ -62,7 +62,8 @@ def _items(path: Path, scratch: Path) -> Iterator[Item]:
             with path.open("wb") as copy:
                 shutil.copyfileobj(file, copy)
             problem = file.problem
-    if _magic(path) == ZSTD_MAGIC:
+    zstd = _magic(path) == ZSTD_MAGIC
+    if zstd:
         compressed, path = path, scratch / "unzstd"
         problem = decompress_file(compressed, path)
     magic = _magic(path)
@@ -72,7 +73,8 @@ def _items(path: Path, scratch: Path) -> Iterator[Item]:
         with open_plain_file(path) as bag, mmap.mmap(bag.fileno(), 0, access=mmap.ACCESS_READ) as content:
             yield from (_version_1 if magic == _version_1.MAGIC else _mcap_bag).items(content)
     else:
-        yield UnreadablePart("it is no ROS bag")
+        way_out = ", but another file that is packed with zstd: unpack it first with `zstd -d`" if zstd else ""
+        yield UnreadablePart(f"it is no ROS bag{way_out}")
     if problem:
         yield UnreadablePart(problem)
 
