@@ -19,6 +19,7 @@ from random import Random
 from typing import Any
 
 from harness.backend_names import BackendName
+from harness.checker.judgement import Judgement
 from harness.run.parallel import FailedTask, cores, sweep
 from harness.run.run import run
 from harness.scenario import Scenario
@@ -133,8 +134,14 @@ def judge(backend: BackendName, number: int) -> tuple[list[str], dict[str, str]]
         asked = varied(number) if backend == "sim" else of_processes(number)
         result = run(asked, number, Path(directory, "run"), backend=backend).result
     verdicts = {key: judgement.verdict for key, judgement in result.judgements.items()}
-    bad = [f"{key}: {verdicts[key]}: {result.judgements[key].reason}" for key in verdicts if key in result.bad]
+    judged = {key: judgement for key, judgement in result.judgements.items() if key in result.bad}
+    bad = [f"{key}: {judgement.verdict}: {judgement.reason}{_first(judgement)}" for key, judgement in judged.items()]
     return bad, verdicts
+
+
+def _first(judgement: Judgement) -> str:
+    """Return the first piece of evidence of a verdict, if it has evidence."""
+    return f"; {judgement.evidence[0].detail}" if judgement.evidence else ""
 
 
 def say(sentence: str) -> None:

@@ -141,7 +141,9 @@ class RunPlayer:
 def _first_deviation(result: Result) -> str | None:
     """Return the handler of the first step that deviates from the algorithms. Return None if no step deviates."""
     steps = result.beside.get("steps")
-    return steps.evidence[0].handler if steps is not None and steps.verdict == "deviates" else None
+    if steps is None or steps.verdict != "deviates":
+        return None
+    return next((finding.handler for finding in steps.evidence), None)
 
 
 def directory_name(task: MatrixTask) -> str:

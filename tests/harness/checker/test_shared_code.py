@@ -5,8 +5,11 @@ from collections.abc import Iterator
 import pytest
 
 from harness.archive import vocabulary
+from harness.checker import Result
+from harness.checker.judgement import Judgement
 from harness.checker.reference import algorithms
 from harness.checker.steps import _shared_code
+from harness.sweep.matrix._cell_play import _first_deviation
 from tests.harness.test_rooms import imports, modules
 from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER
 from ucp.quirks import CRASHED, QUIRKS
@@ -70,3 +73,8 @@ def test_names_of_the_judge_are_those_of_core_and_reference() -> None:
     assert {message.NAME for message in ON_MESSAGE} == vocabulary.MESSAGES
     votes = ("vote_count", "reconcile_vote_count")
     assert {name for name, handler in HANDLERS.items() if handler.tally in votes} == vocabulary.COUNTS_VOTES
+
+
+def test_matrix_names_no_handler_if_the_judge_found_none() -> None:
+    broken = Judgement("every step", "deviates", "ucp/block.py was edited and contradicts the agent contract")
+    assert _first_deviation(Result({}, {}, {"steps": broken})) is None
