@@ -127,7 +127,7 @@ class InferredInputPath:
         return DatagramReceived(encode(sender, self._sequence, message))
 
     def _answer(self, message: Message) -> None:
-        """Return the answer to a query. The answering agents hold the known chain."""
+        """Return the answer that an agent with the known chain gives to a query or request."""
         answer: Message
         known = {chain_hash: height for height, chain_hash in enumerate(self._chain_hashes)}
         chain = self._known.chain

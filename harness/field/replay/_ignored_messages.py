@@ -66,8 +66,9 @@ def ignored_messages(record: RecordedTrace, play_to: Callable[[int], PlayedAgent
 
 
 def _without_line(record: RecordedTrace) -> Iterator[tuple[int, CapturedDatagram]]:
-    """Yield the messages that arrived between two lines of an incarnation but have no line in the trace. Yield each
-    message with the position of the next entry.
+    """Yield the messages that arrived at the agent but that its trace does not contain. Yield each message with the
+    position of the trace entry that follows the arrival. Messages before the first entry or after the last entry of an
+    incarnation are skipped.
     """
     known = {(run.sender, run.sequence) for entry in record.entries if (run := _received(entry)) is not None}
     times = [entry.content.t for entry in record.entries]

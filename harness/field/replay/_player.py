@@ -32,8 +32,8 @@ some milliseconds.
 """
 
 MAX_DOUBTS = 3
-"""Maximum number of places in a record at which damage to a line is accepted as a better explanation than a mistake of
-the agent.
+"""Maximum number of places in a record that can be explained by a damaged line. If there are more such places, the
+replay assumes that the agent made mistakes.
 """
 MAX_TRIED = 20
 """Maximum number of deviations for which damage to a line is tried as an explanation."""

@@ -123,8 +123,8 @@ class Channel:
         return messages
 
     def to_json(self) -> dict[str, Any]:
-        """Return the state of the channel, so that another process can continue with it. No message may be
-        incomplete.
+        """Return the state of the channel, with which another process can continue to use the connection. The caller
+        must have read the last message completely.
         """
         assert not self._unread, "a message is incomplete"
         return {

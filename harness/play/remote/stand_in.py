@@ -86,8 +86,8 @@ class StandIn:
         self._ponged_s = self._loop.time()
         self._begun = False
         self._offset_s: float | None = None
-        """Seconds by which the far clock is ahead of the clock of this machine. The value for mission second 0 is fixed
-        by the first incarnation.
+        """Seconds by which the clock of the other computer is ahead of the clock of this machine. The first incarnation
+        of the agent determines the value. Later incarnations use the same value.
         """
         self._cut_off = False
         self._server: asyncio.Server | None = None
