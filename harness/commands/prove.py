@@ -18,6 +18,7 @@ from harness.run.parallel import cores, sigterm_as_ctrl_c
 GIGABYTE = 1e9
 TIMERS = ("duration", "any")
 CLOCKS = ("agreed", "any")
+ZONES = ("equal", "contained")
 LIMITS, WRONG = "Limits", "Wrong or captured agents"
 
 
@@ -40,6 +41,10 @@ def prove_command(
         str,
         typer.Option(rich_help_panel=RARE, help="Age order of blocks: equal for all agents (agreed), or any."),
     ] = "agreed",
+    zones: Annotated[
+        str,
+        typer.Option(rich_help_panel=RARE, help="Zones that count as one: equal, or contained in another."),
+    ] = "equal",
     losses: Annotated[
         int | None,
         typer.Option(rich_help_panel=RARE, help="Maximum number of lost messages; no limit if not given."),
@@ -123,6 +128,8 @@ def prove_command(
         raise BoundsError(f"--timers must be one of {', '.join(TIMERS)}, not {timers!r}")
     if clocks not in CLOCKS:
         raise BoundsError(f"--clocks must be one of {', '.join(CLOCKS)}, not {clocks!r}")
+    if zones not in ZONES:
+        raise BoundsError(f"--zones must be one of {', '.join(ZONES)}, not {zones!r}")
     quirks = _pairs("--quirk", quirk)
     if lies is not None and (captured is None or network == "any"):
         raise BoundsError(
@@ -146,6 +153,7 @@ def prove_command(
         clocks_any=clocks == "any",
         losses=losses,
         crossing=not no_crossing,
+        zones_contained=zones == "contained",
     )
     if bounds.reduced and (reason := bounds.why_not_reduced()) is not None:
         complain(f"state reduction is disabled: {reason}")

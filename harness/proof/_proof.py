@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,8 @@ OF_OTHERS = {
 RUN_LOOKED_FOR_S = 60.0
 """Maximum number of seconds of the search for a run of the whole swarm that shows a violation found in a single agent.
 """
+CYCLES_LOOKED_FOR_S = 60.0
+"""Maximum number of seconds to search for livelocks in an incomplete graph."""
 PLAYED = {
     "honest": "4",
     "name": "1",
@@ -146,7 +149,14 @@ class Proof:
     def decided(self) -> bool:
         """True if every property was decided, that is, if neither a limit nor a violation ended the search early."""
         whole = self.whole_ended == "complete" and (self.liveness is None or self.liveness.decided)
-        return self.complete and whole
+        return self.complete and whole and not self.left_open
+
+    @property
+    def left_open(self) -> bool:
+        """True if states have no path to one chain, but perhaps only because they represent states with smaller
+        zones.
+        """
+        return self.bounds.zones_contained and self.liveness is not None and self.liveness.lost is not None
 
     @property
     def findings(self) -> dict[str, str]:
@@ -163,7 +173,7 @@ class Proof:
             found[key] = f"{self.claims[self.flaw.kind]}: violated, {self.flaw.sentence}"
         for form in self.forms:
             found[f"livelock {form}"] = f"a cycle without losses lasts for ever, with the timers {form}"
-        if self.liveness is not None and self.liveness.lost is not None:
+        if self.liveness is not None and self.liveness.lost is not None and not self.left_open:
             found["one chain"] = "from some state no path without losses leads to an idle swarm with one chain"
         return found
 
@@ -186,6 +196,7 @@ class Proof:
             "timers": "any" if bounds.timers_any else "duration",
             "coincidences": bounds.coincidences,
             "clocks": "any" if bounds.clocks_any else "agreed",
+            "zones_contained": bounds.zones_contained,
             "losses": bounds.losses,
             "crossing": bounds.crossing,
             "settings": dict(bounds.settings),
@@ -321,7 +332,7 @@ def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[
 def _show(proof: Proof, graph: StateGraph, path: Path, name: str) -> None:
     """Write a scenario for each violation, the first one to `path`."""
     live = proof.liveness
-    ways_round = live.cycles if live is not None else cycles(graph) if proof.ended in ("memory", "time") else []
+    ways_round = live.cycles if live is not None else _known_cycles(graph) if proof.ended in ("memory", "time") else []
     for key, number in graph.shown.items():
         beside = path.with_stem(f"{path.stem}_characteristic_{key}")
         proof.shown[key] = _example(graph, number, SHOWN[key], beside, f"{name} characteristic {key}")
@@ -331,7 +342,7 @@ def _show(proof: Proof, graph: StateGraph, path: Path, name: str) -> None:
         proof.forms = _livelock.in_timers(graph, ways_round)
         proof.livelocks = list(_livelock.show(graph, ways_round, path, name))
         proof.example = proof.livelocks[0].example
-    elif live is not None and live.lost is not None:
+    elif live is not None and live.lost is not None and not proof.left_open:
         proof.example = _example(
             graph, live.lost, "no path from here to an idle swarm with one chain was found", path, name
         )
@@ -343,6 +354,18 @@ def _show(proof: Proof, graph: StateGraph, path: Path, name: str) -> None:
         beside = path.with_stem(f"{path.stem}_votes")
         sentence = "one more vote does not lead from here to one chain"
         proof.reluctant = _example(graph, live.reluctant, sentence, beside, f"{name} votes")
+
+
+def _known_cycles(graph: StateGraph) -> list[list[int]]:
+    """Return the cycles of an incomplete graph. If its zones are not exact, return only those that are found within
+    `CYCLES_LOOKED_FOR_S`.
+    """
+    if graph.states.exact:
+        return [*cycles(graph)]
+    found: list[list[int]] = []
+    with suppress(LimitReachedError):
+        found.extend(cycles(graph, ExplorationBudget(float("inf"), CYCLES_LOOKED_FOR_S).check))
+    return found
 
 
 def _example(graph: StateGraph, number: int, sentence: str, path: Path, name: str) -> ViolationExample:

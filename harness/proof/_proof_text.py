@@ -63,6 +63,7 @@ def _tighter(bounds: Bounds) -> list[str]:
     options += ["--no-crossing"] if bounds.crossing else []
     if bounds.nameless and not bounds.clocks_any:
         options.append("--clocks any")
+    options += [] if bounds.zones_contained else ["--zones contained"]
     return options
 
 
@@ -107,6 +108,11 @@ def _of_the_whole(proof: Proof) -> Iterator[str]:
     )
     if not live.decided:
         yield "- not decided, one chain: the states after more votes exceed the limit of the search"
+    elif proof.left_open:
+        yield (
+            f"- not decided, one chain: {live.astray[-1]:,} states have no path without losses to an idle swarm with "
+            f"one chain, even {after}, or they represent states that have one: use --zones equal"
+        )
     elif live.lost is None:
         yield (
             "✔ holds, one chain: from every state some path without losses leads to an idle swarm with one chain, "

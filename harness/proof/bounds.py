@@ -50,6 +50,8 @@ class Bounds:
       receive each message.
     - `clocks_any`: at each comparison of two blocks, either of them may be the older one.
     - `losses`: the maximum number of lost messages that would have had an effect. None means any number.
+    - `zones_contained`: a state represents all states with the same agents whose possible timer values are among its
+      own.
     - `crossing`: messages of several agents may cross. If false, all consequences of an action end before the next
       action.
 
@@ -72,6 +74,7 @@ class Bounds:
     clocks_any: bool = False
     losses: int | None = None
     crossing: bool = True
+    zones_contained: bool = False
 
     def __post_init__(self) -> None:
         for name, count, most in (("agents", self.agents, MAX_AGENTS), ("blocks", self.blocks, MAX_BLOCKS)):
@@ -129,7 +132,11 @@ class Bounds:
     def _check_time(self) -> None:
         if self.coincidences is not None and not 0 <= self.coincidences <= MAX_COINCIDENCES:
             raise BoundsError(f"--coincidences must be 0..{MAX_COINCIDENCES}, not {self.coincidences}")
-        for option, given in (("--coincidences", self.coincidences is not None), ("--clocks any", self.clocks_any)):
+        for option, given in (
+            ("--coincidences", self.coincidences is not None),
+            ("--clocks any", self.clocks_any),
+            ("--zones contained", self.zones_contained),
+        ):
             if given and (self.timers_any or self.network == "any"):
                 raise BoundsError(f"{option} does not apply to --timers any and --network any: leave it out")
         if self.clocks_any and (self.quirks or self.captured is not None):
@@ -187,6 +194,7 @@ class Bounds:
         if self.coincidences is not None:
             parts += [f"{self.coincidences or 'no'} coincidence{'s' * (self.coincidences != 1)}"]
         parts += ["any block the older"] if self.clocks_any else []
+        parts += ["contained zones left out"] if self.zones_contained else []
         if self.losses is not None:
             parts += [f"{self.losses or 'no'} loss{'es' * (self.losses != 1)}"]
         parts += [f"{name} {value}" for name, value in self.settings.items()]

@@ -8,7 +8,7 @@ from itertools import chain, islice
 from struct import Struct
 from typing import NamedTuple, overload
 
-from harness.proof.model._global_states import AGENTS, ModelSwarm, State
+from harness.proof.model._global_states import AGENTS, ZONE, ModelSwarm, State
 from harness.proof.model._instant import Actions
 from harness.proof.questions._attractor import ByTimer
 
@@ -90,20 +90,42 @@ def cycles_left_alone() -> Iterator[None]:
 
 
 class StateStore(Sequence[State]):
-    """The states of a swarm as bytes, numbered in the order in which they were added."""
+    """The states of a swarm as bytes, numbered in the order in which they were added.
 
-    def __init__(self, agents: int) -> None:
+    The function `contains` returns true if its first zone contains its second zone. A state whose zone is contained in
+    the zone of a stored state with the same agents then gets the number of the stored state: each run from the one
+    state is also a run from the other. Without this function, only equal states have the same number.
+    """
+
+    def __init__(self, agents: int, contains: Callable[[int, int], bool] | None = None) -> None:
         self._form = Struct(f"={AGENTS + agents}i")
+        self._contains = contains
         self._rows: list[bytes] = []
-        self._numbers: dict[bytes, int] = {}
+        self._zones = array("i")
+        self._numbers: dict[bytes, tuple[int, ...]] = {}
+
+    @property
+    def exact(self) -> bool:
+        """True if only equal states have the same number."""
+        return self._contains is None
 
     def add(self, state: State) -> int:
-        """Return the number of a state. If the state is new, add it with the next free number."""
-        row = self._form.pack(*state)
-        number = self._numbers.setdefault(row, len(self._rows))
-        if number == len(self._rows):
-            self._rows.append(row)
+        """Return the number of a state. If no stored state represents it, add it with the next free number."""
+        zone, contains = state[ZONE], self._contains
+        key = self._form.pack(*state if contains is None else (*state[:ZONE], 0, *state[AGENTS:]))
+        alike = self._numbers.get(key, ())
+        for number in alike:
+            if self._zones[number] == zone or (contains is not None and contains(self._zones[number], zone)):
+                return number
+        number = self.append(state)
+        self._numbers[key] = (*alike, number)
         return number
+
+    def append(self, state: State) -> int:
+        """Store a state even if a stored state represents it. Return its number."""
+        self._rows.append(self._form.pack(*state))
+        self._zones.append(state[ZONE])
+        return len(self._rows) - 1
 
     def __len__(self) -> int:
         return len(self._rows)

@@ -23,10 +23,12 @@ class StateGraph:
     """The explored states by number, and the predecessor of each state. If `ended` is "complete", the graph contains
     all reachable states.
 
-    `quiet` and `crossing` contain the fields `by_timer` and `crossing` of each state's `StateExpansion`.
+    `quiet` and `crossing` contain the fields `by_timer` and `crossing` of each state's `StateExpansion`. If `exact` is
+    false, a state can represent states whose zones its zone contains.
     """
 
     swarm: ModelSwarm
+    exact: bool = False
     states: StateStore = field(init=False)
     parents: "array[int]" = field(default_factory=lambda: array("q"))
     quiet: SuccessorStore = field(default_factory=SuccessorStore)
@@ -45,7 +47,7 @@ class StateGraph:
     """Memory and processor time of the workers, and the number of agent steps that they have computed."""
 
     def __post_init__(self) -> None:
-        self.states = StateStore(self.swarm.bounds.agents)
+        self.states = StateStore(self.swarm.bounds.agents, None if self.exact else self.swarm.contains)
 
     @property
     def flaw(self) -> PropertyViolation | None:

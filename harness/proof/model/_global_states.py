@@ -5,7 +5,7 @@ and the local states of the agents. If `bounds.alike` is true, equal agents are 
 agents represents all orders. If `bounds.blocks_alike` is true, the same holds for blocks.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import combinations, permutations, product
 from typing import NamedTuple
@@ -118,6 +118,13 @@ class ModelSwarm:
             faults += (1 << ONCE.index("captured")) + bounds.lies * LIES
         faults += (bounds.coincidences or 0) * COINCIDENCES + (bounds.losses or 0) * LOSSES
         self.initial: State = (0, faults, NOTHING_RUNS, *(self.local.initial[agent_id] for agent_id in own))
+
+    @property
+    def contains(self) -> Callable[[int, int], bool] | None:
+        """A function that returns true if its first zone contains its second zone. None if only equal states count as
+        one.
+        """
+        return self.zones.contains if self.bounds.zones_contained else None
 
     # Actions of an instant
 

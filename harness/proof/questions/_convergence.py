@@ -53,7 +53,7 @@ def look(graph: StateGraph, watch: Watch = lambda asked: None, workers: Workers 
     """
     idle_states = dict(_idle_states(graph, partial(watch, "idle states")))
     forks = [number for number, chains in idle_states.items() if chains > 1]
-    result = ConvergenceResult(len(forks), forks[0] if forks else None, cycles(graph, partial(watch, "cycles")))
+    result = ConvergenceResult(len(forks), forks[0] if forks else None, [*cycles(graph, partial(watch, "cycles"))])
     safe = BackwardReachableStates(graph.quiet, graph.swarm.bounds.timers_any, partial(watch, "paths to one chain"))
     safe.add(number for number, chains in idle_states.items() if chains <= 1)
     result.astray.append(safe.left)

@@ -1,18 +1,84 @@
-"""Find cycles in the state graph without lost messages and without new blocks."""
+"""Find cycles in the state graph without lost messages and without new blocks.
+
+A state of the graph can represent states with smaller zones. A cycle of such a graph can be impossible to repeat: in
+each round the times of the agents shift, until another timer expires first. Each part of the graph with a cycle is
+therefore explored again with exact zones. A cycle through exact zones can repeat forever. Conversely, each endless run
+stays in one part in the end, and with exact zones it repeats a state, because the number of zones is finite.
+"""
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-from harness.proof.graph._exploration import StateGraph
-from harness.proof.questions._attractor import Check
+from harness.proof.graph._expansion import StateExpansion, quiet
+from harness.proof.graph._exploration import NO_PARENT, StateGraph
+from harness.proof.model._global_states import AGENTS, ZONE, State
+from harness.proof.questions._attractor import ByTimer, Check
+
+OUTSIDE = -1
+"""The number of a state outside the explored part."""
 
 
-def cycles(graph: StateGraph, check: Check = lambda: None) -> list[list[int]]:
-    """Return a shortest cycle of each strongly connected component. The component that is nearest to the initial state
+def cycles(graph: StateGraph, check: Check = lambda: None) -> Iterator[list[int]]:
+    """Yield a shortest cycle of each strongly connected component. The component that is nearest to the initial state
     comes first.
     """
-    parts = [part for part in _parts(graph, check) if len(part) > 1 or part[0] in _after(graph, part[0])]
-    return [_shortest_cycle(graph, min(part), set(part)) for part in sorted(parts, key=min)]
+    parts = sorted(_cyclic_parts(graph, check), key=min)
+    if graph.states.exact:
+        yield from (_shortest_cycle(graph, min(part), set(part)) for part in parts)
+        return
+    for part in parts:
+        exact = _with_exact_zones(graph, sorted(part), check)
+        numbers = dict(enumerate(sorted(part)))
+        for cycle in cycles(exact, check):
+            yield [_number_in(graph, exact, state, numbers) for state in cycle]
+
+
+def _cyclic_parts(graph: StateGraph, check: Check) -> Iterator[list[int]]:
+    return (part for part in _parts(graph, check) if len(part) > 1 or part[0] in _after(graph, part[0]))
+
+
+def _with_exact_zones(graph: StateGraph, part: Sequence[int], check: Check) -> StateGraph:
+    """Return the graph of all states that are reached from a part of a graph, whose agents are always in states that
+    occur in this part. Only equal states are one state. The first states of the result are those of `part`.
+    """
+    exact = StateGraph(graph.swarm, exact=True)
+    for number in part:
+        exact.reach(graph.states[number], NO_PARENT)
+    inside = {_agents(graph.states[number]) for number in part}
+    while len(exact.quiet) < len(exact.states):
+        check()
+        parent = len(exact.quiet)
+
+        def number_of(state: State, parent: int = parent) -> int:
+            return exact.reach(state, parent) if _agents(state) in inside else OUTSIDE
+
+        following = quiet(exact.swarm, exact.states[parent], number_of)
+        by_timer: ByTimer = tuple(_inside(after) for after in following.by_timer)
+        exact.take_in(StateExpansion(0, by_timer, _inside(following.crossing)))
+    return exact
+
+
+def _agents(state: State) -> State:
+    """Return a state without its zone."""
+    return (*state[:ZONE], *state[AGENTS:])
+
+
+def _inside(after: Sequence[int]) -> tuple[int, ...]:
+    return tuple(number for number in after if number != OUTSIDE)
+
+
+def _number_in(graph: StateGraph, exact: StateGraph, state: int, numbers: dict[int, int]) -> int:
+    """Return the number in `graph` of a state of `exact`. Add the state and its path to `graph` if necessary.
+
+    `numbers` contains the states of `exact` that `graph` already has.
+    """
+    path = [state]
+    while path[-1] not in numbers:
+        path.append(exact.parents[path[-1]])
+    for after, before in zip(path[-2::-1], path[:0:-1], strict=True):
+        numbers[after] = graph.states.append(exact.states[after])
+        graph.parents.append(numbers[before])
+    return numbers[state]
 
 
 def _after(graph: StateGraph, number: int) -> set[int]:

@@ -97,6 +97,7 @@ def test_reduction_of_tallies_changes_no_result(network: Any) -> None:
         (Bounds(3, 2, "lossy", ("reboot",)), 500_000),
         (Bounds(3, 2, "lossy", ("reboot",)), 1),
         (Bounds(3, 2, "lossy", stagger={"phase1_timeout_s": 0.5}, clocks_any=True), 500_000),
+        (Bounds(3, 2, "lossy", ("reboot",), zones_contained=True), 500_000),
     ],
 )
 def test_two_cores_give_the_result_of_one(bounds: Bounds, most_told: int, monkeypatch: pytest.MonkeyPatch) -> None:

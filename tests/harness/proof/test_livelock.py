@@ -54,7 +54,7 @@ def test_livelock_reports_its_conditions(
 
 def test_possible_forms_come_first_and_the_rest_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     graph = explored(4, 4, "lossless", clocks_any=True)
-    ways = cycles(graph)
+    ways = [*cycles(graph)]
     for number, each in enumerate((ways, ways[::-1])):
         shown = [livelock.contradictory for livelock in show(graph, each, tmp_path / f"{number}.yaml", "round")]
         assert shown == [False, True]
