@@ -135,7 +135,7 @@ def _tip(moment: ReplicationFigures, figures: Sequence[tuple[str, Figure]], name
 CYCLE_HEIGHT = 34
 MAX_ROUNDS = 400
 """Maximum number of brackets that mark repetitions. If there are more repetitions, only the last ones get brackets,
-because nobody could distinguish all of them.
+because readers could not distinguish all of them.
 """
 MOST_ROUNDS = 1_000_000
 MAX_TEXT = 1000

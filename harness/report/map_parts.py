@@ -204,7 +204,7 @@ MIN_ASPECT = 0.45
 MARGIN = 0.05
 """Margin around the flight paths, as a share of the length of each side of the map."""
 INVISIBLE_PX = 0.5
-"""Pixels. Nobody can see a deviation of a line that is not larger than this."""
+"""Largest deviation of a line, in pixels, that readers cannot see."""
 
 
 @dataclass(frozen=True, slots=True)

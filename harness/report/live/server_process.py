@@ -76,7 +76,7 @@ class LivePage:
         self._snapshot = snapshot
 
     def run_is_over(self) -> bool:
-        """Tell the web server that the run has ended. Return true if a page is open."""
+        """Report to the web server that the run has ended. Return true if a page is open."""
         self._ended.set()
         self._state_sender.join()
         self._send(["over"])

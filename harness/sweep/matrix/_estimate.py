@@ -92,8 +92,8 @@ class Metric:
     of: Callable[[Figures], float | None]
     """Returns the value of the result, or None if the run does not determine the result."""
     unit: Literal["share of runs", "share", "number"] = "number"
-    """What the value means: "share of runs" for a property that some runs have, "share" for a share within each run,
-    "number" for any other number.
+    """The meaning of the value: "share of runs" for a property that some runs have, "share" for a share within each
+    run, and "number" for any other number.
     """
     worse: Literal["lower", "higher"] | None = None
     """The direction that counts as worse. None if neither direction is worse."""

@@ -335,7 +335,7 @@ def test_removed_public_key_ends_the_handshake() -> None:
 
 
 def test_wrong_public_key_ends_the_handshake() -> None:
-    for share in ("00" * 32, "ff", 7):  # the first has small order, so the result would be known to everybody
+    for share in ("00" * 32, "ff", 7):  # the first has small order, so every attacker would know the result
         with pytest.raises(HandshakeError, match="wrong public key"):
             _shared(KeyExchange(), {"share": share})
 
