@@ -64,8 +64,8 @@ def examine() -> list[LabRequirement]:
 
 
 def _shared_channel(log: Path) -> LabRequirement:
-    """Test whether a process can take over broadcasts from the kernel. A shared radio channel in real time needs
-    this.
+    """Test whether a process can intercept broadcasts before the kernel delivers them. A shared radio channel in real
+    time needs this ability.
     """
 
     async def attempt() -> str | None:

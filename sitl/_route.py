@@ -70,7 +70,7 @@ def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Wa
 
 
 def limit_s(waypoints: Sequence[Waypoint], index: int) -> float:
-    """Return the time limit, in simulated seconds, of one waypoint after the previous one."""
+    """Return the time limit, in simulated seconds, for the flight from one waypoint to the next."""
     waypoint = waypoints[index]
     start = waypoints[index - 1].place if index else LocalPlace(0.0, 0.0, 0.0)
     way_s = math.dist(start[:2], waypoint.place[:2]) / (SLOWEST * waypoint.speed_ms)

@@ -161,7 +161,7 @@ class GroundStation(asyncio.DatagramProtocol):
         self._full = False
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore the error, which means that no program listens at the address at the moment."""
+        """Ignore this error. It only means that no program listens at the address now."""
 
 
 class _VehicleConnection(asyncio.Protocol):

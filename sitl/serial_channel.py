@@ -246,8 +246,9 @@ class ClientChannel:
     def _refuse_file(self, message: Any) -> None:
         """Refuse a request of MAVLink FTP, because the vehicle has no files.
 
-        A payload has a sequence number of two bytes, a session, an operation, a size, the requested operation, two
-        bytes, an offset of four bytes, and the data, here an error number. https://mavlink.io/en/services/ftp.html
+        A payload has these fields: sequence number (two bytes), session, operation, size, requested operation, two
+        bytes that are not used here, offset (four bytes), and data. The data is an error number here.
+        https://mavlink.io/en/services/ftp.html
         """
         sequence = (int.from_bytes(bytes(message.payload[:2]), "little") + 1) & 0xFFFF
         session, operation = message.payload[2:4]

@@ -24,10 +24,10 @@ class Core(AgentState):
     """The state of an agent, and the operations of its handlers. The results of a handler stay here until the agent
     collects them.
 
-    `outbox` has the (sequence, message, recorded datagram) to broadcast. `changes`, `announced` and `started` are the
-    changes, messages and timers of the running handler, as in a trace. They and the recorded datagrams exist only with
-    `tracing`. `sealed` is the event data that the handler encrypted. The trace needs it, because a replay cannot
-    encrypt it again.
+    `outbox` is a list of (sequence number, message, recorded datagram) to broadcast. `changes`, `announced` and
+    `started` contain the changes, messages and timers of the running handler, as a trace has them. These three and the
+    recorded datagrams exist only with `tracing`. `sealed` is the event data that the handler encrypted. The trace needs
+    it, because a replay cannot encrypt it again.
     """
 
     running: EventHandler[Any]

@@ -362,7 +362,7 @@ class Node:
         return self.mission.quirks
 
     def _trace_command(self, request: dict[str, Any]) -> None:
-        """Write a command that triggers no handler to the trace. Do nothing before the start of the mission."""
+        """Write to the trace a command that triggers no handler. Do nothing before the start of the mission."""
         if self.clock.running:
             self._record_entries([CommandEntry(self.clock.now(), str(request.get("command")), request)])
 

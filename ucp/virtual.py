@@ -242,7 +242,7 @@ class VirtualAgent:
         self._agent.replace_handlers(wrong_handlers(self._mission.quirks, self._rng))
 
     def _trace_command(self, given: dict[str, Any], now: float) -> None:
-        """Write a command that triggers no handler to the trace."""
+        """Write to the trace a command that triggers no handler."""
         if self._tracing:
             request = {key: value for key, value in given.items() if key != "t"}
             self._traced_commands.append(CommandEntry(now, str(given["command"]), request))

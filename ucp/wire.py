@@ -10,8 +10,8 @@ from struct import Struct
 
 
 class FieldKind(Enum):
-    """The type of a field in a message. For a type of fixed size, the value of the member is its big-endian format in
-    Python's `struct`.
+    """The type of a field in a message. For a type of fixed size, the value of the enum member is the big-endian format
+    of `struct`.
     """
 
     U8 = "B"

@@ -219,7 +219,7 @@ class RunArchive:
 
     @cached_property
     def epoch_us(self) -> int | None:
-        """The timestamp of mission second 0 in most of the trace headers. None if no header can be read."""
+        """The timestamp of mission second 0 on which most trace headers agree. None if no header can be read."""
         epochs = Counter(
             epoch for path in self._trace_files if type(epoch := read_clock(path).get("epoch_us")) is int
         ).most_common(1)

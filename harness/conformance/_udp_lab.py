@@ -325,7 +325,7 @@ class ProcessUnderTest:
         await self.program.process.send_signal(number)
 
     async def start_mission(self, epoch_us: int) -> int:
-        """Start the mission. Return its start in the time of the agent's computer. Raises the errors of `ask`."""
+        """Start the mission. Return its start time by the clock of the agent's computer. Raises the errors of `ask`."""
         await self.ask("start", epoch_us=epoch_us)
         return epoch_us if self._incarnation is None else self._incarnation.epoch_us
 

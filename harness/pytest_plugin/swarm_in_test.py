@@ -35,8 +35,8 @@ class RunEndedError(Exception):
 
 
 class _ActionContext(AbstractContextManager[None]):
-    """The result of an action, for use with `with`. The action is undone at the end of the `with` block, unless the
-    block failed.
+    """A context manager that holds the result of an action. The end of the `with` block undoes the action, unless the
+    block raised an exception.
     """
 
     def __init__(self, undo: Callable[[], object]) -> None:

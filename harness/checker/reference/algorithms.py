@@ -377,7 +377,7 @@ def receive_request_block_for_hash(state: ReferenceState, sender: int, message: 
 def receive_response_block_for_hash(state: ReferenceState, sender: int, message: BlockResponse) -> str:
     """Algorithm 18, Receive Response Block for Hash (Section 3.6.3): commit the requested block (reading 12).
 
-    The pause of the phase 3 timer has no effect, because handlers are atomic (reading 12).
+    Pausing the phase 3 timer has no effect, because handlers are atomic (reading 12).
     """
     if not state.phase_three_timer.active:
         return "not in phase 3"

@@ -258,7 +258,9 @@ class TraceReader:
         self._report(number, f"{what} {'were' if lines > 1 else 'was'} lost before this file was written")
 
     def finish(self, left_out: list[UnusedPart]) -> list[TraceIncarnation]:
-        """Return the incarnations of the trace. If there are any, add descriptions of the damage to `left_out`."""
+        """Return the incarnations of the trace. If the trace has incarnations, add descriptions of its damage to
+        `left_out`.
+        """
         incarnations = [life for life in self.incarnations if life.runs or life.asides or life.header]
         incarnations = self._before_mixed_lines(incarnations, left_out)
         left_out += self._left_out() if incarnations else ()

@@ -29,7 +29,7 @@ MAX_OUTPUT_BYTES = 16 * 1024 * 1024
 
 
 class ProgramEndedError(AgentSilentError):
-    """An error: the program ended without a request. The message describes the end."""
+    """An error: the program ended by itself. The message says how it ended."""
 
 
 class Spawn(Protocol):

@@ -101,7 +101,7 @@ class Host(Protocol):
         """Accept a new connection of a far end. Raises HandshakeError, WireError or OSError if the connection fails."""
 
     def begin(self, number: int, stand_in: socket.socket) -> None:
-        """Accept a new stand-in. `number` is the number in the task of the stand-in."""
+        """Accept the connection of a new stand-in. Its task contains `number`, which identifies it."""
 
     def hear(self, number: int, stand_in: socket.socket, message: dict[str, Any]) -> None:
         """Handle a message of a stand-in. An empty message means that the stand-in has ended."""

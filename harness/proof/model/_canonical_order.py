@@ -186,7 +186,7 @@ class CanonicalOrder:
         return [{self._place_of(other, place) for other in snapshot[name]} for name in NAMES_OF_OTHERS]
 
     def _place_of(self, name: int, place: int) -> int:
-        """Return the position of the agent that the agent at `place` knows by this ID."""
+        """Return the position of an agent. `place` is the position of an agent that knows it by this ID."""
         return name - 2 if name - 2 < place else name - 1
 
     def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:

@@ -76,7 +76,7 @@ class ZoneTable:
         return tied
 
     def bounds(self, zone: int) -> list[tuple[int, ...]]:
-        """Return a description of each timer by its bounds. The description does not depend on the order of
+        """Describe each timer by its lower and upper bounds. The description does not depend on the order of
         the timers.
         """
         bounds = self._bounds.get(zone)

@@ -147,8 +147,8 @@ class LivePageServer:
         )
 
     async def _report(self, request: web.Request) -> web.StreamResponse:
-        """Return the report of the run. The browser shows it as a page without rights, because the report may come from
-        an unknown author.
+        """Return the report of the run. The report may come from an unknown author, so the browser shows it in a
+        sandbox: its scripts run, but they have no access to this server.
         """
         path = self._directory / "report.html"
         if not path.is_file():

@@ -41,8 +41,8 @@ def informative(
 
 
 def _information(point: MatrixPoint, runs: Mapping[MatrixTask, Run], begun: int) -> float:
-    """Return the expected width of the widest confidence interval of a cell, after the end of all runs that
-    have begun.
+    """Return how wide the widest confidence interval of a cell will probably be when all runs that have begun have
+    ended.
     """
     if begun < _FIRST_RUNS:
         return float(2 * _FIRST_RUNS - begun)

@@ -221,7 +221,8 @@ def _say_culprit(culprit: Culprit) -> Iterable[str]:
 
 
 def _first_changes(changed: ChangedRuns) -> str:
-    """Return the handlers of the first handler runs that changed, and the run in which a change comes first."""
+    """Find the first changed handler run of each run. Return the names of their handlers, and the run whose change is
+    the earliest."""
     known = [each for each in changed.first if each.handler is not None]
     if not known:
         return ""

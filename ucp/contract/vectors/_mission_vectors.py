@@ -269,7 +269,8 @@ def at_inception() -> RecordedMission:
 
 
 def ties() -> RecordedMission:
-    """A tie in phase 1 continues with phase 2. A tie in phase 2 selects the oldest block, then the lowest hash."""
+    """After a tie in phase 1, phase 2 follows. After a tie in phase 2, the agent selects the oldest block, and among
+    equally old blocks the one with the lowest hash."""
     story = RecordedMission()
     old, young, top = others_block(B, 1, at_s=10), others_block(C, 2, at_s=20), others_block(A, 3, at_s=15)
     story.hear(A, CommitBlock(top, chain_of(top).top_chain_hash))

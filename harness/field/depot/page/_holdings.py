@@ -154,10 +154,10 @@ def _group(
 
 
 def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Iterator[_BlockRange]:
-    """Yield ranges of consecutive blocks that the agent holds at the same place.
+    """Yield ranges of consecutive blocks that the agent holds in the same place: chain, deque or stack.
 
-    Columns that are narrower than a pixel are combined into one cell. A combined cell shows the place at which the
-    agent holds most of the blocks in the cell, and whether the agent holds all of these blocks.
+    Each block has a column in the picture. Columns that are narrower than a pixel are combined into one cell. A
+    combined cell shows the place that holds most of its blocks, and whether the agent holds all of them.
     """
     columns_per_cell = max(1, math.ceil(MIN_CELL_PX / column_px))
     cells = [members[at : at + columns_per_cell] for at in range(0, len(members), columns_per_cell)]
