@@ -34,7 +34,7 @@ class CapturedDatagram:
 
 @dataclass
 class AgentCapture:
-    """The datagrams in the capture of a vehicle, in order."""
+    """The datagrams in the packet capture of a vehicle, in order of time."""
 
     epoch_us: float
     """The time of mission second 0 on the clock of the vehicle, in microseconds."""
@@ -78,5 +78,7 @@ def read_capture(
 
 
 def seconds_of(event: LoggableEvent, capture: AgentCapture) -> float:
-    """Return the mission second at which an event was logged, on the clock of the vehicle with the capture."""
+    """Return the mission second at which an agent logged an event. The capture contains the start of the mission on the
+    clock of the agent's vehicle.
+    """
     return (event.timestamp_us - capture.epoch_us) / MICROSECONDS

@@ -10,11 +10,12 @@ from contextlib import contextmanager
 TICK_S = 0.05
 """Seconds of wall time between two checks of the clock."""
 CATCH_UP_S = 1.0
-"""Maximum lateness of a simulation, in seconds of wall time, for which the simulation speeds up afterwards. If it is
-later, it continues at the requested speed.
+"""If a simulation is late by at most this number of seconds (wall time), it runs faster until it is on time again. If
+it is later, it continues at the requested speed.
 """
 NEXT_RUN = math.inf
-"""A value for the length of a step: the step ends with the next handler run of any agent."""
+"""A special value for the end of a single step. With this value, the step ends with the next handler run of any agent.
+"""
 
 
 class VirtualTimePace:
@@ -33,8 +34,8 @@ class VirtualTimePace:
         self._now_s = 0.0
         self._limited = True
         self._anchor: tuple[float, float] | None = None
-        """Wall time and mission second at which the current speed factor began. If the value is None, the next check
-        sets it.
+        """The wall time and the mission second from which later times are computed, with the current speed. None if the
+        next check must set them.
         """
         self._pace_changed = asyncio.Event()
 

@@ -15,8 +15,8 @@ from netem.channel import Channel, EndedTransmission, FrameFate, Radio, numbers
 from netem.radio import Place
 
 Journal = Callable[[dict[str, object]], None]
-"""A function that records a message on the channel: the time at which a radio received the message from its agent, the
-time at which the radio sent it, and the vehicles that lost it.
+"""A function that records a message on the channel. The record contains the time at which the agent gave the message to
+its radio, the time at which the radio sent it, and the vehicles that lost it.
 """
 
 NEVER = float("inf")

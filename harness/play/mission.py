@@ -60,7 +60,9 @@ class RunOutcome:
     remote: dict[str, RemoteRecord] = field(default_factory=dict)
     unmatched_fates: list[str] = field(default_factory=list)
     traces: dict[int, Trace] | None = None
-    """The traces by agent, exactly as the run directory has them. None if they are only in files."""
+    """The trace of each agent, with the same content as the files in the run directory. None if the traces are only in
+    files.
+    """
 
     def end_early(self, outcome: Outcome, error: HarnessError) -> None:
         """Record that the mission ended early because of `error`."""

@@ -73,7 +73,7 @@ def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) 
 
 
 def _source(scenario: Scenario, quota: int) -> str:
-    """Return the reason for the quota, for the size of all traces together."""
+    """Return the reason why the quota of all traces together has this size, as the phrase of a message."""
     if quota == LEAST_BYTES_PER_AGENT * len(scenario.roster):
         return "the least for each agent"
     if quota == MAX_TRACE_BYTES * len(scenario.roster):

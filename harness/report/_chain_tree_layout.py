@@ -46,7 +46,7 @@ class PlacedMark:
 
     @property
     def rows(self) -> range:
-        """The number of rows that the mark occupies, with the gap above the mark."""
+        """The rows that the mark occupies together with the gap above it. Row 0 is the lowest row."""
         return range(self.row, self.row + math.ceil((self.height + ROW_GAP) / ROW_HEIGHT))
 
     def walk(self) -> Iterator["PlacedMark"]:

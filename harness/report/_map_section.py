@@ -28,7 +28,7 @@ from harness.scenario.changes import RANGE
 from sitl.vehicle import VehicleType
 
 MOVES_M = 1.0
-"""Metres. A vehicle that stays within this distance counts as standing still."""
+"""If a vehicle moves by at most this number of metres to the north and to the east, it counts as standing still."""
 MOMENTS = 6
 
 
@@ -39,7 +39,7 @@ class MapMoment:
     at: str
     """The time of the moment."""
     what: str
-    """The event at this time, or ""."""
+    """A text about the event at this time. Empty if there is no event."""
     network: str
     """The groups of connected vehicles at this time."""
     picture: Markup
@@ -59,8 +59,8 @@ class MapSection:
 def section(
     tracks: VehicleTracks, network: Connectivity, ink: Mapping[int, AgentColours], types: Mapping[int, VehicleType]
 ) -> MapSection | None:
-    """Return the map section. Return None if no vehicle moved and no file is damaged. `types` contains the known types
-    of vehicles.
+    """Return the map section. Return None if no vehicle moved and no file is damaged. `types` maps vehicles to their
+    types, if the types are known.
     """
     if not any(_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
         return MapSection(None, [], [], tracks.problems) if tracks.problems else None

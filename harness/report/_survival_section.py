@@ -26,8 +26,8 @@ class LossRow:
     what: str
     vehicles: str
     counts: list[str]
-    """Four numbers of blocks: completed before the loss, still held after the loss, destroyed by the loss, and missing
-    at the end.
+    """Four numbers of blocks: blocks that were completed before the loss, blocks that vehicles still held after it,
+    blocks that it destroyed, and blocks that are missing at the end of the run.
     """
     blocks: list[LostBlockRow]
 

@@ -46,7 +46,8 @@ OUTCOMES = {
 """Outcome of a vote -> description."""
 PHASE_HEIGHTS = {"phase 1": 4, "phase 2": 7, "phase 3": 10, "finalize": 2}
 BAR_HEIGHT = 7
-"""Height in pixels of a reconcile that has too many phases to draw them."""
+"""Height in pixels of the bar that represents a reconcile with too many phases. Such a bar does not show single phases.
+"""
 
 MAX_BARS = 6000
 MAX_COMMITS = 4000

@@ -144,9 +144,7 @@ def _planned_s(record: RunRecord) -> float:
 
 
 def _shades(network: Connectivity, end_s: float) -> tuple[list[PartitionShade], int]:
-    """Return the `MAX_SHADES` longest partitions of the network, and the number of shorter partitions, which are
-    omitted.
-    """
+    """Return the `MAX_SHADES` longest partitions of the network, and the number of the omitted shorter partitions."""
     known = divisions(network.states)
     ends = [*(division.at_s for division in known[1:]), end_s]
     shades = [

@@ -16,9 +16,9 @@ class AgentProgram:
 
     agents: tuple[int, ...]
     command: tuple[str, ...] | None
-    """None for the harness's own program."""
+    """The command that starts the program. None for the harness's own program."""
     version: str | None
-    """The version that the agents reported, or None."""
+    """The version that the agents reported. None if they reported no version."""
 
     @property
     def in_words(self) -> str:
@@ -39,8 +39,8 @@ def programs(record: RunRecord) -> list[AgentProgram]:
 
 
 def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[AgentProgram]:
-    """Return the programs that a scenario names for its agents. After a run of the scenario, `agents` contains the
-    agents that the run recorded.
+    """Return the programs that the agents of a scenario use. If `agents` is given, the result also has the versions
+    that these agents reported in a run.
     """
     if not scenario.foreign:
         return []

@@ -148,7 +148,7 @@ def ranges(agent_ids: list[int]) -> list[str]:
 
 
 def wrapped(parts: list[str]) -> list[str]:
-    """Join the parts with commas, and divide the text into lines of similar length."""
+    """Join the parts with commas. Divide the resulting text into lines of similar length."""
     characters = len(", ".join(parts))
     widest = max(OVAL_LINE_CHARACTERS, round((2.5 * characters) ** 0.5))
     even = math.ceil(characters / math.ceil(characters / widest)) + 1

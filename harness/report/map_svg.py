@@ -30,7 +30,7 @@ from sitl.vehicle import VehicleType
 
 HEIGHT, DIGIT, PADDING = 16, 7.5, 8
 NEAR, FAR = 14, 34
-"""The two distances in pixels that may lie between a place on the map and the middle of the tag above it."""
+"""Two possible distances, in pixels, between a place on the map and the middle of the tag that belongs to the place."""
 _DIRECTIONS = ((0, -1), (0, 1), (1, -1), (-1, -1), (1, 1), (-1, 1), (1, 0), (-1, 0))
 
 Box = tuple[float, float, float, float]
@@ -40,8 +40,8 @@ Box = tuple[float, float, float, float]
 def tags(
     tagged: Sequence[tuple[int, Point]], crosses: Sequence[Point], to_px: MapProjection, ink: Mapping[int, AgentColours]
 ) -> Markup:
-    """Draw tags with vehicle IDs. A tag overlaps no other tag and none of the points `crosses`. If there is no room for
-    a tag, the vehicle has only a tooltip.
+    """Draw tags with vehicle IDs. A tag overlaps no other tag and no point in `crosses`. If there is no room for a tag,
+    only the tooltip of the vehicle shows its ID.
     """
     occupied = [(x - 5, y - 5, x + 5, y + 5) for x, y in (*(place for _, place in tagged), *crosses)]
     drawn = []

@@ -20,7 +20,7 @@ STATEMENTS = {
 }
 ICONS = {"good": "✓", "bad": "✗", "unknown": "\u2013"}
 KINDS = {"good": "holds", "bad": "violated", "unknown": "unknown"}
-"""Name of a verdict -> CSS class."""
+"""Assessment of a verdict ("good", "bad" or "unknown") -> CSS class."""
 EVIDENCE_KEPT = 200
 
 

@@ -55,10 +55,12 @@ from ucp.trace import DroppedDatagram, HandlerRun, RecordedBytes, in_base64
 from ucp.trigger import LocalTrigger, MessageTrigger, OperatorTrigger
 
 START_DELAY_S = 2.0
-"""Seconds of wall time until mission second 0. In this time, the node of the peers starts."""
+"""Seconds of wall time between the start of the programs and mission second 0. The program that plays the peers needs
+this time to start.
+"""
 SLACK_S, SLACK_WALL_S = 1.0, 0.15
-"""Tolerated difference between the time of a message and its recorded time: mission seconds, plus seconds of wall
-time.
+"""Maximum difference between the time of a message and its recorded time. The first value is in mission seconds, the
+second in seconds of wall time. The sum of both applies.
 """
 HASH_DIGITS = 12
 
@@ -83,8 +85,8 @@ class ExpectedMessage:
 
 @dataclass(frozen=True)
 class ScriptedDatagram:
-    """A datagram that the harness sends to the agent program at a given time. If the datagram is an answer, `after` is
-    the agent's query, and `asked_s` is the time of this query.
+    """A datagram that the harness sends to the agent program at mission second `t`. If the datagram is an answer to a
+    query of the agent, `after` is the query, and `asked_s` is the recorded mission second of the query.
     """
 
     t: float
@@ -127,8 +129,8 @@ class PeerScript:
 
 
 def script_of(record: RecordedTrace) -> PeerScript:
-    """Return the script for the inputs before the first restart of the recorded agent. Inputs after a restart would
-    depend on the content of its disk.
+    """Return the script for the peers, up to the first restart of the recorded agent. Later inputs are omitted, because
+    after a restart the agent program depends on the content of its disk.
     """
     datagrams: list[ScriptedDatagram] = []
     reconciles: list[float] = []
@@ -171,8 +173,8 @@ def script_of(record: RecordedTrace) -> PeerScript:
 
 
 def _question_key(message: Message) -> tuple[type, bytes] | None:
-    """Return the type of the answer to a query, together with the chain or block that the query concerns. Return None
-    if the message is not a query.
+    """Return two properties of a query: the type of its answer, and the hash of the chain or block that it concerns.
+    Return None if the message is not a query.
     """
     match message:
         case ChainContainQuery():

@@ -28,7 +28,7 @@ SPEEDUP = 20.0
 RECORD_CORE = "harness.field.bisection._record_core"
 """The module that plays records with the tested core. The harness starts it as a process."""
 CODE = "{code}"
-"""A placeholder in an agent command. It stands for the directory of the code."""
+"""A placeholder in an agent command. The harness replaces it by the path of the directory with the code of a commit."""
 
 
 class UntestableError(HarnessError):
@@ -36,8 +36,8 @@ class UntestableError(HarnessError):
 
 
 class SubjectPlayer:
-    """A player of one scenario or record, for several commits. It plays each commit in a directory of its own inside
-    `directory`, for at most `limit_s` seconds.
+    """An object that plays one scenario or record with the code of several commits. Each commit gets a separate
+    directory inside `directory`, and at most `limit_s` seconds.
 
     Without `command`, the code of the commit plays a scenario in virtual time, and the agent core of the commit plays
     records. With `command`, the installed harness starts agent processes with this command. They play the scenario, or

@@ -41,12 +41,13 @@ MAX_EARLY_S = 2.0
 MARGIN_WALL_S = 0.006
 """Typical delay of a timer in an agent process, in seconds of wall time."""
 MAX_QUESTION_GAP_S = 6.0
-"""Mission seconds without a query after which the agent counts as no longer in a reconcile."""
+"""If an agent sends no query for this number of mission seconds, its reconcile counts as ended."""
 
 
 class AgentLateness:
-    """The delay of the agent process during a reconcile, compared with the record, in mission seconds. `margin_s` is an
-    allowance for a further delay of the agent's next timer.
+    """A measurement of the delay of an agent process during a reconcile. The delay is the number of mission seconds by
+    which a query of the process comes later than in the record. `margin_s` is added to the delay, because the next
+    timer of the agent may be even later.
     """
 
     def __init__(self, margin_s: float) -> None:
@@ -63,7 +64,9 @@ class AgentLateness:
             self._late_s, self._asked_s = max(0.0, now - nearest), nearest
 
     def at(self, mission_s: float) -> float:
-        """Return the current delay for a datagram that the record contains at this mission second."""
+        """Return the number of mission seconds by which a datagram must be delayed. `mission_s` is the recorded time of
+        the datagram.
+        """
         return self._late_s + self._margin_s if mission_s - self._asked_s < MAX_QUESTION_GAP_S else 0.0
 
 

@@ -20,7 +20,9 @@ from ucp.plain_file import read_json, read_plain_file
 
 MAX_OUTCOME_BYTES = 64 * 1024 * 1024
 TIMING_DEPENDENT = ("2", "5", "6", "liveness")
-"""Keys of judgements that depend on how far the agent processes have come at the end of the run."""
+"""Keys of the judgements that depend on timing. Their results depend on the progress of the agent processes at the end
+of the run.
+"""
 
 
 class _OutcomeModel(BaseModel):

@@ -31,15 +31,15 @@ from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 from ucp.trigger import MessageTrigger
 
 ON_AIR_S = 0.005
-"""Maximum difference between the sending times of two messages, in seconds, at which both messages count as on the air
-at the same time.
+"""If the sending times of two messages differ by at most this number of seconds, both messages count as on the air at
+the same time.
 """
 _NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitBlock, ChainContainQuery))
 
 
 class _SentMessage(NamedTuple):
-    """A message, with the vehicles that received it (`reached`) and the vehicles that did not receive it (`lost`), as
-    far as the records show this.
+    """A sent message. `reached` contains the vehicles that received the message, and `lost` the vehicles that did not
+    receive it. A vehicle is in neither set if the records do not show whether it received the message.
     """
 
     at_s: float
@@ -50,8 +50,8 @@ class _SentMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class ObservedTransmissions:
-    """All transmissions of messages to receivers, the source of these data, and a sentence for each unusable part of
-    the records.
+    """The transmissions of messages to receivers. `source` names the kind of records that show the transmissions.
+    `problems` has a sentence for each unusable part of the records.
     """
 
     attempts: list[TransmissionAttempt]
@@ -118,7 +118,9 @@ def _vehicles(names: Iterable[ListenerName]) -> set[int]:
 
 
 def _asking_agents(transmissions: Sequence[Transmission]) -> dict[int, set[int]]:
-    """Return, for the number of each transmission, the agents whose requests it answers."""
+    """Return a mapping from the number of each answer to the agents whose requests it answers. The number identifies
+    the transmission of the answer.
+    """
     asking: dict[int, set[int]] = defaultdict(set)
     answers = RequestAnswers(transmissions)
     for request in transmissions:
@@ -174,8 +176,8 @@ class _ReceivingAgent:
         return message in _NEVER_WITHHELD and not any(around)
 
     def takes(self, key: tuple[int, str, int]) -> bool:
-        """Return true if the agent handled the message. For a message that was handled once, only the first call
-        returns true.
+        """Return true if the agent handled the message. If the agent handled the message n times, only the first n
+        calls for this message return true.
         """
         self._handled[key] -= 1
         return self._handled[key] >= 0

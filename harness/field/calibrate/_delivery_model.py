@@ -43,8 +43,8 @@ LEVEL = 0.95
 PARAMETERS = ("range_m", "spread", "floor", "load")
 
 _STEPS_PER_FOLD = 50
-"""Number of steps per factor e (2.718) of distance. Transmissions whose distances fall into the same step are counted
-together.
+"""Number of distance steps between a distance and e (2.718) times this distance. Transmissions whose distances fall
+into the same step are counted together.
 """
 _MOST_ITERATIONS = 60
 _LEAST = 1e-9
@@ -119,8 +119,8 @@ class FittedModel:
 
 
 class _TransmissionCluster(NamedTuple):
-    """Transmissions that belong to one cluster (a link, or a link in a period of time) and have about the same
-    distance.
+    """A group of transmissions whose distances are about the same. All of them belong to the same cluster: a link, or a
+    link in a block of time.
     """
 
     log_m: float
@@ -168,8 +168,8 @@ def _rows(attempts: Iterable[TransmissionAttempt]) -> list[_TransmissionCluster]
 
 
 def _cells(rows: Iterable[_TransmissionCluster]) -> list[_TransmissionCluster]:
-    """Combine transmissions with similar distances, across all clusters. The result has the same likelihood and is
-    faster to compute.
+    """Combine transmissions with similar distances, even if they belong to different clusters. The combined
+    transmissions have the same likelihood, but fewer terms must be computed.
     """
     counts: dict[tuple[float, int], list[int]] = defaultdict(lambda: [0, 0])
     for row in rows:
@@ -193,7 +193,9 @@ def _starts(rows: Sequence[_TransmissionCluster], free: Sequence[int]) -> list[V
 
 
 def _terms(row: _TransmissionCluster, values: Vector) -> tuple[float, Vector]:
-    """Return the probability that a transmission arrives, and its derivatives with respect to the parameters."""
+    """Return the probability that a transmission arrives, and the derivatives of this probability with respect to the
+    parameters.
+    """
     spread = math.exp(values[1])
     deviation = (values[0] - row.log_m) / spread
     survives = math.exp(-values[2] - values[3] * row.others)
@@ -274,8 +276,9 @@ def _maximise(rows: Sequence[_TransmissionCluster], start: Vector, free: Sequenc
 def _cluster_scales(
     rows: Sequence[_TransmissionCluster], values: Vector, free: Sequence[int]
 ) -> tuple[dict[int, tuple[float, float]], dict[int, float], int]:
-    """Return the standard errors of the parameters with and without clusters, the degrees of freedom, and the number of
-    clusters.
+    """Compute the standard errors of the free parameters. Return three results. The first maps each parameter to two
+    standard errors, with clusters and without. The second maps each parameter to its degrees of freedom. The third is
+    the number of clusters (links in blocks of time).
     """
     inner = [parameter for parameter in free if values[parameter] > _LOWEST[parameter]]
     _, information = _score(rows, values, inner)

@@ -52,7 +52,9 @@ class Positions:
         return between(track[after - 1], track[after], at_s)
 
     def distance_m(self, one: int, other: int, at_s: float) -> float | None:
-        """Return the distance of two vehicles in three dimensions. Return None if one of the positions is unknown."""
+        """Return the three-dimensional distance between two vehicles in metres. Return None if the position of either
+        vehicle is unknown.
+        """
         first, second = self.at(one, at_s), self.at(other, at_s)
         if first is None or second is None:
             return None

@@ -20,7 +20,9 @@ _PLAUSIBLE = (1.0, 6.0)
 _METRES_PER_DEGREE = 111_195.0
 
 Sample = tuple[float, float, int]
-"""A signal strength measurement: ln(distance), signal strength in dB, and number of the minute."""
+"""A signal strength measurement: ln(distance), signal strength in dB, and the index of the minute in which it was
+measured.
+"""
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from netem.channel import PRESETS
 from netem.radio import LogDistance
 
 TRAINING_SHARE = 2 / 3
-"""The share of the flight to which the validation fits the model, from the beginning of the flight. The model then
-predicts the rest of the flight.
+"""Share of the flight that is used to fit the model for the validation. It begins at the start of the flight. The
+fitted model then predicts the rest of the flight.
 """
 BLOCK_S = 120.0
 _BINS = 10
@@ -77,7 +77,9 @@ class DeliveryShare:
 
 @dataclass(frozen=True)
 class LinkDelivery:
-    """The share of messages that arrived over one link: for the whole flight, and for each block of time."""
+    """The share of messages that arrived over one link. `total` is the share in the whole flight. `over_time` maps the
+    start of each block of `BLOCK_S` mission seconds to the share in this block.
+    """
 
     one: int
     other: int

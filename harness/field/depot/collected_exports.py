@@ -86,7 +86,9 @@ class CollectedExports:
     left_out: list[str]
     remarks: list[str]
     roster: set[int] = field(default_factory=set)
-    """The agents that other files of the mission name: mission files, traces, a manifest, or the record of the run."""
+    """The IDs of the agents that occur in other files of the mission: mission files, traces, a manifest, or the record
+    of the run.
+    """
     traced: dict[int, list[str]] = field(default_factory=dict)
     """Agent -> hashes of the blocks that the agent completed, according to its trace."""
     flight_logs: list[FlightLog] = field(default_factory=list)
@@ -95,8 +97,8 @@ class CollectedExports:
     wrong_signatures: list[str] = field(default_factory=list)
     """A sentence about each wrong signature in a secured mission."""
     unproven: str | None = None
-    """The reason why valid signatures do not prove that the exports are genuine. None if they prove this, or if the
-    mission was not secured.
+    """The reason why valid signatures do not prove that the exports are genuine. None if valid signatures prove it, or
+    if the mission was not secured.
     """
 
     @property

@@ -226,7 +226,9 @@ def _names(collected: CollectedExports) -> dict[str, str]:
 
 
 def _holdings(collected: CollectedExports) -> dict[str, list[Holding]]:
-    """Return block hash -> the agents that hold the block, with the places."""
+    """Return a mapping from each block hash to its holdings. A holding is a place, such as a position in a chain, with
+    the IDs of the agents that hold the block there.
+    """
     where: dict[str, dict[tuple[Place, int | None, str | None], list[int]]] = defaultdict(lambda: defaultdict(list))
     for agent_id, export in collected.exports.items():
         for position, block in enumerate(export.chain, 1):

@@ -31,12 +31,16 @@ from ucp.clock import MICROSECONDS
 from ucp.store import StoredState
 
 LIMIT_S = 1e7
-"""Maximum time for the agents to become idle, in virtual seconds. Popping a block takes five seconds."""
+"""Number of virtual seconds in which the agents must become idle. The limit is high, because an agent needs five
+seconds to pop one block from its chain.
+"""
 
 
 @dataclass(frozen=True)
 class ReconciledExports:
-    """The exports of all agents after the reconcile, and the line about the reconcile for the merged record."""
+    """The exports of all agents after the reconcile. `line` is the line of the merged record that describes the
+    reconcile.
+    """
 
     exports: dict[int, Export]
     line: ReconcileResult

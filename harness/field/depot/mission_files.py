@@ -32,7 +32,7 @@ from ucp.settings import Settings
 
 FILE = "manifest.json"
 EXACT = 2**53
-"""Largest integer up to which every integer is exact as a float."""
+"""The largest integer n for which a float can represent every integer from 0 to n exactly."""
 
 
 class ManifestInception(BaseModel):

@@ -18,8 +18,8 @@ MAX_TIME_US = 2**53
 _BACK_US, _AHEAD_US = 1_000_000, 60_000_000
 _BIN_US = 10_000_000
 _MAX_DRIFT = 0.01
-"""Difference in rate above which a clock counts as the clock of a simulated vehicle. The rates of real clocks differ by
-0.0001 or less.
+"""If the rate of a clock differs by more than this from the rate of GPS time, the clock counts as the clock of a
+simulated vehicle. The rates of real clocks differ by at most 0.0001.
 """
 _SECOND_US = 1_000_000
 _UNKNOWN = object()
@@ -62,7 +62,7 @@ def _consistent(before_us: int, after_us: int) -> bool:
 
 
 class RecordBudget:
-    """A budget for the records of a file: the number of further records that may be stored."""
+    """A counter of the records that may still be stored from a file. All collectors of the file share this counter."""
 
     def __init__(self) -> None:
         self.left = MAX_RECORDS
@@ -84,8 +84,8 @@ class RecordCollector:
         self._last_state: dict[type[Any], Hashable] = {}
 
     def add(self, record: FlightRecord) -> bool:
-        """Store a record. The time of the record is converted to UTC at the end of the segment. Return false if the
-        limit of the number of records is reached.
+        """Store a record. The method `end_segment` later converts its time to UTC. Return false if the maximum number
+        of records has been stored already.
         """
         kept = self._budget.take()
         if kept:
@@ -126,7 +126,9 @@ class RecordCollector:
         return True
 
     def end_segment(self) -> None:
-        """Return the records of one type, in the order of the file."""
+        """End a segment of the log's clock, because the clock jumped or the log ended. Convert the times of all records
+        of this segment to UTC, if the segment contains GPS times.
+        """
         to_utc = (
             _PiecewiseLinearClock(
                 [

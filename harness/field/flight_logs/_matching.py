@@ -31,12 +31,12 @@ vehicles may fly side by side.
 _CELL_DEG = 1e-4
 """Size of a cell of the search grid in degrees of latitude. A cell has a length of about eleven metres."""
 _PAUSE_US = 5_000_000
-"""Microseconds between two positions near the same place. If the time between the positions is longer, they belong to
-two different visits of this place.
+"""Maximum number of microseconds between successive positions of one visit. If a vehicle returns to a place after a
+longer time, it makes a new visit.
 """
 _MAX_VISIT_US = 20_000_000
-"""Maximum duration of a visit in microseconds. If a vehicle is near a place for longer, it stays there, and the visit
-is not used to find the time difference.
+"""Maximum duration in microseconds of a visit that is used to find the time difference. A vehicle that is near a place
+for longer does not show the time at which it passed the place.
 """
 _BIN_US = 1_000_000
 _MIN_VOTES = 3
@@ -126,8 +126,9 @@ def _match(log: FlightLog, vehicle: VehicleLog, agents: Mapping[int, Fixes]) -> 
 
 @dataclass(frozen=True)
 class _ClockDifference:
-    """A difference between two clocks, and the number of positions that support it. `of_utc` is true if the log has UTC
-    from GPS.
+    """The difference between the clock of an agent and the clock of a flight log. If `of_utc` is true, UTC from GPS
+    takes the place of the log's clock. `voters` is the number of positions that were compared, and `agreeing` is the
+    number of those that support this difference.
     """
 
     ahead_us: float

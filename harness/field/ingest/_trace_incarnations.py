@@ -33,12 +33,12 @@ MAX_RUNS = 1_000_000
 number in 2 hours.
 """
 MAX_BYTES_BEFORE_TRACE, MAX_LINES_BEFORE_TRACE = 8 * 1024 * 1024, 100_000
-"""Limits within which a trace must have its first valid line. A file without a valid line within these limits is not a
-trace.
+"""Maximum number of bytes and of lines before the first valid line of a trace. A file that exceeds one of these limits
+is not a trace.
 """
 ROUNDING_S = 2e-3
-"""Maximum number of seconds by which a line may be earlier than the previous line. Times may be rounded to
-milliseconds.
+"""Maximum number of seconds by which the time of a line may be earlier than the time of the previous line. Such
+differences occur because times may be rounded to milliseconds.
 """
 FAR_AHEAD_S = 3600.0
 """Maximum number of seconds between two handler runs of an incarnation. No agent is idle for longer."""
@@ -308,8 +308,8 @@ class TraceReader:
 
 
 def _lines(file: BoundedFile) -> Iterator[tuple[int, bytes, bool]]:
-    """Yield the lines as triples: line number, content, and true if the line has a line end. If a line is too long,
-    only its last part is yielded.
+    """Yield each line as a triple: its number, its content, and whether it has a line end. If a line is too long, only
+    its last part is yielded.
     """
     number, kept = 1, b""
     while text := file.readline(MAX_LINE_BYTES):

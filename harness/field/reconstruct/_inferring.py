@@ -44,14 +44,16 @@ from ucp.trace import HandlerRun
 
 MAX_TRIES = 400
 MAX_INPUTS = 200_000
-"""Maximum number of inputs that all attempts together may simulate. This number takes some seconds."""
+"""Maximum number of inputs that are simulated in all attempts together. The simulation of this number takes some
+seconds.
+"""
 MAX_LATE_WALL_S = 0.1
 """Maximum delay of a timer in seconds of wall time. If a timer is later, the process was paused."""
 MAX_UNREAD_WALL_S = 0.005
 """Maximum number of seconds of wall time that a datagram waits in a socket."""
 ROUNDING_S = 1e-3
 Pause = tuple[float, float]
-"""The start and the end of a pause of the process."""
+"""A pause of the agent's process. The two values are the mission seconds of its start and its end."""
 MAX_PAUSES = 10
 JUST_AFTER_S = 1e-6
 MAX_STARTS = 50
@@ -195,8 +197,8 @@ def _infer_incarnation(
 
 
 def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
-    """Choose the next order of inputs to try. The method changes the last timer that has another possible position.
-    Return false if no timer has one.
+    """Choose the next order of inputs to try. The function changes the position of the last timer that has another
+    possible position. Return false if no timer has one.
     """
     for place in range(len(choices) - 1, -1, -1):
         if deferred.get(place, 0) < choices[place]:
@@ -208,8 +210,8 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 
 
 class _InputSequence:
-    """One possible order of the inputs of an agent in one incarnation. `deferred` maps the number of a timer to the
-    distance between its position and the most likely position.
+    """One possible order of the inputs of an agent in one incarnation. For each timer that does not expire at its most
+    likely position in this order, `deferred` maps the number of the timer to the distance from that position.
     """
 
     def __init__(

@@ -30,10 +30,11 @@ class JudgedTrace:
         record = RecordedTrace(Path(f"agent {agent_id}"), "", trace, IngestedRecords(flight), [])
         player = RecordPlayer(record)
         self._known: dict[int, KnownState] = {}
-        """Handler run after which the state is known again -> the known state. The key is the `id` of the handler run.
+        """The state of the agent after each handler run at which the state becomes known again. The key is the Python
+        object ID of the handler run.
         """
         self._played: set[int] = set()
-        """The `id` of each handler run that the reference could execute."""
+        """The Python object IDs of the handler runs that the reference could execute."""
         self._names = ReplayNames(record)
         self._export = flight.exports.get(agent_id)
         self._is_last_line_lost = False

@@ -32,7 +32,9 @@ class OtherRecords:
     def __init__(self, flight: Flight, opener: "DatagramOpener | None" = None, depot: "Depot | None" = None) -> None:
         """Read the files. In a secured mission, `opener` decrypts datagrams, and `depot` decrypts event data."""
         self.sealed: dict[int, dict[bytes, bytes]] = defaultdict(dict)
-        """Agent ID -> event that filled a block, in encoded form -> encrypted event data of the block."""
+        """Agent ID -> a mapping from each event that filled a block (encoded as bytes) to the encrypted event data of
+        this block.
+        """
         self._depot = depot
         self.captures: dict[int, AgentCapture] = {}
         self.problems: list[str] = []

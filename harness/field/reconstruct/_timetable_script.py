@@ -19,9 +19,11 @@ from ucp.quirks import Quirks
 
 HALF_GAP_S = MIN_GAP_S / 2
 Sealed = Mapping[int, Mapping[bytes, bytes]]
-"""Agent -> event that filled a block -> encrypted event data of the block."""
+"""Agent ID -> a mapping from each event that filled a block (encoded as bytes) to the encrypted event data of this
+block.
+"""
 MIN_PAUSE_S = 0.5
-"""Minimum delay of a timer, in seconds, from which the agent is assumed to have been paused."""
+"""If a timer is delayed by at least this number of seconds, the agent is assumed to have been paused."""
 
 
 def scenario_document(

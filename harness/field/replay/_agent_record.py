@@ -97,8 +97,8 @@ class RecordedTrace:
 
     @cached_property
     def unrecorded(self) -> dict[int, str]:
-        """Position of an entry whose deviations lost lines may explain -> the reason, such as "lines are missing
-        ...".
+        """Position of an entry -> the reason why lost lines may explain the deviations of this entry, such as "lines
+        are missing ...".
         """
         lost = {} if self.is_counted else lost_lines(self.trace)
         of_runs = [position for position, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]

@@ -39,9 +39,7 @@ MAX_TRIED = 20
 """Maximum number of deviations for which damage to a line is tried as an explanation."""
 
 PERHAPS = "perhaps"
-"""A word that precedes the damage that may explain a deviation. The reasons why steps are not judged contain
-this word.
-"""
+"""A word in the reason why a step was not judged. It precedes a description of damage that may explain a deviation."""
 
 _OF_TIMERS = frozenset(handler.name for handler in ON_TIMER.values())
 
@@ -112,8 +110,8 @@ class RecordPlayer:
         self._clock_set = ClockChangeDetector(record)
         self._resumption = ResumptionSearch(record, self._blocks)
         self.resumed_at: int | None = None
-        """The position after the last entry at which the state became known again. None if it did not become known
-        again.
+        """The position after the most recent entry at which the state became known again after a gap. None if there was
+        no such entry.
         """
         self._follower, self._incarnation = self._new_follower(), 1
         self._checkpoints = {0: _PlayerCheckpoint(self._follower.copy(), 1, self.result.copy())}

@@ -154,11 +154,15 @@ def _is_hex(text: str) -> bool:
 
 
 WITHIN = 200
-"""Number of lines before and after an entry in which a clock change is searched."""
+"""The detector searches for a clock change in this number of lines before an entry, and in this number of lines after
+it.
+"""
 MESSAGES = 3
-"""Number of messages with one other agent, before and after an entry of the trace, that are used for medians."""
+"""Number of messages before a possible clock change, and after it, whose median time difference is compared. The
+messages are those between the agent and one other agent.
+"""
 MIN_SHIFT_S = 1.0
-"""Minimum change of a clock in seconds that is detected."""
+"""Minimum change of a clock, in seconds, that the detector reports."""
 
 
 class ClockChangeDetector:
@@ -184,8 +188,8 @@ class ClockChangeDetector:
 
     @cached_property
     def _differences(self) -> list[list[tuple[int, float]]]:
-        """Return, for each other agent, the positions of the messages with it, and the difference of both clocks at
-        each message.
+        """For each other agent, a list with a pair for each message between it and this agent: the position of the
+        message in the trace, and the difference of both clocks in seconds.
         """
         own = self._record.agent_id
         differences = []

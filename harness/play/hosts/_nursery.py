@@ -23,11 +23,13 @@ from ucp import node
 
 MAX_ORDER_BYTES = 1 << 16
 OWN_AGENT = [sys.executable, "-P", "-m", "ucp.node"]
-"""The agent of the harness. Its program is forked, too. Any other agent is a program of its own."""
+"""The command of the harness's own agent. The nursery runs this agent in a forked process. It starts every other agent
+as a separate program.
+"""
 
 
 class Nursery:
-    """The process that forks. Start it before the event loop."""
+    """A process that forks a new process for each agent. Create it before an event loop runs in this process."""
 
     def __init__(self, *, user_namespace: bool) -> None:
         self._requests, other_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -37,8 +39,8 @@ class Nursery:
         other_end.close()
 
     async def start(self, inside: socket.socket, directory: Path, command: Sequence[str]) -> ForkedProcess:
-        """Start `harness.play.remote.far_worker` in a private network. `inside` is its end of the socket to this
-        process.
+        """Start `harness.play.remote.far_worker` in a private network. `inside` is the socket with which it
+        communicates with this process.
         """
         order = json.dumps([str(directory), *command]).encode()
         socket.send_fds(self._requests, [order], [inside.fileno()])

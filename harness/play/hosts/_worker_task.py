@@ -48,8 +48,8 @@ def why_not(programs: list[str], has_keys: bool) -> str | None:
 def play_agents(order: HostOrder) -> None:
     """Let agents join a run, and wait until the run has ended. Raises MachineError if the agents could not join.
 
-    The agents are in a process of their own, because its main thread must own the private networks. It ends when its
-    standard input ends, so it does not survive this worker.
+    The agents run in a separate process, because the main thread of a process must own the private networks. The
+    process ends when its standard input ends, so it does not survive this worker.
     """
     path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
     with subprocess.Popen(

@@ -211,7 +211,9 @@ class DeliveryLateness:
         """Number of deliveries that the kernel did not accept."""
         self._all = array("f")
         self._most: list[float] = []
-        """The greatest lateness of a delivery in each interval in which the load is measured."""
+        """The greatest lateness of a delivery in each interval. The intervals are those of the load measurement
+        (`LOAD_S`).
+        """
 
     def add(self, due_s: float, now: float) -> None:
         """Record the lateness of a delivery that was due at `due_s` and happened at the time `now`."""

@@ -42,11 +42,11 @@ MAX_TEXT = 200
 
 @dataclass
 class FarEnd:
-    """A connection of another computer that knows the secret and offers to run an agent."""
+    """A connection from another computer. The other computer knows the secret and offers to run an agent."""
 
     agent_id: int
     session: str
-    """A number that is the same for all connections of one `ucp-harness join`."""
+    """An identifier that all connections of one `ucp-harness join` share."""
     command: list[str]
     host: str
     connection: socket.socket
@@ -95,7 +95,9 @@ class Host(Protocol):
     """The owner of the connections to other computers: a run or a conformance test."""
 
     def refusal(self, agent_id: int, session: str, host: str) -> str:
-        """Return a sentence that refuses a far end. It is empty if the far end is accepted."""
+        """Return the sentence with which the host refuses a far end. Return an empty text if the host accepts the far
+        end.
+        """
 
     async def receive(self, far_end: FarEnd) -> None:
         """Accept a new connection of a far end. Raises HandshakeError, WireError or OSError if the connection fails."""

@@ -57,7 +57,7 @@ class _RemoteVehicle:
 
     @property
     def is_alive(self) -> bool:
-        """True if the earlier far end of the agent is still connected."""
+        """True if a far end of the agent is connected now. Its connection is either unused, or in use by a stand-in."""
         if self.held is not None:
             return self.held.is_connected
         return self.stand_in is not None and not self.cut_off
@@ -93,7 +93,7 @@ class RemoteAgents:
         return agent_id in self._vehicles and bool(self._vehicles[agent_id].cuts)
 
     async def end(self) -> None:
-        """Keep the vehicles cut off that are cut off now, because the mission ends. No agent begins any more."""
+        """Record that the mission ends, and accept no further far ends. Vehicles that are cut off now stay cut off."""
         self._ended = True
         if self._far_ends is not None:
             await self._far_ends.stop_listening()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class StandInTask:
-    """The agent for which a program stands in."""
+    """The task of a stand-in. It describes the agent that the stand-in represents."""
 
     number: int
     """The number by which the harness identifies the stand-in."""

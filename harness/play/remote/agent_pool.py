@@ -54,7 +54,7 @@ class AgentPool:
     """The stand-ins that are waiting for a connection."""
     _incarnations: list[RemoteIncarnation] = field(default_factory=list)
     is_encrypted: bool = False
-    """True if the keys of a test can travel to the far end."""
+    """True if the connection to the far end is encrypted, so that it can carry keys."""
     _joined: asyncio.Event = field(default_factory=asyncio.Event)
     _lost: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -100,7 +100,7 @@ class AgentPool:
 
     @property
     def socket_path(self) -> Path:
-        """The socket at which stand-ins connect."""
+        """The path of the socket to which stand-ins connect."""
         return self._directory / SOCKET
 
     # The methods of harness.play.remote._far_ends.Host

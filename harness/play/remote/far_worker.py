@@ -58,8 +58,8 @@ FRAMES_PER_TURN = 64
 MAX_READ_BYTES = 1 << 20
 MAX_ANSWER_BYTES = 2 << 20
 MAX_UNSENT_BYTES = 4 << 20
-"""Maximum number of bytes that wait for a slow connection. At this number, further datagrams are lost, and lines of the
-trace wait.
+"""Maximum number of bytes that wait for a slow connection. Beyond this number, datagrams of the agent are lost, and new
+lines of its trace wait in the file.
 """
 LAG_PROBE = Path(__file__).parents[1] / "process" / "_lag_probe.py"
 
@@ -73,8 +73,8 @@ class FileTail:
         self._file: Any = None
 
     def read(self) -> bytes:
-        """Return the bytes after this position in the file. The result is empty if there are no such bytes, or if the
-        file does not exist yet.
+        """Return the next bytes of the file, at most `MAX_READ_BYTES`, and advance `position`. The result is empty if
+        the file has no further bytes, or does not exist yet.
         """
         if self._file is None:
             try:
@@ -97,8 +97,8 @@ class FarWorker:
     def __init__(
         self, outside: socket.socket, directory: Path, command: list[str], own_agent: OwnAgent | None = None
     ) -> None:
-        """Create the object. `own_agent` is called with the mission file in a fork of this process, in place of the
-        command. It is faster.
+        """Create the object. If `own_agent` is given, a fork of this process calls it with the mission file as
+        argument, and `command` is not used. This is faster than starting a program.
         """
         self._own_agent = own_agent
         self._outside, self._directory, self._command = outside, directory, command
@@ -129,7 +129,7 @@ class FarWorker:
         """The file with the agent's keys, in a secured mission."""
         self._tails: dict[Kind, FileTail] = {}
         self._ended: dict[str, Any] | None = None
-        """How the agent ended."""
+        """The message about the end of the agent, with its exit status. None while the agent runs."""
 
     async def run(self) -> None:
         """Run until the incarnation has ended. When this process ends, the kernel ends the agent."""
@@ -264,7 +264,9 @@ class FarWorker:
                 await self._measure_lag(mission["epoch_us"])
 
     def _write_bundle(self, bundle: bytes) -> Path:
-        """Write the file with the agent's keys. Its memory does not appear in a core file either."""
+        """Write the agent's keys to a file, and return its path. Also disable core files, because they would contain
+        the keys.
+        """
         from ucp.secure.keyfile import write_key_file  # only an encrypted connection carries keys
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -449,7 +451,9 @@ def _other_processes(own: set[int]) -> list[str]:
 
 
 def play(descriptor: int, directory: Path, command: list[str], own_agent: OwnAgent | None = None) -> None:
-    """Play one incarnation of an agent. `descriptor` is that of the socket to the process outside."""
+    """Play one incarnation of an agent. `descriptor` is the file descriptor of the socket to the process outside the
+    private network.
+    """
     outside = socket.socket(fileno=descriptor)
     outside.setblocking(False)
     outside.set_inheritable(False)

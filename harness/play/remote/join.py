@@ -45,7 +45,7 @@ REJOIN_LIMIT_S = 60.0
 MAX_PLACES = 32
 DIRECTORY = "ucp-join-"
 NEW_S = 60.0
-"""Age in seconds of wall time from which a directory without a lock belongs to a killed process."""
+"""If a directory has no lock and is at least this number of seconds old, it belongs to a killed process."""
 
 
 class JoinError(HarnessError):
@@ -82,7 +82,7 @@ class _Connected:
 
 
 class FarProcess(Protocol):
-    """A running `harness.play.remote.far_worker`. Its process ID is also that of its group."""
+    """A running `harness.play.remote.far_worker`. Its process ID is also the ID of its process group."""
 
     @property
     def pid(self) -> int: ...
@@ -115,7 +115,7 @@ def join_command(listen: str, agent_id: int) -> str:
 
 
 class _RunOverError(Exception):
-    """No harness listens any more."""
+    """An error: no harness listens any more, so the run has ended."""
 
 
 def join(request: JoinRequest, say: Callable[[str], None]) -> None:
@@ -132,7 +132,9 @@ def join(request: JoinRequest, say: Callable[[str], None]) -> None:
 async def play_incarnations(
     request: JoinRequest, start: StartWorker, say: Callable[[str], None], directory: Path
 ) -> None:
-    """Play incarnations of one of several agents of this process, with its files in `directory`. See `join`."""
+    """Run incarnations of one agent, whose files are in `directory`. This process may run several agents at the same
+    time. See `join`.
+    """
     await _Joining(request, start, say).play(directory)
 
 

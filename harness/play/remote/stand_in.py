@@ -131,7 +131,7 @@ class StandIn:
             self._over.set_result(status)
 
     def _tell(self, what: dict[str, Any]) -> None:
-        """Send a message to the harness. If the harness has ended, the lab ends too."""
+        """Send a message to the harness. Ignore the failure if the harness has ended, because the lab then ends too."""
         with contextlib.suppress(OSError):
             self._outside.send(json.dumps(what).encode())
 

@@ -167,7 +167,7 @@ class VirtualAir:
         self.open_queries: list[dict[QueryKind, _OpenQuery]] = [{} for _ in roster]
         """Agent number -> its open queries."""
         self._quiet_at = 0.0
-        """Arrival time of the last copy of all messages, except messages on a shared channel."""
+        """The time at which all messages in transit have arrived. Messages on a shared channel are not included."""
         self.position: ScheduledInput = (0.0, 0, 0, None)
         """Current position in the order of inputs."""
         self._roster = roster

@@ -28,7 +28,9 @@ class _ScriptedFate:
     matches: int = 0
     decided: int = 0
     arrivals: dict[int, list[float]] = field(default_factory=dict)
-    """Mission seconds at which matching datagrams arrive, by the number of a datagram that has not been sent yet."""
+    """Number of a datagram -> the mission seconds at which its copies arrive. The matching datagrams are numbered from
+    0. Only datagrams that have not been sent yet are included.
+    """
     holds: bool = False
     """True while the fate holds messages and the end of the hold is unknown."""
 

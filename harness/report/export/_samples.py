@@ -128,7 +128,7 @@ class TelemetrySample:
 @dataclass(frozen=True, slots=True)
 class LogLine:
     """A line of text with a time: a line of a log file, a fault, a network change or a verdict. `source` is the name of
-    the file, or says which part of the run the line describes.
+    the log file, or a word for the part of the run that the line describes.
     """
 
     at_ns: int

@@ -21,7 +21,9 @@ from harness.report.live.feed_to_log import copy_live_run
 from harness.report.live.server import UPDATE_S, LivePageServer
 
 MAX_UNWATCHED_S = 3.0
-"""Seconds. If no page is open for this time, the server ends. A page that is reloaded reconnects earlier."""
+"""If no page is open for this number of seconds, the server ends. A page that is reloaded connects again within this
+time.
+"""
 
 
 async def main(directory: Path, port: int) -> None:

@@ -37,8 +37,8 @@ class GrowingFile:
         return self._lines.popleft()
 
     def drop_while(self, can_be_dropped: Callable[[bytes], bool]) -> bytes | None:
-        """Drop lines that were read but not returned yet, until the function returns false for a line. Return the last
-        dropped line.
+        """Drop lines that were read but not returned yet. Stop at the first line for which `can_be_dropped` returns
+        false. Return the last dropped line.
         """
         dropped, lines = None, self._lines
         while lines and can_be_dropped(lines[0]):
@@ -106,8 +106,8 @@ class AgentTrace:
             self._incarnation, self._headers = self._incarnation + 1, 0
 
     def drop_while(self, can_be_dropped: Callable[[bytes], bool]) -> bytes | None:
-        """Drop lines of the current incarnation, until the function returns false for a line. Return the last dropped
-        line.
+        """Drop lines of the current incarnation. Stop at the first line for which `can_be_dropped` returns false.
+        Return the last dropped line.
         """
         return self._file.drop_while(can_be_dropped)
 

@@ -14,7 +14,7 @@ from harness.report.live._agent_course import Change
 MAX_BYTES = 512 * 1024 * 1024
 CHUNK_BYTES = 256 * 1024
 FAR_BEHIND_BYTES = 4 * 1024 * 1024
-"""Number of bytes. If a live reader is behind by more than this, it skips frequent changes, such as messages and
+"""If a live reader is behind by more than this number of bytes, it skips frequent changes, such as messages and
 positions, to catch up.
 """
 _LEFT_OUT = (b'["m"', b'["p"', b'["t"', b'["d"')

@@ -60,8 +60,8 @@ this time, most receivers have recorded the message. A receiver on a busy machin
 then gets a change of the kind `h`.
 """
 MAX_BEHIND_S = 2.0
-"""Seconds of wall time. If the stream of changes is behind an active run by more than this, it omits messages until it
-has caught up.
+"""If the stream of changes is behind an active run by more than this number of seconds (wall time), it omits messages
+until it has caught up.
 """
 MAX_KEPT = 100_000
 """Maximum number of messages for which further receivers can still be added on the page. The same limit applies to
@@ -80,7 +80,7 @@ class _Broadcast:
     block: str | None = None
 
     def add_receiver(self, bit: int) -> bool:
-        """Add a receiver of the message. The number `bit` stands for the receiver. Return true if the
+        """Add a receiver of the message. `bit` is the bit that represents the receiver in masks. Return true if the
         receiver is new.
         """
         before = self.mask

@@ -1,6 +1,6 @@
 """The web server of the live page. It listens on 127.0.0.1 only, and requires the secret token in the page's address.
 
-The server lists the files that it serves at its start, so no address can reach another file. The
+At its start, the server makes a list of the files that it serves, so no address can reach another file. The
 Content-Security-Policy lets browsers load from this server only. Three checks reject requests from other pages in the
 same browser: other pages do not know the token, the header Origin shows their origin, and the header Host shows a
 foreign host name that resolves to 127.0.0.1.

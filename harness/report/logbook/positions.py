@@ -41,7 +41,9 @@ class LogEntry:
     event: LoggableEvent
     is_position: bool
     position: GlobalPosition | None
-    """The position of the vehicle. If the event is no position, the position before it. None if there is none."""
+    """The position in the event. If the event contains no position, this is the last position of the vehicle before the
+    event. None if no earlier position is known.
+    """
     position_age_s: float | None
     """The age of the position at the time of the event, in seconds."""
 

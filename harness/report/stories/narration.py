@@ -40,7 +40,9 @@ class AgentReaction:
     receivers: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
     """Sequence number of a sent message -> the receivers of the message."""
     at_s: float = 0.0
-    """Mission second at which the first cause of this action would have happened if all timers had expired on time."""
+    """Mission second of the first cause of this action. If timers expired late, this is the time at which the cause
+    would have happened without their delay.
+    """
     distance: int = 0
     """Number of messages between this action and the first cause at the same instant."""
 

@@ -33,7 +33,7 @@ class RawMessage(NamedTuple):
 
 
 class UnreadablePart(NamedTuple):
-    """A place in a file that cannot be read. `why` is the reason, and completes a sentence."""
+    """A part of a file that cannot be read. `why` is the reason as a text that completes a sentence."""
 
     why: str
 
@@ -42,8 +42,9 @@ Item = RawMessage | UnreadablePart
 
 
 class BagTopics:
-    """The topics of a ROS bag by channel. The object stores a message without a known topic until the end, because an
-    index at the end of the file may declare the topic. Messages of one channel keep their order.
+    """An index of the topics in a ROS bag, by channel. If the topic of a message is not known yet, the message is
+    stored until the end of the file, because an index at the end may declare the topic. Messages of one channel keep
+    their order.
     """
 
     def __init__(self) -> None:
@@ -76,7 +77,9 @@ class BagTopics:
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _READ_BYTES = 1024 * 1024
 _STEP_BYTES = 16 * 1024
-"""Number of compressed bytes per step of the decompression. At most this many bytes before damaged data are lost."""
+"""Number of compressed bytes that are decompressed in one step. If data are damaged, at most this number of undamaged
+bytes before the damage are lost.
+"""
 
 
 def decompress(compression: str, data: bytes, max_bytes: int = MAX_CHUNK_BYTES) -> tuple[bytes, str]:

@@ -104,8 +104,8 @@ class _McapReader:
 
 
 def _record_at(buffer: Buffer, position: int) -> tuple[int, int, int]:
-    """Return (operation, start, end) of the record at a position in an MCAP file. Return zeros if no record begins
-    there. A chunk record may be truncated.
+    """Return the operation code of the record at a position in an MCAP file, and the start and end of its content.
+    Return three zeros if no record begins there. The content of a chunk may extend beyond the end of a truncated file.
     """
     if position + _RECORD.size > len(buffer):
         return 0, 0, 0

@@ -39,7 +39,7 @@ PLACES = {
 
 
 def draw(record: MergedRecord) -> Markup:
-    """Draw the columns in four groups: blocks in all chains, in some chains, in no chain, and lost blocks."""
+    """Draw the columns in groups. One group has the blocks in all chains, another the lost blocks, and so on."""
     columns = _columns(record)
     groups = [(group, list(members)) for group, members in groupby(columns, key=lambda column: column[0])]
     available_px = WIDTH - LEFT - RIGHT - GAP * (len(groups) - 1)
@@ -82,8 +82,9 @@ Column = tuple[str, str, Mapping[int, str]]
 
 
 class _BlockRange(NamedTuple):
-    """A range of columns, from `begin` up to but not including `end`. The agent holds the blocks of these columns at
-    the same place (chain, deque or others). `fraction` is "part" if the agent does not hold all of these blocks.
+    """A range of columns, from `begin` up to but not including `end`. `place` is the place at which the agent holds the
+    blocks of these columns, such as its chain or its deque. `fraction` is "part" if the agent holds only some of these
+    blocks, and empty otherwise.
     """
 
     place: str
@@ -177,8 +178,8 @@ def _ranges(members: Sequence[Column], agent_id: int, column_px: float) -> Itera
 
 
 def _cell_state(cell: Sequence[Column], agent_id: int) -> tuple[str | None, str]:
-    """Return the place at which the agent holds most of the blocks in this cell. The second value is "part" if the
-    agent does not hold all of them.
+    """Return the place at which the agent holds the most blocks of this cell, or None if it holds none of them. The
+    second result is "part" if the agent holds only some of the blocks, and empty otherwise.
     """
     places = Counter(place for _, _, held in cell if (place := held.get(agent_id)) is not None)
     if not places:

@@ -46,8 +46,8 @@ def draw(
     ink: Mapping[int, AgentColours],
     flown: Sequence[EventTrack] = (),
 ) -> EventMap:
-    """Draw the map. `rare` contains the names of blocks that only one vehicle holds. `lost` contains the numbers of
-    each agent's lost blocks. `flown` contains the paths from flight logs. At least one position must exist.
+    """Draw the map. `rare` contains the names of blocks that only one vehicle holds. `lost` maps each agent to the
+    numbers of its lost blocks. `flown` contains the paths from flight logs. At least one path must contain a position.
     """
     field = _MetricProjection([*tracks, *flown])
     paths = {track.agent_id: [field.fix(at_us, position) for at_us, position in track.fixes] for track in tracks}

@@ -18,9 +18,12 @@ WIDTH, LEFT, RIGHT, TOP, BOTTOM = 900, 76, 24, 8, 34
 LANE, BARS, BOXES = 44, 20, 12
 BINS = 260
 MAX_GAP_PX = 0.6
-"""Maximum width in pixels of a gap between two blocks that is not visible."""
+"""Width in pixels below which a gap between two blocks is invisible. Blocks with a narrower gap are drawn as one box.
+"""
 OUTLIER_SHARE = 0.01
-"""Share of the events at each end of the time span that is ignored, because the clocks of these events may be wrong."""
+"""Share of the earliest and of the latest events that do not determine the time span, because their clocks may be
+wrong.
+"""
 SHADES = 4
 MAX_NAMED = 8
 """Maximum number of changes that the text of a mark lists."""
@@ -50,8 +53,9 @@ def time_span_of(record: MergedRecord) -> TimeSpan | None:
 
 
 def extended(time_span: TimeSpan, marks: Iterable["Mark"]) -> TimeSpan:
-    """Return the interval, extended so that it contains marks before and after it. A mark is ignored if it is farther
-    away than the length of the interval, because its clock must then be wrong.
+    """Return a longer interval that also contains the marks before and after the given interval. A mark is ignored if
+    its distance from the given interval exceeds the length of this interval, because the clock of the mark must then be
+    wrong.
     """
     length = time_span.last_us - time_span.first_us
     near = [at for at, _ in marks if time_span.first_us - length <= at <= time_span.last_us + length]

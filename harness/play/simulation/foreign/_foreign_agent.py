@@ -69,7 +69,7 @@ class IncarnationRecord:
     agent_id: int
     command: tuple[str, ...]
     after_another: bool
-    """Add `count` to the counter. Return the total for the mission second that contains `now`."""
+    """True if the program had already run another agent before this one."""
     limit: int
     exchanges: list[tuple[bytes, bytes]] = field(default_factory=list)
     length: int = 0
