@@ -22,7 +22,9 @@ TRACK_S = 1.0
 
 
 class RadioRange:
-    """The current network conditions of one run."""
+    """The current network conditions of one run. They follow from the timeline of the scenario and from the positions
+    of the vehicles.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self._roster = scenario.roster

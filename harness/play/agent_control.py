@@ -157,7 +157,7 @@ class AgentControl:
 
     @property
     def exists(self) -> bool:
-        """True if the control socket exists. This is much cheaper than an attempt to connect."""
+        """True if the control socket exists. The check is much cheaper than an attempt to connect."""
         return self._path.exists()
 
     async def ask(self, command: str, *, timeout_s: float, **arguments: Any) -> dict[str, Any]:

@@ -120,8 +120,8 @@ class Swarm(Protocol):
     async def until_run(self, sought: SoughtRun, mission_s: float) -> int | None:
         """Wait until an agent runs this handler, but at most until `mission_s`.
 
-        Return the ID of the agent. Return None if no agent ran the handler. The method also counts handler runs that
-        the last change caused. With processes, it counts all handler runs since the last call of `until`.
+        Return the ID of the agent. Return None if no agent ran the handler. A handler run that the last change of the
+        timeline caused also ends the wait. With processes, so does any handler run since the last call of `until`.
         """
 
     async def apply(self, change: Change) -> None:
@@ -133,8 +133,8 @@ class Swarm(Protocol):
         """
 
     async def release(self, number: int, fate: Fate) -> None:
-        """End the hold with this number. Messages of the hold that are sent before `fate.until_s` arrive at
-        `fate.hold_until_s` or later.
+        """End the hold (a rule that delays messages) with this number. Its messages that are sent before `fate.until_s`
+        arrive at `fate.hold_until_s` or later.
         """
 
     async def stop_events(self) -> None: ...

@@ -97,7 +97,7 @@ def of_reference(algorithm: int) -> Callable[[Callable[..., str]], ReferenceChan
 
 @dataclass(frozen=True)
 class Variant:
-    """A protocol variant. `core` and `reference` contain its changes by the number of the algorithm."""
+    """A protocol variant. `core` and `reference` map the number of each changed algorithm to the change."""
 
     name: str
     file: Path

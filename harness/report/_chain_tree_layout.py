@@ -31,8 +31,8 @@ MARGIN = 8
 
 @dataclass(slots=True)
 class PlacedMark:
-    """A mark of the picture with its position in CSS pixels. `x` is the horizontal centre of the mark, and `y` is its
-    upper edge. `y` increases downwards.
+    """A mark of the picture (a box, an oval or an ellipsis) with its position in CSS pixels. `x` is the horizontal
+    centre of the mark, and `y` is its upper edge. `y` increases downwards.
     """
 
     mark: ChainTreeMark
@@ -159,8 +159,8 @@ def _width(characters: int) -> float:
 
 
 def _offsets(placed_marks: list[PlacedMark]) -> dict[int, float]:
-    """Return the horizontal distance between each mark and the mark below it. The keys are the results of
-    `id(mark)`.
+    """Return the horizontal distance between each mark and the mark below it. The keys are the Python object IDs of the
+    marks.
     """
     offsets: dict[int, float] = {}
     outlines: dict[int, _SubtreeOutline] = {}

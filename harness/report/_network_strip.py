@@ -18,7 +18,7 @@ _LANE = 24
 
 @dataclass(frozen=True, slots=True)
 class ConditionSpan:
-    """An interval of mission seconds in which the network condition was the same."""
+    """An interval of mission time in which a network condition did not change."""
 
     from_s: float
     to_s: float

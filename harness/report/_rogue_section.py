@@ -14,8 +14,8 @@ MAX_ROWS = 500
 
 @dataclass(frozen=True, slots=True)
 class InjectionRow:
-    """A table row about one result of an injected message. `message` is the type of this message. If agents refused a
-    datagram, `message` is the reason.
+    """A table row about one result of an injection. `message` is the type of the injected message. If the agents
+    refused the datagrams, `message` contains their reason instead.
     """
 
     at: str

@@ -26,8 +26,9 @@ class LossRow:
     what: str
     vehicles: str
     counts: list[str]
-    """Four numbers of blocks: blocks that were completed before the loss, blocks that vehicles still held after it,
-    blocks that it destroyed, and blocks that are missing at the end of the run.
+    """Four numbers of blocks. The first two count the blocks that were completed before the loss, and the blocks that
+    vehicles still held after it. The last two count the blocks that the loss destroyed, and the blocks that are missing
+    at the end of the run.
     """
     blocks: list[LostBlockRow]
 

@@ -166,7 +166,9 @@ def block_label(block: str, names: Mapping[str, str]) -> str:
 
 
 def phases_in_words(reconcile: AgentReconcile) -> str:
-    """List the phases of a reconcile in the order in which they began, each with its number of rounds."""
+    """Return a text that lists the phases of a reconcile in the order of their first rounds. A phase with several
+    rounds has the number of its rounds.
+    """
     rounds: dict[str, int] = {}
     for phase in reconcile.phases:
         rounds[phase.name] = rounds.get(phase.name, 0) + phase.rounds

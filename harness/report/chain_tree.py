@@ -41,7 +41,7 @@ class ChainTreeNode:
 
 @dataclass(slots=True)
 class ChainTreeMark:
-    """A mark of the picture, together with all marks that are above it."""
+    """A mark of the picture (a box, an oval or an ellipsis), together with all marks above it."""
 
     kind: Literal["block", "ellipsis", "oval"]
     nodes: list[ChainTreeNode]
@@ -78,8 +78,8 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 
 def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool) -> ChainTreeMark:
-    """Return the mark of the inception block. It leads to all other marks. `names` maps the hashes of blocks to their
-    names. The marks above a block are ordered by the lowest ID of the agents whose chains they show.
+    """Return the mark of the inception block. All other marks can be reached from this mark. `names` maps the hashes of
+    blocks to their names. The marks above a block are ordered by the lowest ID of the agents whose chains they show.
     """
     root = ChainTreeMark("block", [inception], ["inception block"], inception.holders)
     to_grow = [(root, inception)]

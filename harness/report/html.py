@@ -67,7 +67,7 @@ def render(template: Path, *, styles: Sequence[str], script: str = "", **content
 
 @cache
 def _environment(directory: Path) -> Environment:
-    """Return the environment of the templates in this directory. It keeps compiled templates."""
+    """Return a template environment for this directory. The environment caches compiled templates."""
     environment = Environment(
         loader=FileSystemLoader([directory, _HERE]),
         bytecode_cache=_TemplateCache(),

@@ -24,8 +24,8 @@ class TraceLine:
     agent_id: int
     text: str | bytes
     where: int | None = None
-    """Number of the line, row or message in the source file, counted from 1. The following classes have the
-    same field.
+    """Number of the line, row or message in the source file, counted from 1. The field `where` of the following classes
+    has the same meaning.
     """
 
 

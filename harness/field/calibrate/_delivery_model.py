@@ -350,7 +350,7 @@ def _intervals(
 def _profile(
     rows: Sequence[_TransmissionCluster], values: Vector, least: float, free: Sequence[int], parameter: int
 ) -> tuple[float, float]:
-    """Return the values of a parameter at which its profile likelihood falls to `least`."""
+    """Return the lowest and the highest value of a parameter at which its profile likelihood is at least `least`."""
     others = [each for each in free if each != parameter]
 
     def inside(value: float) -> bool:
@@ -387,8 +387,8 @@ def student(freedom: float) -> float:
 
 
 def wilson(delivered: float, attempts: float) -> ConfidenceInterval:
-    """Return Wilson's confidence interval of a probability, computed from independent draws (Wilson, JASA 22, 1927).
-    Without draws, the interval is 0 to 1.
+    """Return Wilson's confidence interval of the probability that a message arrives. `delivered` of `attempts`
+    independent messages arrived (Wilson, JASA 22, 1927). If there are no attempts, the interval is 0 to 1.
     """
     if not attempts:
         return ConfidenceInterval(0.0, 1.0)

@@ -27,7 +27,7 @@ from netem.channel import PRESETS
 from netem.radio import LogDistance
 
 TRAINING_SHARE = 2 / 3
-"""Share of the flight that is used to fit the model for the validation. It begins at the start of the flight. The
+"""Share of the flight to which the model is fitted for the validation. The share begins at the start of the flight. The
 fitted model then predicts the rest of the flight.
 """
 BLOCK_S = 120.0
@@ -338,6 +338,8 @@ def share_of(attempts: Sequence[TransmissionAttempt]) -> DeliveryShare:
 
 
 def model_of(radio: LogDistance, loss: float = 0.0) -> DeliveryModel:
-    """Return a delivery model that has the same probabilities as this radio together with an additional loss rate."""
+    """Return the delivery model that corresponds to this radio with an additional loss rate. Both deliver a message
+    with the same probability at each distance.
+    """
     range_m = 10 ** (radio.margin_db(1.0) / (10 * radio.exponent))
     return DeliveryModel(range_m, radio.shadowing_db * math.log(10) / (10 * radio.exponent), loss)

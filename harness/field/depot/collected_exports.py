@@ -251,8 +251,8 @@ def _other_missions(read_exports: Iterable[ReadExport], mission: str) -> Iterato
 
 
 def _by_agent(read_exports: Iterable[ReadExport], left_out: list[str]) -> CollectedExports:
-    """Group the exports by agent. The latest export of an agent contains the current state of the agent. Earlier
-    exports may contain further blocks.
+    """Find the latest export of each agent, which contains the current state of the agent. Also keep earlier exports,
+    because they may contain further blocks.
     """
     collected = CollectedExports({}, [], left_out, [])
     for each in read_exports:

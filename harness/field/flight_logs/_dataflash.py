@@ -29,7 +29,7 @@ from harness.field.flight_logs._records import (
 MAGIC = b"\xa3\x95"
 FMT = 128
 MAX_MESSAGES = 30_000_000
-"""Maximum number of messages that are read from a file. They correspond to about seven hours of flight."""
+"""Maximum number of messages that are read from a file. A flight of about seven hours produces this number."""
 _FMT_BYTES = 89
 _MAX_DEFINITIONS = 4096
 _CHUNK_BYTES = 1024 * 1024
@@ -40,7 +40,9 @@ _COLUMN_TYPES: dict[str, tuple[str, float | None]] = {
     **{"a": ("64s", None), "g": ("e", None), "n": ("4s", None), "N": ("16s", None), "Z": ("64s", None)},
     **{"c": ("h", 100), "C": ("H", 100), "e": ("i", 100), "E": ("I", 100), "L": ("i", 1e7), "M": ("b", None)},
 }
-"""Code of a column type in an FMT message -> code of the type in Python's `struct`, and divisor of the values."""
+"""Code of a column type in an FMT message -> two values: the type code of Python's `struct`, and the number by which a
+stored value is divided.
+"""
 _VEHICLE_PARAMETERS = ("MAV_SYSID", "SYSID_THISMAV")
 _EVENT_ARMED, _EVENT_DISARMED = 10, 11
 _FAILSAFES = {
@@ -89,7 +91,7 @@ class DataFlashReader:
         self.budget = budget
         self.vehicle = RecordCollector(budget)
         self.gps_positions = RecordCollector(budget)
-        """Positions of the GPS receiver. They are used for logs without estimated positions."""
+        """Positions of the GPS receiver, which are used if the log contains no estimated positions."""
         self.clock = LogClock()
         self.damage = DamagedBytes()
         self.vehicle_id: int | None = None

@@ -46,8 +46,8 @@ _SAME_FLIGHT_S = 60.0
 _NEAR_M = 1_000.0
 _DAY_US = 86_400_000_000
 _FIRST_UTC_US = 1_000_000_000_000_000
-"""Earliest timestamp of a clock that was set. Earlier timestamps come from clocks that were never set. A set clock is
-assumed to be wrong by at most a day. Otherwise the flight of another day along the same path would match.
+"""Earliest possible timestamp of a clock that was set. Clocks that were never set show earlier times. A clock that was
+set is assumed to be wrong by at most a day, so that a flight along the same path on another day does not match.
 """
 _METRES_PER_DEGREE = 111_195.0
 
@@ -74,8 +74,8 @@ class MatchedLog:
     agent_id: int | None
     """The ID of the agent. None if no known agent flew on the vehicle."""
     evidence: str
-    """The evidence for the agent. It completes a sentence such as "is of agent 10 by ..." or "matches no
-    agent: ...".
+    """The evidence for the agent. The text completes a sentence such as "is of agent 10 by ..." or "matches no agent:
+    ...".
     """
     clock_ahead_s: float | None = None
     """The time on the agent's clock minus GPS time, in seconds. None if unknown."""

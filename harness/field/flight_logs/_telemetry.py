@@ -28,7 +28,7 @@ from harness.field.flight_logs._records import (
 )
 
 MAX_MESSAGES = 10_000_000
-"""Maximum number of messages that are read from a file. They correspond to about two hours of ten vehicles."""
+"""Maximum number of messages that are read from a file. Ten vehicles send this number in about two hours."""
 _CHUNK_BYTES = 1024 * 1024
 _STAMP_BYTES = 8
 _V1, _V2 = 0xFE, 0xFD

@@ -31,7 +31,7 @@ class CaptureSummary:
     epoch_us: int | None
     hashes: frozenset[str]
     source: Path
-    """The original file of the capture. It differs from `path` if an import created the capture."""
+    """The original file of the capture. If an import created the capture, this file differs from `path`."""
 
 
 def summarise_capture(

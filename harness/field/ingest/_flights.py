@@ -143,7 +143,8 @@ def _assign_to_flights(
     groups: list[_FlightRecords], mission: _MissionInHeader, agent_id: int, flights: list[list[TraceIncarnation]]
 ) -> None:
     """Assign the records of one agent to the flights of the other agents. Records belong to the flight with the most
-    directories in common. This assignment is a guess for records that no other fact assigns to a flight.
+    directories in common. This assignment is only a guess, and is used if no other fact determines the flight of the
+    records.
     """
 
     def shared_directories(flight_incarnations: list[TraceIncarnation], records: _FlightRecords) -> int:
@@ -166,9 +167,8 @@ def _assign_to_flights(
 
 
 def _merged(groups: list[_FlightRecords]) -> list[_FlightRecords]:
-    """Merge groups of records that belong to the same flight.
-
-    Their headers may differ in mission second 0, or lack BD_0.
+    """Merge groups of records that belong to the same flight. The headers of these records may differ in mission second
+    0, or lack BD_0.
     """
     merged: list[_FlightRecords] = []
     for records in sorted(groups, key=lambda each: each.size, reverse=True):

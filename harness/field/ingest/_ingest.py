@@ -47,7 +47,7 @@ class Flight:
     exports: dict[int, Export] = field(default_factory=dict)
     captures: dict[int, Path] = field(default_factory=dict)
     roster: tuple[int, ...] = ()
-    """The roster according to the traces or mission files. It is empty without them."""
+    """The roster according to the traces or mission files. Empty if there are no such files."""
     epoch_us: int | None = None
     """The time of mission second 0 in microseconds since the Unix epoch. None if no trace or capture contains it."""
     more_captures: list[Path] = field(default_factory=list)
@@ -59,7 +59,9 @@ class Flight:
     flight_logs: list[MatchedLog] = field(default_factory=list)
     """The flight logs of the vehicles that carried these agents."""
     mission_files: dict[int, Path] = field(default_factory=dict)
-    """Agent ID -> its mission file. It may be the only file of an agent that did not come home."""
+    """Agent ID -> the mission file of the agent. If a vehicle did not come home, this may be the only file of its
+    agent.
+    """
     public_keys: "PublicKeys | None" = None
     """The public keys of a secured mission. None if no file contains them."""
 

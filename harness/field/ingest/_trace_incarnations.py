@@ -275,10 +275,10 @@ class TraceReader:
     def _before_mixed_lines(
         self, incarnations: list[TraceIncarnation], left_out: list[UnusedPart]
     ) -> list[TraceIncarnation]:
-        """Return the incarnations up to the place from which on several agents wrote into the file at the same time.
+        """Return the incarnations before the place at which the lines of several agents become mixed in the file.
 
-        Their lines do not name their agent. The datagrams in some lines show that these lines are of another agent
-        whose header is in the file, too.
+        Trace lines do not name their agent, so mixed lines cannot be used. The mixture is detected if an incarnation
+        sent datagrams with the ID of another agent whose header is also in the file.
         """
         agents = {life.header.agent_id for life in incarnations if life.header is not None}
         for position, life in enumerate(incarnations if len(agents) > 1 else ()):
@@ -329,7 +329,7 @@ def _entry(line: bytes) -> TraceHeader | Entry | None:
 
 
 def _parse(line: bytes) -> TraceHeader | Entry | None:
-    """Return the entry in a line. Its time is not checked. Return None if the entry is incomplete."""
+    """Return the entry in a line without a check of its time. Return None if the entry is incomplete."""
     if not any(word in line for word in _MARKERS):
         return None
     try:

@@ -127,7 +127,9 @@ class InferredInputPath:
         return DatagramReceived(encode(sender, self._sequence, message))
 
     def _answer(self, message: Message) -> None:
-        """Return the answer that an agent with the known chain gives to a query or request."""
+        """Schedule the answer that a peer with the known chain gives to this message. If the message is no query or
+        request, do nothing.
+        """
         answer: Message
         known = {chain_hash: height for height, chain_hash in enumerate(self._chain_hashes)}
         chain = self._known.chain

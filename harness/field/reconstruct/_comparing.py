@@ -140,8 +140,8 @@ class SoloSimulations:
         return [*self._remarks, inferred]
 
     def rehearse(self, header: CheckedHeader) -> None:
-        """Simulate an agent with the inputs in its trace. If this simulation does not end in the state of the agent's
-        export, try a simulation with the capture of its vehicle. Return the simulation that explains more inputs.
+        """Simulate an agent with the inputs in its trace, or with the inputs that the capture of its vehicle shows.
+        Store the simulation that explains more inputs in `rehearsals`.
         """
         agent_id = header.agent_id
         rehearsal = self._by_trace(header) if agent_id in self._flight.traces else None

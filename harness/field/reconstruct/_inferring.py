@@ -144,8 +144,8 @@ def _last_seen(received: Sequence[CapturedDatagram], last_s: float, restart_s: f
 def _infer_restarted(
     header: CheckedHeader, record: _IncarnationRecord, late_s: float, stored: StoredState, tries: int
 ) -> "_InputSequence":
-    """Guess the inputs after a restart, once with and once without data on the disk. The restart happened some time
-    before the first sent datagram.
+    """Guess the inputs after a restart. The time of the restart and the content of the disk are unknown. Try several
+    times before the first sent datagram, each with and without data on the disk. Return the best guess.
     """
     first_s = record.sent[0].at_s if record.sent else NEVER
     times = sorted(
@@ -210,8 +210,8 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 
 
 class _InputSequence:
-    """One possible order of the inputs of an agent in one incarnation. For each timer that does not expire at its most
-    likely position in this order, `deferred` maps the number of the timer to the distance from that position.
+    """One possible order of the inputs of an agent in one incarnation. `deferred` maps the number of a timer to the
+    number of inputs by which its expiry is moved away from its most likely position.
     """
 
     def __init__(

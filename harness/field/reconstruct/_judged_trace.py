@@ -79,8 +79,8 @@ class JudgedTrace:
             yield from (self._known[id(run)] for run in recorded.runs if id(run) in self._known)
 
     def _state_at_export(self) -> KnownState | None:
-        """Return the state in the export as the known state at the end. Return None if the agent was not idle when it
-        exported its chain.
+        """Return the state in the agent's export, which is the known state at the end of its trace. Return None if the
+        agent was not idle when it exported its chain.
         """
         export = self._export
         if export is None or not export.idle or export.blocks_to_be_committed or export.reconcile_stack:

@@ -79,7 +79,7 @@ def _visible_settings(other_records: OtherRecords) -> Settings:
 
 
 def _max_block_bytes(blocks: Iterable[bytes], largest: int) -> int:
-    """Return the setting max_block_bytes. It follows from the sizes of the blocks, because a block is full if an event
+    """Return the setting max_block_bytes, which is computed from the sizes of the blocks. A block is full if an event
     of the largest size might not fit into it.
     """
     least, most = largest, MAX_EVENT_DATA_BYTES

@@ -123,13 +123,15 @@ def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSim
 
 
 class _DatagramsBySender:
-    """The datagrams that each simulated agent sent. They can be searched for the sender of a received datagram."""
+    """The datagrams that each simulated agent sent. The class also finds the agents that sent a given datagram."""
 
     def __init__(self, rehearsals: Mapping[int, SoloSimulation]) -> None:
         self._rehearsals = rehearsals
         self.sent: dict[int, list[bytes]] = {agent: [] for agent in rehearsals}
         self._sent_by: dict[int, list[int]] = {agent: [] for agent in rehearsals}
-        """Sender -> for each datagram of the sender, the position of the input that caused the datagram."""
+        """Sender -> a list with one element for each datagram of the sender. The element is the position of the input
+        that caused the datagram.
+        """
         self._numbers: dict[bytes, list[tuple[int, int]]] = defaultdict(list)
         for agent, rehearsal in rehearsals.items():
             for place, played in enumerate(rehearsal.played):
@@ -139,7 +141,9 @@ class _DatagramsBySender:
                     self._sent_by[agent].append(place)
 
     def of(self, datagram: bytes, receiver: int) -> list[tuple[int, int]]:
-        """Return (agent, number) for each time that an agent other than the receiver sent this datagram."""
+        """Return each case in which an agent other than the receiver sent this datagram, as a pair: the agent, and the
+        number of the datagram among those that the agent sent.
+        """
         return [sent for sent in self._numbers.get(datagram, ()) if sent[0] != receiver]
 
     def sent_s(self, agent: int, number: int) -> float:
@@ -193,8 +197,8 @@ class _TimetablePlanner:
         return self._table
 
     def _queue(self, agent: int) -> None:
-        """Find the next input of the agent that needs a time. The input is ready, or it waits for a message that
-        another agent has not sent yet.
+        """Find the next input of the agent that has no mission time yet. Record that this input is ready, or that it
+        waits for a message which another agent has not sent yet.
         """
         played = self._played[agent]
         place = self._next[agent]
@@ -213,8 +217,8 @@ class _TimetablePlanner:
         return self._table.clocks[agent].at(self._played[agent][place].input.at_s)
 
     def _sent(self, agent: int, place: int) -> tuple[int, int] | None:
-        """Return (sender, number) of the datagram that arrives with this input. Return None for other inputs, and for a
-        datagram of unknown origin.
+        """Return the sender and the number of the datagram that this input receives. Return None if the input is no
+        datagram, or if no simulated agent sent the datagram.
         """
         cause = self._played[agent][place].input.cause
         if not isinstance(cause, DatagramReceived) or (agent, place) in self._as_strays:
@@ -289,7 +293,7 @@ class _TimetablePlanner:
         return expiry_local, self._table.clocks[agent].at(expiry_local)
 
     def _keep_running(self, agent: int, timer: TimerStart, until_s: float) -> None:
-        """Delay the expiry of the timer, so that the timer still runs at `until_s`."""
+        """Delay the expiry of a timer, so that the timer still runs at mission second `until_s`."""
         _, expiry_s = self._expiry(agent, timer)
         if expiry_s < until_s + MIN_GAP_S:
             self._delay(agent, timer, _rounded_up(until_s + 2 * MIN_GAP_S - expiry_s))

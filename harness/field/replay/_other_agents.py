@@ -68,7 +68,9 @@ class OtherAgents:
 
 
 class _OtherAgent:
-    """An agent that is not replayed. `clock` relates the clock of this agent to the clock of the replayed agent."""
+    """The trace of an agent that is not replayed. `clock` converts between the clock of this agent and the clock of the
+    replayed agent.
+    """
 
     def __init__(self, record: RecordedTrace, trace: Trace) -> None:
         self._messages = PeerMessages(record, trace)

@@ -39,7 +39,9 @@ MAX_TRIED = 20
 """Maximum number of deviations for which damage to a line is tried as an explanation."""
 
 PERHAPS = "perhaps"
-"""A word in the reason why a step was not judged. It precedes a description of damage that may explain a deviation."""
+"""A word in the reason why a step was not judged. A description of damage that may explain a deviation follows this
+word.
+"""
 
 _OF_TIMERS = frozenset(handler.name for handler in ON_TIMER.values())
 
@@ -69,7 +71,7 @@ class ReplayResult:
             self.positions.append(position)
 
     def insert(self, position: int, deviation: StepDeviation) -> None:
-        """Insert a deviation before the deviations at later positions."""
+        """Insert a deviation into the list of deviations, which is ordered by position."""
         number = bisect_left(self.positions, position)
         self.deviations.insert(number, deviation)
         self.positions.insert(number, position)

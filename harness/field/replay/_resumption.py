@@ -154,8 +154,8 @@ def _is_hex(text: str) -> bool:
 
 
 WITHIN = 200
-"""The detector searches for a clock change in this number of lines before an entry, and in this number of lines after
-it.
+"""The detector searches this number of lines before an entry, and the same number of lines after it, for a clock
+change.
 """
 MESSAGES = 3
 """Number of messages before a possible clock change, and after it, whose median time difference is compared. The

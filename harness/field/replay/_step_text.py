@@ -24,7 +24,9 @@ BLOCKS_SHOWN = 8
 
 
 class StepText:
-    """A writer of texts about the record of a player. `names` contains the names of the blocks in the record."""
+    """An object that describes the steps and states of a replay as text. `names` contains the names of the blocks in
+    the record.
+    """
 
     def __init__(self, player: RecordPlayer, names: ReplayNames) -> None:
         self._player = player

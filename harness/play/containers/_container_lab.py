@@ -207,7 +207,9 @@ class ContainerLab:
         return await self.network.read()
 
     async def watch(self) -> None:
-        """Raise DockerError if Docker stopped or does not answer, or if a container was stopped from outside."""
+        """Wait until Docker stops or does not answer, or until a container is stopped from outside. Then raise
+        DockerError.
+        """
         while True:
             await asyncio.wait({self._failure}, timeout=LOOK_EVERY_S)
             if self._failure.done():

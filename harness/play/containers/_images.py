@@ -97,7 +97,7 @@ def named(engine: DockerEngine, name: str) -> ContainerImage:
 
 def agents_in_named(scenario: Scenario) -> Iterable[int]:
     """Return the agents that run in the image that the scenario names. If the key `agent_command` lists commands by
-    agent, the result is the agents with a command. Otherwise it is all agents.
+    agent, only the agents with a command run in this image. Otherwise all agents run in it.
     """
     if scenario.docker.image is None:
         return ()
@@ -122,7 +122,7 @@ def project_name() -> str:
 
 
 def build_arguments() -> dict[str, str]:
-    """Return the versions of the packages to install in the Docker image. These versions are installed on
+    """Return the versions of the packages to install in the Docker image. They equal the versions of the packages on
     this machine.
     """
     arguments = {"PYMAVLINK": version("pymavlink")}

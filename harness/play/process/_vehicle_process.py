@@ -126,9 +126,7 @@ class VehicleProcess:
         return Place(*field.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
 
     def prepare(self, flight: Flight | None, altitude_m: float) -> None:
-        """Choose the flight of the vehicle. It flies the given plan. Without a plan, it climbs to
-        `altitude_m` metres.
-        """
+        """Choose the flight of the vehicle. If `flight` is None, the vehicle only climbs to `altitude_m` metres."""
         assert self.pilot is not None
         self._flight = self.pilot.flight(flight.to_plan(), flight.by) if flight else self.pilot.ascent(altitude_m)
 

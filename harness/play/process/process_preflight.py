@@ -51,18 +51,18 @@ def network_needs(scenario: Scenario) -> list[str]:
 
 
 def add_rogue_listener(conditions: NetworkConditions, scenario: Scenario) -> NetworkConditions:
-    """Return the network conditions. If the scenario has a rogue node, add links to the rogue node, without loss and
-    delay.
+    """Return the network conditions. If the scenario has a rogue node, the result also has links from the agents to the
+    rogue node, without loss and delay.
     """
     return conditions.with_listener(scenario.rogue, scenario.roster) if scenario.rogue else conditions
 
 
 def _network_states(scenario: Scenario) -> list[NetworkConditions]:
-    """Return the different network conditions that occur in the scenario, at the scenario's speed and without
-    partitions.
+    """Return all different network conditions that occur in the scenario, without partitions and at the scenario's
+    speed.
 
-    With a radio model, one link in each of these conditions loses more messages than the other links, so the conditions
-    represent links that differ during a flight.
+    If the scenario has a radio model, one link in each of these conditions has an additional loss. The conditions then
+    contain links with different losses, as during a flight.
     """
     states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
     out_of_reach = {frozenset(scenario.roster[:2]): 0.5} if scenario.network.radio else {}
@@ -82,8 +82,8 @@ def _network_states(scenario: Scenario) -> list[NetworkConditions]:
 def refuse_unsupported_network(scenario: Scenario) -> None:
     """Raise MachineError with a solution if this machine cannot create the network conditions of the scenario.
 
-    If the scenario needs more than loss and partitions, this opens a lab for a fraction of a second. If some kernels
-    with netem reject the conditions of the scenario, the conditions are applied in this lab as a test.
+    If the scenario needs more than loss and partitions, the function opens a lab for a fraction of a second. In this
+    lab, it applies the conditions that some kernels reject.
     """
     needs = network_needs(scenario)
     uncertain = [network for network in _network_states(scenario) if may_refuse(network)]

@@ -110,7 +110,7 @@ class Host(Protocol):
 
 
 class FarEnds:
-    """The listening sockets of a host, and the tasks that handle its connections."""
+    """The sockets at which far ends (agents on other computers) connect, and tasks for their connections."""
 
     def __init__(self, host: Host, name: str, *, places: int = 1, agents: int = 1, has_keys: bool = False) -> None:
         """Create the object without listening. `name` describes the run to the user of the other computer.

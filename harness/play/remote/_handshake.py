@@ -47,7 +47,9 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True)
 class Hello:
-    """A far end that knows the secret. `words` is its JSON object without the public key."""
+    """The verified first message of a far end (an agent on another computer). `words` is the JSON object in this
+    message without the public key.
+    """
 
     words: dict[str, Any]
     connection: socket.socket

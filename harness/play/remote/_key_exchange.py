@@ -26,9 +26,10 @@ class KeyExchange:
         return None if self._private is None else self._private.public_key().public_bytes_raw().hex()
 
     def shared(self, share: Any) -> bytes | None:
-        """Return the number that both ends have in common. Return None if an end lacks the package cryptography.
+        """Compute the shared secret of both ends from the public key of the other end. Return None if an end lacks the
+        package cryptography.
 
-        Raises ValueError if the public key of the other end is wrong.
+        Raises ValueError if the public key of the other end is invalid.
         """
         if self._private is None or share is None:
             return None

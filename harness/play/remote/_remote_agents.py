@@ -163,7 +163,9 @@ class RemoteAgents:
                 self.compensated(change.conditions.at_speed(self._scenario.speedup))
 
     async def watch_hosts(self) -> None:
-        """Raise MachineError if a worker of a cluster is lost. Without workers, wait without end."""
+        """Wait until a worker of the cluster is lost, then raise MachineError. If no cluster runs the agents, wait
+        forever.
+        """
         await (self._hosts.watch() if self._hosts is not None else asyncio.Event().wait())
 
     async def _wait_for_all(self, show: Callable[[str], None]) -> None:

@@ -102,7 +102,7 @@ class Channel:
         return self.encode(kind, json.dumps(document).encode())
 
     def decode(self, data: bytes) -> list[Message]:
-        """Return the messages that are complete after these further bytes. Raises WireError."""
+        """Add received bytes to the buffer. Return the messages that are complete now. Raises WireError."""
         self._unread += data
         messages = []
         while len(self._unread) >= _HEADER.size:
@@ -142,7 +142,7 @@ class Channel:
 
 
 class _Authentication:
-    """The messages of one direction, in the clear with a tag."""
+    """The protection of messages in one direction by an authentication tag. The messages are not encrypted."""
 
     def __init__(self, key: bytes) -> None:
         self._key = key
@@ -160,7 +160,7 @@ class _Authentication:
 
 
 class _Encryption:
-    """The messages of one direction, encrypted."""
+    """The protection of messages in one direction by encryption."""
 
     def __init__(self, key: bytes) -> None:
         from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305

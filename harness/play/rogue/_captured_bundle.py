@@ -65,7 +65,7 @@ class CapturedKeys:
         return session.seal(sequence, message, request, signature, 0)
 
     def _session(self, sender: int, now_us: int) -> Session:
-        """Return a forged session that imitates a restart of the sender at this moment. It is newer than the sender's
-        genuine session.
+        """Return a forged session that imitates a restart of the sender at this moment. The forged session is newer
+        than the sender's genuine session.
         """
         return Session(replace(self._bundle, agent_id=sender), make_boot(now_us, self._random_bytes()))

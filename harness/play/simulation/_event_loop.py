@@ -55,12 +55,12 @@ class EventLoop:
     """The agents of a scenario on a simulated network. The number of an agent is its index in the roster.
 
     `deliver_all`: also deliver the messages that a released agent would ignore. This takes longer and changes only the
-    traces. Every message is delivered if an agent has quirks, is not the harness's own, or has an edited core
-    (`harness.play.core_version`), because such an agent might not ignore it. The same is true of a secured mission in
-    which messages can be dropped: a second copy is a replay even if the first one had no effect.
+    traces. Every message is also delivered if an agent has quirks, is a foreign agent (a separate program), or has an
+    edited core (`harness.play.core_version`). Such an agent might react to the message. The same is true of a secured
+    mission in which messages can be dropped: a second copy is a replay even if the first one had no effect.
 
-    Receivers share one decoded message. If an agent has quirks or an edited core, it might change this object, so each
-    receiver then decodes the datagram itself, and traces contain the bytes as they were sent.
+    Receivers share one decoded message. An agent with quirks or an edited core might change this object. In this case,
+    each receiver decodes the datagram itself, and traces contain the bytes as they were sent.
 
     `interactive`: a user may request injections during the run. `fate_script` creates the object that applies scripted
     fates. `air` creates the network. `programs` are the programs that play foreign agents.

@@ -16,8 +16,8 @@ from ucp.store import StoredState
 from ucp.trace import Entry, RecordedBytes
 
 AgentOutput = tuple[int, Message | None, RecordedBytes | None]
-"""An output of an agent: (sequence number, message, datagram). The datagram is None if the message is not encoded yet.
-An output that is not a message of the agent has only the datagram, with sequence 0 and no message.
+"""An output of an agent: sequence number, message, datagram. The datagram is None if the message is not encoded yet. If
+the output is not a message of the agent, its sequence number is 0, and its message is None.
 """
 
 DiskContents = StoredState | tuple[Any]
@@ -40,8 +40,8 @@ class VirtualAgent(Protocol):
 
     @property
     def chain_changed_at(self) -> float | None:
-        """The time of the last change of the chain, on the agent's clock. It is 0 without a change, and None if it is
-        unknown.
+        """The time at which the chain changed last, on the agent's clock. The time is 0 if the chain never changed, and
+        None if it is unknown.
         """
 
     @property

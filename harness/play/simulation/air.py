@@ -71,7 +71,7 @@ class _AnswerLog:
     answers: dict[int, list[MessageInFlight]] = field(default_factory=dict)
     """Sender -> its answers to the query, in the order of sending."""
     askers: set[int] = field(default_factory=set)
-    """Numbers of the agents whose query for these answers is open."""
+    """Numbers of the agents that have sent the query and still accept answers to it."""
     answer_count: int = 0
     """Number of all answers to the query."""
     quiet_at: float = 0.0
@@ -199,8 +199,8 @@ class VirtualAir:
         return self._quiet_at if channel is None or channel.next_s == NEVER else max(self._quiet_at, channel.next_s)
 
     def inputs_until(self, mission_s: float) -> Iterator[ScheduledInput]:
-        """Yield the inputs of all agents up to and including `mission_s`, in order. The caller may add inputs between
-        two steps.
+        """Yield the inputs of all agents up to and including `mission_s`, in order. The caller may add inputs while it
+        iterates.
         """
         queue = self._queue
         while True:
@@ -494,8 +494,8 @@ class VirtualAir:
         return True
 
     def release(self, number: int, at: float) -> None:
-        """End the hold with this number. Each held message arrives at the time `at`. If its original arrival time is
-        later, it arrives at that time.
+        """End the hold (a rule that delays messages) with this number. Each held message arrives at the time `at`, or
+        at its original arrival time if that is later.
         """
         for flight, receiver, would_arrive in self._held.pop(number, ()):
             self._schedule_arrival(flight, receiver, max(at, would_arrive))

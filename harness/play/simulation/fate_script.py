@@ -14,7 +14,7 @@ from ucp.state import AgentState
 RIGHT_AFTER_S = 1e-6
 
 NameOf = Callable[[bytes], str | None]
-"""A function that returns the name of a block from its hash. It returns None if the block has no name."""
+"""A function that returns the name of the block with a given hash, or None if the block has no name."""
 
 
 @dataclass(slots=True, eq=False)
@@ -64,7 +64,7 @@ class FateScript:
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf) -> None:
         self.listens = bool(fates)
-        """True if the scenario has fates. Only then must the caller call `decide`."""
+        """True if there are rules. If it is false, the caller need not call `decide`."""
         self.last_s: float | None = None
         """The time at which a fate last changed the delivery of a message."""
         self._parts = [_ScriptedFate(index, fate) for index, fate in enumerate(fates)]
@@ -83,7 +83,9 @@ class FateScript:
         return part.index
 
     def release(self, number: int, fate: Fate) -> None:
-        """End the hold with this number. `fate` contains the times at which the hold ends."""
+        """End the hold (a rule that delays messages) with this number. `fate` contains the times at which the hold
+        ends.
+        """
         part = self._parts[number]
         part.fate, part.holds = fate, False
 
@@ -130,10 +132,10 @@ class FateScript:
         return decided
 
     def settled_counts(self, now: float) -> tuple[int, ...] | None:
-        """Return the number of messages that each rule has matched, but at most the largest message number in its
-        `count`.
+        """Return the number of messages that each rule has matched. Messages after the last number in the `count` of a
+        rule are not included, because the rule has no effect on them.
 
-        Return None if the result of a rule still depends on time.
+        Return None if the effect of a rule still depends on time.
         """
         if any(part.arrivals or part.holds for part in self._parts):
             return None
@@ -143,8 +145,8 @@ class FateScript:
         return tuple(min(part.matches, max(part.fate.counts or (0,))) for part in self._parts)
 
     def unmatched(self, waiting: Collection[str]) -> list[str]:
-        """Return a sentence for each rule that had no effect, because the author of the rule expects an effect.
-        `waiting` contains the names of rules for whose message other messages wait, but which did not match a message.
+        """Return a sentence for each rule that had no effect, or only a part of the expected effect. `waiting` contains
+        names of rules. Messages still wait for the message that such a rule should match.
         """
         sentences = []
         for part in self._parts:
@@ -191,7 +193,7 @@ class RunningTimer(NamedTuple):
 
 class LateTimers:
     """The timers of one agent, some of which expire late. The timers are counted across restarts of the agent. `text`
-    is the key `lateness` of the scenario for this agent.
+    is the agent's value of the scenario key `lateness`.
     """
 
     def __init__(self, text: str = "") -> None:

@@ -49,7 +49,7 @@ class SimulatedIncarnation:
     """Mission second at which the last pause ended. Answers that arrived during the pause are handled at this time."""
     bytes_sent: int = 0
     handler_runs: int = 0
-    """Number of handler runs. They are counted only if a trace is written."""
+    """Number of handler runs, which are counted only if a trace is written."""
     ended_at: float | None = None
     completed: int = 0
     """Number of blocks that the agent had completed after its last input, if it runs in this process."""

@@ -26,7 +26,9 @@ from ucp.trigger import MessageTrigger
 Change = list[Any]
 
 KEY_LENGTH = 16
-"""Number of hexadecimal digits that identify a block on the page. They are the first digits of the block's hash."""
+"""Number of hexadecimal digits that identify a block on the page. A block is identified by the first digits of its
+hash.
+"""
 
 _RECEIPT_LINE = re.compile(
     rb'\{"t":([\d.]+),"handler":"receive_\w+","algorithm":\d+,'
@@ -78,7 +80,7 @@ class AgentActions:
         self.has_unread = False
         """True if the last call of `read` left lines unread."""
         self.leaves_out_messages = False
-        """If true, `read` only processes changes of the agent's state. This is several times as fast."""
+        """If true, `read` processes only changes of the agent's state, which is several times as fast."""
         self._trace = AgentTrace(agents, agent_id)
         self._ahead: MessageReceipt | HandlerRun | DroppedDatagram | None = None
         """An entry that was read but is later than the requested mission second."""

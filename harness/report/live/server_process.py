@@ -34,8 +34,8 @@ _NO_REASON = "it does not say why"
 
 
 class LivePage:
-    """The process of the web server that serves the live page. It forwards requests from browsers. `address` is the
-    address of the page.
+    """The process of the web server that serves the live page. The process forwards requests from browsers. `address`
+    is the address of the page.
 
     The run never waits for the server. Threads write to the server and read from it.
     """

@@ -62,8 +62,8 @@ def words(event: LoggableEvent, telemetry: bool, of_type: int | None = None) -> 
 
 
 def _vehicle_types(logbook: Logbook) -> dict[int, int]:
-    """Return the MAV_TYPE of each agent's vehicle. It is part of the first change of the flight mode that the agent
-    logged.
+    """Return the MAV_TYPE of each agent's vehicle. The first event about a flight mode that the agent logged contains
+    the MAV_TYPE.
     """
     types: dict[int, int] = {}
     if not logbook.telemetry:

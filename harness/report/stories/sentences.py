@@ -9,7 +9,7 @@ from harness.scenario.faults import TIMELINE_FAULTS
 from harness.scenario.load import parse_yaml
 
 EVENT_BYTES = 256
-"""Default size of the data of an event in a script, in bytes."""
+"""Default number of data bytes of an event that a story logs."""
 
 _IDS = r"(\d{1,7}(?: \d{1,7})*)"
 _LOGS = re.compile(rf"{_IDS} logs?(?: (\d{{1,7}}) bytes)?")
@@ -26,8 +26,8 @@ SENTENCES = (
 
 
 class StoryEntries:
-    """The scenario entries for all sentences that were added so far: entries of `script` for logged events, entries of
-    `timeline` for everything else, and the mission second of the end.
+    """The scenario entries that represent the sentences of a story. Entries of `script` represent logged events, and
+    entries of `timeline` represent all other sentences. `ends_at_s` is the mission second of the end.
     """
 
     def __init__(self) -> None:

@@ -33,15 +33,15 @@ _ENTRY = re.compile(r"(`?)(timeline|events\.script)\.(\d+)(?:\.|: )")
 INDENT = "    "
 DELAY_S = 0.02
 SPEEDUP = 10.0
-"""Speedup of stories that are played as processes. It is limited, because sentences may be one second apart, and a
-change of the network takes some milliseconds.
+"""Speedup of stories that are played as processes. The speedup is limited, because the sentences of a story may be one
+second apart, and a change of the network takes some milliseconds.
 """
 
 
 @dataclass(frozen=True)
 class StorySection:
-    """The place in a story file for the reactions of the agents in an interval of mission time. The place is after line
-    `line`, counted from 0. The interval begins at `from_s` and ends at `until_s`.
+    """The place in a story file at which the reactions of the agents are written. The place follows line `line`,
+    counted from 0. It contains the reactions from mission second `from_s` until `until_s`.
     """
 
     line: int
@@ -155,7 +155,9 @@ def _parsed(path: Path, text: str) -> Story:
 
 
 def _in_its_line(problem: str, entry_lines: Mapping[str, Sequence[int]]) -> str:
-    """Return the error message with the line number of the sentence in place of the scenario entry."""
+    """Return an error message that names the line of a sentence, in place of the scenario entry that the sentence
+    created.
+    """
     entry = _ENTRY.match(problem)
     return f"line {entry_lines[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
 

@@ -32,7 +32,7 @@ class BagMessage(NamedTuple):
     """A message in a ROS bag."""
 
     number: int
-    """The position of the message in the file, counted from 1."""
+    """Number of the message among the readable messages of the bag, counted from 1."""
     topic: str
     type_name: str
     time_ns: int
@@ -41,7 +41,7 @@ class BagMessage(NamedTuple):
 
 
 def messages(path: Path) -> Iterator[BagMessage | UnreadablePart]:
-    """Yield all messages in a ROS bag. For each place between messages that cannot be read, yield an UnreadablePart.
+    """Yield all readable messages in a ROS bag. For each part of the bag that cannot be read, yield an UnreadablePart.
     Raises OSError.
     """
     number = 0

@@ -65,7 +65,7 @@ def _pages_of_truncated(path: Path) -> SqlitePages | None:
 
 
 def _rows_in_pages(pages: SqlitePages) -> Iterator[Item]:
-    """Yield the messages in the pages in order of time. Then yield an entry about the damage."""
+    """Yield the messages in the pages in order of time. Then yield an UnreadablePart that describes the damage."""
     topics: dict[Any, tuple[str, str]] = {}
     messages: dict[int, list[Any]] = {}
     for number, values in pages.rows():

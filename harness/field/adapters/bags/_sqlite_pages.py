@@ -15,7 +15,8 @@ _INTEGER_BYTES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
 
 Value = int | bytes | str | None
 Row = tuple[int, list[Value]]
-"""A row of a table: its number, and its values. A value that equals the row number is None."""
+"""A row of a table: its number, and its values. If a column contains the row number, SQLite stores None in this column.
+"""
 
 
 class SqlitePages:

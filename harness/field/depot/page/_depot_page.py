@@ -88,8 +88,8 @@ def draw(record: MergedRecord, reconciliation: ReconciledExports | None = None) 
 
 
 def _title(record: MergedRecord) -> str:
-    """Return the title of the page. If the data of the inception block are readable text, the title is this text.
-    Otherwise the title is a text with the hash of the inception block.
+    """Return the title of the page. If the data of the inception block are readable text, they are the title. Otherwise
+    the title contains the hash of the inception block.
     """
     text = base64.b64decode(record.header.inception.block_data).decode("utf-8", errors="replace")
     if text and text.isprintable() and "\ufffd" not in text:
@@ -176,7 +176,9 @@ def _vehicles(record: MergedRecord, ink: Mapping[int, AgentColours]) -> list[dic
 
 
 def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, AgentColours]) -> list[dict[str, Any]]:
-    """Return the changes in flight logs, such as flight modes, of all vehicles with an agent, in order of time."""
+    """Return the changes that the flight logs show, such as a new flight mode, in order of time. Flight logs whose
+    agent is unknown are omitted.
+    """
     found = [change for match in matches if match.agent_id is not None for change in changes(match)]
     return [
         {
@@ -191,7 +193,7 @@ def _changes(matches: Sequence[MatchedLog], ink: Mapping[int, AgentColours]) -> 
 
 
 def _marks(matches: Sequence[MatchedLog]) -> dict[int, list[_time_chart.Mark]]:
-    """Return the changes in the flight log of each agent, with times on the clock of the agent."""
+    """Return the changes that the flight log of each agent shows. The times are those of the agent's clock."""
     marks: dict[int, list[_time_chart.Mark]] = {}
     for match in matches:
         if match.agent_id is not None:

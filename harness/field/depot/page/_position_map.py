@@ -147,8 +147,8 @@ def _paths(
 def _pieces(
     track: EventTrack, path: Sequence[PositionFix], lost: Mapping[int, Sequence[int]]
 ) -> Iterable[tuple[bool, Sequence[PositionFix]]]:
-    """Divide the path of a vehicle into pieces. Yield pairs: true if the piece is a gap, and the positions of the
-    piece. A gap is a piece between two positions where blocks were lost.
+    """Divide the path of a vehicle into pieces. For each piece, yield whether it is a gap, and its positions. A gap
+    connects two positions between which blocks were lost.
     """
     missing = lost.get(track.agent_id, ())
     ordinals = [_ordinal(entry.block) for entry in track.entries if entry.is_position]
@@ -167,7 +167,9 @@ def _ordinal(name: str) -> int | None:
 
 
 def _logged(track: EventTrack, single_copies: set[str]) -> Iterable[tuple[bool, int, LogEntry]]:
-    """Yield each event that the map marks, as (true if only one vehicle holds its block, agent ID, event)."""
+    """Yield three values for each event that the map marks: whether only one vehicle holds the block of the event, the
+    agent ID, and the event.
+    """
     for entry in track.entries:
         rare = entry.block in single_copies
         if entry.position is not None and (rare or not entry.is_position):

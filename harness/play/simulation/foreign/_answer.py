@@ -38,8 +38,8 @@ class ForeignAnswer:
     """A valid answer of a foreign agent."""
 
     sent: list[tuple[bytes, RecordedBytes]]
-    """The sent datagrams. Each datagram has its record. If the datagram contains a message, the record contains the
-    message.
+    """The datagrams that the agent sent. Each datagram comes with the form in which traces record it. This form
+    contains the message if the datagram contains a valid message.
     """
     timer: float | None
     """Time on the agent's clock at which its next timer expires."""

@@ -42,8 +42,8 @@ answers could grow without end.
 ROUNDED_S = 2e-6
 """Tolerance in seconds for times in a trace, which are rounded to six decimals."""
 NO_VIRTUAL_TIME = (2, 127)
-"""Exit statuses of programs that do not support virtual time. They interpret `--virtual` as a mission file (2), or
-refuse it (127).
+"""Exit statuses of programs that do not support virtual time. Such a program ends with 2 if it interprets `--virtual`
+as the name of a mission file, and with 127 if it refuses the argument.
 """
 
 
@@ -62,7 +62,7 @@ class _CounterPerSecond:
 
 @dataclass
 class IncarnationRecord:
-    """The recorded inputs and answers of an agent, as lines, from one start to its end. Recording stops after `limit`
+    """The recorded inputs and answers of one incarnation of an agent, as lines of text. Recording stops after `limit`
     bytes.
     """
 

@@ -50,8 +50,8 @@ class ProgramFailedError(Exception):
 class LineProgram:
     """A running program that was started with `command` and the argument `--virtual`.
 
-    Its standard error goes to the file `log`. Without `log`, it goes to a temporary file, which is cleared at the start
-    of each mission. Raises OSError if the program cannot be started.
+    The standard error of the program goes to the file `log`. If `log` is None, it goes to a temporary file, which is
+    cleared at the start of each mission. Raises OSError if the program cannot be started.
     """
 
     def __init__(self, command: Sequence[str], log: Path | None = None) -> None:
