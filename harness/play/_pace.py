@@ -24,8 +24,8 @@ class VirtualTimePace:
     """
 
     def __init__(self, factor: float | None = None, *, paused: bool = False) -> None:
-        """Set the initial speed. `factor` is the number of mission seconds per second of wall time. None means
-        unlimited speed.
+        """Set the initial speed. `factor` is the number of mission seconds per second of wall time. If it is None, the
+        speed is unlimited.
         """
         self.factor = factor
         self.paused = paused
@@ -34,8 +34,8 @@ class VirtualTimePace:
         self._now_s = 0.0
         self._limited = True
         self._anchor: tuple[float, float] | None = None
-        """The wall time and the mission second from which later times are computed, with the current speed. None if the
-        next check must set them.
+        """The wall time and the mission second from which later times are computed with the current speed, or None if
+        the next check must set them.
         """
         self._pace_changed = asyncio.Event()
 
@@ -45,7 +45,7 @@ class VirtualTimePace:
         return self._step is not None and self._step_to_s == NEXT_RUN
 
     def set_factor(self, factor: float | None) -> None:
-        """Set the number of mission seconds per second of wall time. None means unlimited speed."""
+        """Set the number of mission seconds per second of wall time. If it is None, the speed is unlimited."""
         self.factor = factor
         self._change()
 

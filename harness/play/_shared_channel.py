@@ -29,8 +29,8 @@ _WORD_BITS = 32
 class _SentFrame(Protocol):
     @property
     def sequence(self) -> int | None:
-        """The sequence number of the message in the frame. None if the frame contains data that are not a message of an
-        agent.
+        """The sequence number of the message in the frame, or None if the frame contains other data than a message of
+        an agent.
         """
 
 
@@ -55,7 +55,7 @@ class ChannelTraffic(Generic[Message]):
         self._processed_at = [0.0] * len(roster)
         self._order = 0
         self._queued: dict[int, Message] = {}
-        """Frame number -> the message that the frame carries."""
+        """The message that each frame carries, by frame number."""
 
     def send(self, now: float, sender: int, message: Message, data_bytes: int) -> None:
         """Send a message on the channel as soon as the radio of the agent is free. The messages of one agent keep their

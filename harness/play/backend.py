@@ -30,8 +30,8 @@ class Backend(ABC):
     """True if `harness.run.simulate` can carry out the same run in memory, which makes runs of many seeds fast."""
 
     not_in_uml: ClassVar[str | None] = None
-    """The reason why this backend cannot run inside User Mode Linux, with a solution. None if the backend can run
-    there.
+    """The reason why this backend cannot run inside User Mode Linux, with a solution. The value is None if the backend
+    can run there.
     """
 
     @abstractmethod

@@ -112,15 +112,15 @@ class Interventions(GrowingTimeline):
         super().__init__(scenario)
         self._initial_scenario = scenario
         self.pace = VirtualTimePace(factor, paused=paused) if virtual_time else None
-        """The speed of virtual time, which the backend reads. None in real time."""
+        """The speed of virtual time, which the backend reads. The value is None if the run uses real time."""
         self.on_entry_added: Callable[[], None] = lambda: None
         """A function that the thread of the run calls each time an entry was added."""
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
-        """The event loop of the run. None before its start and after its end."""
+        """The event loop of the run, or None before its start and after its end."""
         self._swarm: Swarm | None = None
         self._closed: str | None = "the mission has not started"
-        """Reason why the run does not accept requests of the user. None while the run accepts requests."""
+        """Reason why the run does not accept requests of the user, or None while the run accepts requests."""
         self._requests: deque[tuple[Entry, Future[float]]] = deque()
         self._request_arrived = asyncio.Event()
         self._by_hand: dict[float, TimelineEntry] = {}
@@ -134,7 +134,7 @@ class Interventions(GrowingTimeline):
 
     @property
     def closed(self) -> str | None:
-        """The reason why the run does not accept requests of the user now. None if the run accepts requests."""
+        """The reason why the run does not accept requests of the user now, or None if the run accepts requests."""
         return self._closed
 
     @property
@@ -156,7 +156,7 @@ class Interventions(GrowingTimeline):
 
     @property
     def factor(self) -> float | None:
-        """The number of mission seconds per second of wall time. None means unlimited speed."""
+        """The number of mission seconds per second of wall time. If it is None, the speed is unlimited."""
         return self.pace.factor if self.pace is not None else self.scenario.speedup
 
     def ask(self, entry: Mapping[str, Any]) -> Future[float]:
@@ -187,7 +187,7 @@ class Interventions(GrowingTimeline):
         return self._change_pace(lambda pace, _: pace.resume())
 
     def set_factor(self, factor: float | None) -> Future[float]:
-        """Set the number of mission seconds per second of wall time. None means unlimited speed."""
+        """Set the number of mission seconds per second of wall time. If it is None, the speed is unlimited."""
         if factor is not None and not 0 < factor <= MAX_FACTOR:
             return _refused(f"{factor:g} is not a speed: use a number above 0 and at most {MAX_FACTOR:g}")
         return self._change_pace(lambda pace, _: pace.set_factor(factor))

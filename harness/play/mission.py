@@ -52,7 +52,7 @@ class RunOutcome:
     counters: Counters | None = None
     datagrams: dict[str, DatagramsRead] = field(default_factory=dict)
     channel: ChannelRecord | None = None
-    """The counts of frames on a shared channel. None without a channel."""
+    """The counts of frames on a shared channel, or None if the run has no such channel."""
     capture: dict[str, CapturedFrames] | None = None
     agents: dict[str, AgentRecord] = field(default_factory=dict)
     vehicles: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -60,8 +60,8 @@ class RunOutcome:
     remote: dict[str, RemoteRecord] = field(default_factory=dict)
     unmatched_fates: list[str] = field(default_factory=list)
     traces: dict[int, Trace] | None = None
-    """The trace of each agent, with the same content as the files in the run directory. None if the traces are only in
-    files.
+    """The trace of each agent, with the same content as the files in the run directory. The value is None if the traces
+    are only in files.
     """
 
     def end_early(self, outcome: Outcome, error: HarnessError) -> None:
@@ -89,9 +89,9 @@ class SoughtRun:
 
     handler: str
     branch: str | None = None
-    """The branch of the handler run. None matches any branch."""
+    """The branch of the handler run. If it is None, every branch matches."""
     agent: int | None = None
-    """The ID of the agent. None matches any agent."""
+    """The ID of the agent. If it is None, every agent matches."""
 
     def matches(self, agent_id: int, run: HandlerRun) -> bool:
         """Return true if the handler run matches this description."""

@@ -29,7 +29,7 @@ class SwarmSnapshot:
     duration_s: float
     network: str
     statuses: Mapping[int, AgentStatus | None]
-    """Agent -> its last status report. None before the first report."""
+    """The last status report of each agent, by agent ID. The value is None before the first report."""
 
 
 class ProgressDisplay(Protocol):

@@ -39,7 +39,7 @@ class MapMoment:
     at: str
     """The time of the moment."""
     what: str
-    """A text about the event at this time. Empty if there is no event."""
+    """A text about the event at this time, or an empty text if there is no event."""
     network: str
     """The groups of connected vehicles at this time."""
     picture: Markup

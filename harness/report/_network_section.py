@@ -25,7 +25,7 @@ REASONS = {
     "queue": "full queue",
     "too_long": "message too long for the radio",
 }
-"""Reason for the loss of a message on a shared radio channel -> description."""
+"""The description of each reason for which a shared radio channel loses a message."""
 
 
 @dataclass(frozen=True, slots=True)

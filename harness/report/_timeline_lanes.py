@@ -43,7 +43,7 @@ OUTCOMES = {
     "reconcile in progress": "given up for a reconcile",
     CUT_SHORT: "cut short",
 }
-"""Outcome of a vote -> description."""
+"""The description of each outcome of a vote."""
 PHASE_HEIGHTS = {"phase 1": 4, "phase 2": 7, "phase 3": 10, "finalize": 2}
 BAR_HEIGHT = 7
 """Height in pixels of the bar that represents a reconcile with too many phases. Such a bar does not show single phases.

@@ -16,9 +16,9 @@ class AgentProgram:
 
     agents: tuple[int, ...]
     command: tuple[str, ...] | None
-    """The command that starts the program. None for the harness's own program."""
+    """The command that starts the program, or None for the harness's own program."""
     version: str | None
-    """The version that the agents reported. None if they reported no version."""
+    """The version that the agents reported, or None if they reported no version."""
 
     @property
     def in_words(self) -> str:

@@ -52,7 +52,7 @@ class ChainTreeMark:
     holders: list[int]
     children: list["ChainTreeMark"] = field(default_factory=list)
     beside: "ChainTreeMark | None" = None
-    """The oval beside a block at which some chains end and other chains continue. None if there is no such oval."""
+    """The oval beside a block at which some chains end and other chains continue, or None if there is no such oval."""
 
 
 def chain_tree(exports: Mapping[int, Export]) -> ChainTreeNode:

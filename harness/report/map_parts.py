@@ -32,7 +32,7 @@ class NetworkDivision:
     """The mission second of the change with which the division begins."""
     what: str
     parts: dict[int, frozenset[int]]
-    """Number of a part -> the vehicles in the part. Empty if all vehicles reach each other."""
+    """The vehicles in each part, by the number of the part. There are no parts if all vehicles reach each other."""
     alone: frozenset[int]
     """The living vehicles that reach no other vehicle."""
     together: frozenset[int]

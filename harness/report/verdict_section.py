@@ -20,7 +20,7 @@ STATEMENTS = {
 }
 ICONS = {"good": "✓", "bad": "✗", "unknown": "\u2013"}
 KINDS = {"good": "holds", "bad": "violated", "unknown": "unknown"}
-"""Assessment of a verdict ("good", "bad" or "unknown") -> CSS class."""
+"""The CSS class for each assessment of a verdict: "good", "bad" or "unknown"."""
 EVIDENCE_KEPT = 200
 
 
@@ -28,7 +28,7 @@ EVIDENCE_KEPT = 200
 class VerdictEntry:
     key: str
     number: str
-    """The number of the characteristic. Empty for a further check."""
+    """The number of the characteristic, or an empty text if the verdict belongs to a further check."""
     name: str
     statement: str
     verdict: str
@@ -40,8 +40,8 @@ class VerdictEntry:
     """The evidence for the verdict, as pairs of a label and a value."""
     evidence_left_out: int
     remark: str = ""
-    """A text that compares the verdict with the expected verdict, such as "as expected". Empty if the scenario expects
-    no verdict.
+    """A text that compares the verdict with the expected verdict, such as "as expected". The text is empty if the
+    scenario expects no verdict.
     """
 
     @property

@@ -31,8 +31,8 @@ class BisectionResult:
     good: Outcome
     bad: Outcome
     first: list[GitCommit] = field(default_factory=list)
-    """The first commit that changes the outcome. If some commits cannot be tested, there are several candidates. Empty
-    if the outcome is the same at the good and at the bad commit.
+    """The first commit that changes the outcome. If some commits cannot be tested, there are several candidates. There
+    is no such commit if the good and the bad commit have the same outcome.
     """
     tried: list[CommitTrial] = field(default_factory=list)
     changes: list[str] = field(default_factory=list)

@@ -58,7 +58,7 @@ class Outcome(_OutcomeModel):
     agents: dict[int, AgentResult] = {}
     verdicts: dict[str, str] = {}
     crashed: str | None = None
-    """The place of the exception that ended the tested code. None without an exception."""
+    """The place of the exception that ended the tested code, or None if there was no exception."""
 
     def as_recorded(self) -> "Outcome":
         """Return the outcome of an agent core that does not differ from the records."""

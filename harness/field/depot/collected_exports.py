@@ -90,15 +90,15 @@ class CollectedExports:
     of the run.
     """
     traced: dict[int, list[str]] = field(default_factory=dict)
-    """Agent -> hashes of the blocks that the agent completed, according to its trace."""
+    """The hashes of the blocks that each agent completed according to its trace, by agent ID."""
     flight_logs: list[FlightLog] = field(default_factory=list)
     telemetry: bool = True
     """False if a file shows that the events are not telemetry of vehicles. True otherwise."""
     wrong_signatures: list[str] = field(default_factory=list)
     """A sentence about each wrong signature in a secured mission."""
     unproven: str | None = None
-    """The reason why valid signatures do not prove that the exports are genuine. None if valid signatures prove it, or
-    if the mission was not secured.
+    """The reason why valid signatures do not prove that the exports are genuine. The value is None if valid signatures
+    prove it, or if the mission was not secured.
     """
 
     @property
@@ -121,7 +121,7 @@ class CollectedExports:
 
     @property
     def claims(self) -> dict[str, str]:
-        """The blocks for which a file gives a wrong hash: computed hash -> wrong hash. A block is not included if
+        """The wrong hashes that files give for blocks, by the computed hash of the block. A block is not included if
         another export contains it with the computed hash, or if its agent completed it.
         """
         claims = {true: claimed for read_export in self.read_exports for true, claimed in read_export.claims.items()}

@@ -197,8 +197,8 @@ def _unreadable(event_data: bytes, events: Sequence[tuple[int, int, int, int]]) 
 
 
 def _names(collected: CollectedExports) -> dict[str, str]:
-    """Return block hash -> name of the block. If a file contains an edited block, its name is the name of the original
-    block, followed by "(edited)".
+    """Return the name of each block, by block hash. If a file contains an edited block, the name of the edited block is
+    the name of the original block, followed by "(edited)".
     """
     claims = collected.claims
     exports: dict[int, Export] = {}

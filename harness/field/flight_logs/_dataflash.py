@@ -40,8 +40,8 @@ _COLUMN_TYPES: dict[str, tuple[str, float | None]] = {
     **{"a": ("64s", None), "g": ("e", None), "n": ("4s", None), "N": ("16s", None), "Z": ("64s", None)},
     **{"c": ("h", 100), "C": ("H", 100), "e": ("i", 100), "E": ("I", 100), "L": ("i", 1e7), "M": ("b", None)},
 }
-"""Code of a column type in an FMT message -> two values: the type code of Python's `struct`, and the number by which a
-stored value is divided.
+"""The meaning of each column type in FMT messages, by the code of the type. The meaning consists of the type code of
+Python's `struct`, and the number by which a stored value is divided.
 """
 _VEHICLE_PARAMETERS = ("MAV_SYSID", "SYSID_THISMAV")
 _EVENT_ARMED, _EVENT_DISARMED = 10, 11
@@ -60,11 +60,11 @@ _FAILSAFES = {
     50: "dead reckoning failsafe",
     51: "takeoff failsafe",
 }
-"""Number of ArduPilot's ModeReason (libraries/AP_Vehicle/ModeReason.h) -> description of the failsafe. A rover has the
-general reason 25 if it lost its radio or its ground station.
+"""The description of each failsafe, by the number of ArduPilot's ModeReason (libraries/AP_Vehicle/ModeReason.h). A
+rover has the general reason 25 if it lost its radio or its ground station.
 """
 _FIRMWARE = {"ArduPlane": 1, "ArduCopter": 2, "ArduRover": 10, "Rover": 10}
-"""First word of the text about the firmware -> type of the vehicle (MAV_TYPE)."""
+"""The type of the vehicle (MAV_TYPE), by the first word of the text about the firmware."""
 
 Values = dict[str, Any]
 

@@ -17,7 +17,7 @@ class DamagedBytes:
     skipped_bytes: int = 0
     first_at: int | None = None
     ends_at: int | None = None
-    """Position of the byte at which reading stopped because of too much damage. None if the file was read to its
+    """Position of the byte at which reading stopped because of too much damage, or None if the file was read to its
     end.
     """
     unusable: int = 0

@@ -72,13 +72,13 @@ class MatchedLog:
     log: FlightLog
     vehicle: VehicleLog
     agent_id: int | None
-    """The ID of the agent. None if no known agent flew on the vehicle."""
+    """The ID of the agent, or None if no known agent flew on the vehicle."""
     evidence: str
     """The evidence for the agent. The text completes a sentence such as "is of agent 10 by ..." or "matches no agent:
     ...".
     """
     clock_ahead_s: float | None = None
-    """The time on the agent's clock minus GPS time, in seconds. None if unknown."""
+    """The time on the agent's clock minus GPS time, in seconds, or None if the difference is unknown."""
 
 
 def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[MatchedLog]:

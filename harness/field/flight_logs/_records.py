@@ -144,7 +144,7 @@ class VehicleLog:
     """The records of one vehicle in a flight log."""
 
     vehicle: int | None
-    """The MAVLink system ID. None if a DataFlash log does not contain the parameter with this ID."""
+    """The MAVLink system ID, or None if a DataFlash log does not contain the parameter with this ID."""
     mav_type: int | None
     """The type of the vehicle (MAV_TYPE): 1 plane, 2 quadcopter, 10 rover. A DataFlash log has 2 for every kind of
     copter.

@@ -22,7 +22,7 @@ class FileRemark:
     path: Path
     why: str
     line: int | None = None
-    """Number of the line, from 1. None for the whole file."""
+    """Number of the line, counted from 1, or None if the remark concerns the whole file."""
     counts: str = "line"
     """The unit of `line`, for example "message" in a ROS bag."""
 
@@ -42,28 +42,28 @@ class Flight:
     """The records of one flight of a swarm, by agent ID."""
 
     initial_data: bytes | None
-    """The data of the inception block (BD_0). None if no file contains it."""
+    """The data of the inception block (BD_0), or None if no file contains it."""
     traces: dict[int, Trace] = field(default_factory=dict)
     exports: dict[int, Export] = field(default_factory=dict)
     captures: dict[int, Path] = field(default_factory=dict)
     roster: tuple[int, ...] = ()
-    """The roster according to the traces or mission files. Empty if there are no such files."""
+    """The roster according to the traces or mission files. The roster is empty if there are no such files."""
     epoch_us: int | None = None
-    """The time of mission second 0 in microseconds since the Unix epoch. None if no trace or capture contains it."""
+    """The time of mission second 0 in microseconds since the Unix epoch, or None if no trace or capture contains it."""
     more_captures: list[Path] = field(default_factory=list)
     """Further captures of the same vehicles, and captures of observation points without a vehicle."""
     logged: dict[int, list[LoggableEvent]] = field(default_factory=dict)
     """Events of the agents that a separate recorder recorded. The events in traces are not included."""
     sources: dict[int, list[Path]] = field(default_factory=dict)
-    """Agent ID -> the files from which its trace was read."""
+    """The files from which the trace of each agent was read, by agent ID."""
     flight_logs: list[MatchedLog] = field(default_factory=list)
     """The flight logs of the vehicles that carried these agents."""
     mission_files: dict[int, Path] = field(default_factory=dict)
-    """Agent ID -> the mission file of the agent. If a vehicle did not come home, this may be the only file of its
+    """The mission file of each agent, by agent ID. If a vehicle did not come home, this may be the only file of its
     agent.
     """
     public_keys: "PublicKeys | None" = None
-    """The public keys of a secured mission. None if no file contains them."""
+    """The public keys of a secured mission, or None if no file contains them."""
 
     @property
     def agents(self) -> list[int]:

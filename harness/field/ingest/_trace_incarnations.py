@@ -71,7 +71,7 @@ class TraceIncarnation:
     @property
     def agent_id(self) -> int | None:
         """The ID of the agent. It comes from the header, the source of the lines, the sent datagrams or the file name,
-        in this order. None if the ID is unknown.
+        in this order. The value is None if the ID is unknown.
         """
         if self.header is not None:
             return self.header.agent_id

@@ -37,7 +37,7 @@ class FirstDifference:
     at_s: float
     """The mission second in the reconstructed scenario."""
     line: int | None
-    """The line number in the trace. None if the record has no further step."""
+    """The line number in the trace, or None if the record has no further step."""
     handler: str
     recorded: str
     played: str

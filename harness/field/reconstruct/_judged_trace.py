@@ -54,7 +54,7 @@ class JudgedTrace:
 
     @property
     def first_finding(self) -> str | None:
-        """A sentence about the first deviation from the reference implementation. None if there is no deviation."""
+        """A sentence about the first deviation from the reference implementation, or None if there is no deviation."""
         return self.deviations[0].sentence(self._names.of) if self.deviations else None
 
     def with_known_states(

@@ -32,8 +32,8 @@ class OtherRecords:
     def __init__(self, flight: Flight, opener: "DatagramOpener | None" = None, depot: "Depot | None" = None) -> None:
         """Read the files. In a secured mission, `opener` decrypts datagrams, and `depot` decrypts event data."""
         self.sealed: dict[int, dict[bytes, bytes]] = defaultdict(dict)
-        """Agent ID -> a mapping from each event that filled a block (encoded as bytes) to the encrypted event data of
-        this block.
+        """The encrypted event data of each block. The first key is the agent ID, and the second is the event that
+        filled the block, encoded as bytes.
         """
         self._depot = depot
         self.captures: dict[int, AgentCapture] = {}
@@ -130,8 +130,8 @@ class OtherRecords:
 
     @property
     def _reason_unreadable(self) -> str:
-        """The reason why event data cannot be divided into events, as the end of a sentence. Empty if the event data
-        are not encrypted.
+        """The reason why event data cannot be divided into events. The text is the end of a sentence. It is empty if
+        the event data are not encrypted.
         """
         exports = self._exports.values()
         if not any(sealed_to(base64.b64decode(export.inception.block_data)) for export in exports):

@@ -176,7 +176,7 @@ class _IncarnationSimulation:
         self._early_s = math.inf if tolerance.early_timers else header.early_s
         self._ignoring = tolerance.ignoring
         self._running_timers: dict[int, TimerStart] = {}
-        """Number of a timer -> the timer, for the timers that are running."""
+        """The timers that are running, by their numbers."""
         timers.update(self.agent.state)
 
     def running_at_end(self) -> list[TimerStart]:

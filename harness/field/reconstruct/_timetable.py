@@ -73,7 +73,7 @@ class InputTimetable:
     """All datagrams that each agent sends, in order."""
     sent_at_s: dict[int, list[float]] = field(default_factory=dict)
     lateness: dict[int, dict[int, float]] = field(default_factory=dict)
-    """Agent -> number of a timer -> delay of the timer in seconds."""
+    """The delay of each timer in seconds. The first key is the agent ID, and the second is the number of the timer."""
     contradictions: list[str] = field(default_factory=list)
     """A sentence for each record that contradicts every order of inputs."""
 
@@ -129,8 +129,8 @@ class _DatagramsBySender:
         self._rehearsals = rehearsals
         self.sent: dict[int, list[bytes]] = {agent: [] for agent in rehearsals}
         self._sent_by: dict[int, list[int]] = {agent: [] for agent in rehearsals}
-        """Sender -> a list with one element for each datagram of the sender. The element is the position of the input
-        that caused the datagram.
+        """The position of the input that caused each datagram. The list of a sender has one element for each datagram
+        that the sender sent.
         """
         self._numbers: dict[bytes, list[tuple[int, int]]] = defaultdict(list)
         for agent, rehearsal in rehearsals.items():
@@ -175,7 +175,9 @@ class _TimetablePlanner:
         self._played = {agent: rehearsal.played for agent, rehearsal in rehearsals.items()}
         self._next = dict.fromkeys(rehearsals, 0)
         self._at: dict[int, list[float]] = {agent: [0.0] * len(played) for agent, played in self._played.items()}
-        """Agent -> the times of its planned inputs on its own clock, by position."""
+        """The planned time of each input on the agent's own clock. The key is the agent ID, and the index is the
+        position of the input.
+        """
         self._ready: list[tuple[float, int]] = []
         self._waiting: dict[tuple[int, int], list[int]] = defaultdict(list)
         self._as_strays: set[tuple[int, int]] = set()

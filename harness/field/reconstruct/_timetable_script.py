@@ -19,8 +19,8 @@ from ucp.quirks import Quirks
 
 HALF_GAP_S = MIN_GAP_S / 2
 Sealed = Mapping[int, Mapping[bytes, bytes]]
-"""Agent ID -> a mapping from each event that filled a block (encoded as bytes) to the encrypted event data of this
-block.
+"""The encrypted event data of each block. The first key is the agent ID, and the second is the event that filled the
+block, encoded as bytes.
 """
 MIN_PAUSE_S = 0.5
 """If a timer is delayed by at least this number of seconds, the agent is assumed to have been paused."""

@@ -36,8 +36,8 @@ class RecordEntry:
     incarnation: int
     content: HandlerRun | DroppedDatagram | CommandEntry
     gap: str | None = None
-    """A description of missing lines directly before this line, such as "2 lines are damaged". None if no lines are
-    missing.
+    """A description of missing lines directly before this line, such as "2 lines are damaged". The value is None if no
+    lines are missing.
     """
 
 
@@ -72,8 +72,8 @@ class RecordedTrace:
         self.agent_id = trace.header.agent_id
         self.incarnations = len(trace.starts) + 1
         self.doubts: dict[int, str] | None = None
-        """Position of a deviation -> the damage to a single line that explains the deviation. None until such
-        explanations were searched.
+        """The damage to a single line that explains a deviation, by the position of the deviation. The value is None
+        before the search for such explanations.
         """
         if not trace.header.has_inputs:
             raise FieldError(
@@ -97,8 +97,8 @@ class RecordedTrace:
 
     @cached_property
     def unrecorded(self) -> dict[int, str]:
-        """Position of an entry -> the reason why lost lines may explain the deviations of this entry, such as "lines
-        are missing ...".
+        """The reasons why lost lines may explain deviations, such as "lines are missing ...". The key is the position
+        of the entry with the deviations.
         """
         lost = {} if self.is_counted else lost_lines(self.trace)
         of_runs = [position for position, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
@@ -106,7 +106,9 @@ class RecordedTrace:
 
     @property
     def doubtful_runs(self) -> dict[int, str]:
-        """Position of a handler run -> damage to a single trace line that may explain the deviations of this run."""
+        """The damage to a single trace line that may explain the deviations of a handler run, by the position of the
+        handler run.
+        """
         of_entries = [number for number, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
         doubts = self.doubts or {}
         return {number: doubts[entry] for number, entry in enumerate(of_entries) if entry in doubts}
@@ -148,7 +150,7 @@ class RecordedTrace:
 
     @cached_property
     def _sent_by_others(self) -> dict[str, list[tuple[int, Message]]]:
-        """Type -> sender and message."""
+        """The recorded messages of other agents, each with its sender, by the type of the message."""
         found: dict[str, dict[tuple[int, Message], None]] = {}
         for (sender, _), datagrams in self._datagrams.items():
             for data in datagrams if sender != self.agent_id else ():
@@ -170,7 +172,7 @@ class RecordedTrace:
 
     @cached_property
     def _sent_by_complete_traces(self) -> dict[int, list[Message]]:
-        """Agent ID -> the messages that the agent sent. Agents with missing lines in their traces are not included."""
+        """The messages that each agent sent, by agent ID. Agents whose traces lack lines are not included."""
         sent = {}
         lacking = {agent_id for agent_id, _ in lacking_traces(self.flight.traces)}
         for agent_id, trace in self.flight.traces.items():
@@ -183,7 +185,7 @@ class RecordedTrace:
 
     @cached_property
     def arrivals(self) -> list[CapturedDatagram] | None:
-        """The datagrams that reached the vehicle of the agent, in order. None without a capture of the vehicle."""
+        """The datagrams that reached the vehicle of the agent, in order, or None if it has no capture."""
         capture = self.flight.capture(self.agent_id)
         return None if capture is None else [seen for seen in capture.sightings if not seen.outbound]
 
@@ -194,8 +196,8 @@ class RecordedTrace:
 
     @cached_property
     def present_until_s(self) -> float | None:
-        """A mission second after the last line until which the agent certainly ran. None if no such time is known. If a
-        step was due before this time and has no line, this line was lost.
+        """A mission second after the last line until which the agent certainly ran. The value is None if no such time
+        is known. If a step was due before this time and has no line, this line was lost.
         """
         if self.trace.cut_off or self.trace.problem or self.agent_id not in self.flight.exports:
             return None

@@ -112,8 +112,8 @@ class RecordPlayer:
         self._clock_set = ClockChangeDetector(record)
         self._resumption = ResumptionSearch(record, self._blocks)
         self.resumed_at: int | None = None
-        """The position after the most recent entry at which the state became known again after a gap. None if there was
-        no such entry.
+        """The position after the most recent entry at which the state became known again after a gap, or None if there
+        was no such entry.
         """
         self._follower, self._incarnation = self._new_follower(), 1
         self._checkpoints = {0: _PlayerCheckpoint(self._follower.copy(), 1, self.result.copy())}
@@ -125,12 +125,12 @@ class RecordPlayer:
 
     @property
     def lost(self) -> str | None:
-        """The reason why the state of the agent is unknown at this position. None if the state is known."""
+        """The reason why the state of the agent is unknown at this position, or None if the state is known."""
         return self._follower.lost
 
     @property
     def entry(self) -> RecordEntry | None:
-        """The trace entry that was played last. None if no entry was played."""
+        """The trace entry that was played last, or None if no entry was played."""
         return self.entries[self.position - 1] if self.position else None
 
     @property
@@ -313,7 +313,9 @@ class _DoubtingPlayer(RecordPlayer):
     def __init__(self, record: RecordedTrace) -> None:
         super().__init__(record)
         self.found: dict[int, str | None] = {}
-        """Position of a deviation -> the damage that explains the deviation, or None."""
+        """The damage that explains each deviation, by the position of the deviation. The value is None if no damage
+        explains the deviation.
+        """
 
     def _doubt(self, deviations: list[StepDeviation]) -> str | None:
         if self.position not in self.found:

@@ -26,7 +26,7 @@ from ucp.trace import HandlerRun
 from ucp.trigger import EventTrigger, LocalTrigger
 
 _ChainSteps = dict[bytes, tuple[bytes, str]]
-"""Chain hash -> the previous chain hash, and the block between the two."""
+"""The previous chain hash, and the block between both hashes, by chain hash."""
 
 
 class ResumptionSearch:

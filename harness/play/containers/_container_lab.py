@@ -56,9 +56,9 @@ class ContainerLab:
         self._ours: ContainerImage | None = None
         self._named: ContainerImage | None = None
         self._holders: dict[str, int] = {}
-        """Container ID of the holder of a network namespace -> vehicle."""
+        """The vehicle of each holder (a container that keeps a network namespace), by container ID."""
         self._containers: dict[str, Container] = {}
-        """Container ID -> container, for all containers that were started, including ended ones."""
+        """All containers that were started, including ended ones, by container ID."""
         self._incarnations: Counter[tuple[int, str]] = Counter()
         self._networks: set[int] = set()
         """Inode numbers of the vehicles' network namespaces."""

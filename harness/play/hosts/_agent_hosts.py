@@ -41,7 +41,7 @@ class AgentHosts:
         self._listeners: dict[str, socket.socket] = {}
         self._tasks: list[Any] = []
         self._ended: dict[str, asyncio.Future[None]] = {}
-        """Worker -> a future that becomes done when the task of the worker ends."""
+        """A future for each worker, which becomes done when the task of the worker ends."""
         self._loop = asyncio.get_running_loop()
         self._problem: asyncio.Future[str] = self._loop.create_future()
         self.secret = secrets.token_bytes(32)

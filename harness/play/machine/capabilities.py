@@ -99,7 +99,9 @@ def _ardupilot() -> MachineRequirement:
 
 
 _SHOWN = {"": (100.0, "%"), "s": (1000.0, "ms"), "bit/s": (0.001, "kbit/s"), "packets": (1.0, "packets")}
-"""Unit in `netem.measure` -> conversion factor and name of the unit that is printed instead."""
+"""The unit that is printed in place of each unit in `netem.measure`. The values are the conversion factor and the name
+of the printed unit.
+"""
 
 
 def measure_engines(requirements: Iterable[MachineRequirement], say: Callable[[str], None]) -> list[EngineMeasurement]:

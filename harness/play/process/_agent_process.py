@@ -143,7 +143,7 @@ class AgentProcess:
 
     @property
     def status(self) -> AgentStatus | None:
-        """The newest status report since the last start. None if the agent is neither running nor paused."""
+        """The newest status report since the last start, or None if the agent is neither running nor paused."""
         return self._incarnations[-1].status if self.outcome in ("running", "paused") else None
 
     # Start and end of an incarnation

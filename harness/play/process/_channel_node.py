@@ -62,7 +62,7 @@ ANSWER_TO = {
         (RequestForBlock, BlockResponse),
     )
 }
-"""Type code of a query or request -> type code of its answers."""
+"""The type code of the answers to each query or request, by the type code of the query or request."""
 
 
 class ChannelNode:
@@ -251,10 +251,10 @@ class AnswerTimeMeter:
     def __init__(self) -> None:
         self._all = array("f")
         self._question: dict[bytes, int] = {}
-        """Frame of a query -> type code of the answers to the query. Only the latest queries are kept."""
+        """The type code of the answers to a query, by the frame of the query. Only the latest queries are kept."""
         self._asked_s: dict[tuple[int, int], float] = {}
-        """(Vehicle, type code of an answer) -> the time at which the vehicle received the latest query that asks for
-        such an answer.
+        """The time at which a vehicle received its latest query that asks for a certain answer. The key is a pair: the
+        vehicle, and the type code of the answer.
         """
 
     def sent(self, heard: ReceivedBroadcast, data: bytes, at_s: float) -> None:

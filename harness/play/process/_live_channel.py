@@ -26,7 +26,7 @@ from netem.radio import Place
 class _ChannelMessage:
     frame: bytes
     sequence: int | None
-    """The sequence number of the message in the frame. None if the frame contains no message of an agent."""
+    """The sequence number of the message in the frame, or None if the frame contains no message of an agent."""
 
 
 class FrameDelivery(NamedTuple):

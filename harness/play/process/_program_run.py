@@ -122,7 +122,7 @@ class ProgramRun:
         self._waited_until_s = 0.0
         """Mission second at which the last `until` or `until_run` ended."""
         self._starting: dict[int, asyncio.Task[None]] = {}
-        """Agent -> the task that restarts the agent. The task may still be running."""
+        """The task that restarts each agent, by agent ID. The task may still be running."""
 
     @asynccontextmanager
     async def opened(self) -> AsyncIterator[Self]:

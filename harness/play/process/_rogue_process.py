@@ -24,7 +24,8 @@ class RogueProcess:
     def __init__(self, vehicle: int, scenario: Scenario, seed: int, rundir: RunDirectory) -> None:
         self.vehicle = vehicle
         self.sent: dict[int, int] = {}
-        """Number of an injection -> number of datagrams that the injection sent. `stop` sets these numbers."""
+        """The number of datagrams that each injection sent, by the number of the injection. `stop` sets these values.
+        """
         self._scenario = scenario
         self._seed = seed
         self._rundir = rundir

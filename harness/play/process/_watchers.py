@@ -19,7 +19,7 @@ class MissionTasks:
     def __init__(self) -> None:
         self._group = asyncio.TaskGroup()
         self._tasks: dict[str, list[asyncio.Task[None]]] = defaultdict(list)
-        """Name of a program or flight -> the tasks that watch it or control it."""
+        """The tasks that watch or control a program or a flight, by the name of the program or flight."""
 
     @asynccontextmanager
     async def guard(self, *watched: Coroutine[Any, Any, None]) -> AsyncIterator[None]:

@@ -9,7 +9,7 @@ class LabProgram(Protocol):
 
     @property
     def returncode(self) -> int | None:
-        """The exit status, or the negative number of the signal that killed the program. None while the
+        """The exit status, or the negative number of the signal that killed the program. The value is None while the
         program runs.
         """
 

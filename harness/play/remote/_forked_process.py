@@ -26,7 +26,7 @@ class ForkedProcess:
     @property
     def returncode(self) -> int | None:
         """The exit status, or the negative number of the signal that killed the process. If another process is the
-        parent, the exit status is unknown, and the value is 0. None while the process runs.
+        parent, the exit status is unknown, and the value is 0. The value is None while the process runs.
         """
         return self._ended.result() if self._ended.done() else None
 

@@ -22,7 +22,7 @@ class KeyExchange:
 
     @property
     def share(self) -> str | None:
-        """The public key for the other end, in hexadecimal. None without the package cryptography."""
+        """The public key for the other end, in hexadecimal, or None if the package cryptography is missing."""
         return None if self._private is None else self._private.public_key().public_bytes_raw().hex()
 
     def shared(self, share: Any) -> bytes | None:

@@ -69,7 +69,7 @@ class RemoteAgents:
     def __init__(
         self, scenario: Scenario, rundir: RunDirectory, now: Callable[[], float], hosts: AgentHosts | None = None
     ) -> None:
-        """Prepare for remote agents. `hosts` are the cluster workers that run all agents of the run. None means that
+        """Prepare for remote agents. `hosts` are the cluster workers that run all agents of the run. If it is None,
         users let agents join.
         """
         self._scenario, self._rundir, self._now, self._hosts = scenario, rundir, now, hosts

@@ -129,7 +129,7 @@ class FarWorker:
         """The file with the agent's keys, in a secured mission."""
         self._tails: dict[Kind, FileTail] = {}
         self._ended: dict[str, Any] | None = None
-        """The message about the end of the agent, with its exit status. None while the agent runs."""
+        """The message that reports the exit status of the agent, or None while the agent runs."""
 
     async def run(self) -> None:
         """Run until the incarnation has ended. When this process ends, the kernel ends the agent."""

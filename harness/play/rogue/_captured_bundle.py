@@ -28,9 +28,9 @@ class CapturedKeys:
         self._random_bytes = random_bytes
         self._opener = DatagramOpener(bundle)
         self._sessions: dict[int, Session] = {}
-        """Imitated sender -> the forged session for its datagrams."""
+        """The forged session for the datagrams of each imitated sender."""
         self._signatures: dict[bytes, bytes] = {}
-        """Block hash -> the genuine signature, from received datagrams."""
+        """The genuine signatures in received datagrams, by the hash of the signed block."""
 
     def opened(self, datagram: bytes) -> tuple[Message, AnsweredRequest] | None:
         """Decrypt a datagram. Return its message, and the identification that an answer to it must contain.

@@ -18,7 +18,7 @@ class RogueJournal:
         self._write = write
         self._lines: Counter[int] = Counter()
         self._counted: dict[int, dict[str, Any]] = {}
-        """Injection -> the line of counts of this injection that has not been written yet."""
+        """The line of counts of each injection that has not been written yet."""
 
     def add(self, injected: RogueDatagram, at_s: float) -> None:
         number, record = injected.injection, injected.to_json(at_s)

@@ -50,7 +50,7 @@ FLOOD_BATCH = 64
 
 
 QUERY_OF_ANSWER = {NAMES[answer]: NAMES[query] for answer, query in REQUEST_OF.items()}
-"""Name of an answer -> name of the query or request to which it belongs."""
+"""The name of the query or request to which each answer belongs, by the name of the answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +64,9 @@ class RogueDatagram:
     source: int
     datagram: bytes
     plain: bytes | None = None
-    """The datagram before encryption. None if the rogue node did not encrypt it."""
+    """The datagram before encryption, or None if the rogue node did not encrypt it."""
     receivers: Sequence[int] | None = None
-    """The receivers of the datagram. None for a broadcast."""
+    """The receivers of the datagram, or None for a broadcast."""
 
     def to_json(self, at_s: float) -> dict[str, object]:
         said = self.plain or self.datagram
@@ -124,7 +124,9 @@ class RogueLogic:
         self._votes_name_chain = False
         self._known_blocks = KnownBlocks(initial_data, epoch_us)
         self._queries: dict[tuple[int, str], AnsweredRequest] = {}
-        """(Sender, type of a query) -> identification of the last encrypted query, which an answer must contain."""
+        """The identification of the last encrypted query, which an answer must contain. The key is a pair: the sender
+        and the type of the query.
+        """
         self._windows: list[_ActiveInjection] = []
         self._waiting: list[tuple[float, int, RogueDatagram]] = []
         self._outbox: list[RogueDatagram] = []

@@ -39,13 +39,13 @@ def cached_crypto() -> CryptoFunctions:
 
 
 class RecordedSignatures:
-    """A record of all signatures made in this process. To verify such a signature, the process only searches this
-    record.
+    """A record of all signatures made in this process. To verify such a signature, the process usually only searches
+    this record.
     """
 
     def __init__(self) -> None:
         self._made: dict[bytes, tuple[bytes, bytes]] = {}
-        """Signature -> the public key of its key pair, and the signed bytes."""
+        """The signed bytes and the public key of the signing key pair, by signature."""
         self._number = count(1)
 
     def signer(self, private_key: bytes) -> "RecordingSigner":

@@ -108,7 +108,7 @@ class EventLoop:
         """
         self._foreign_swarm = self._foreign_agents(programs) if scenario.foreign else None
         self._late = {self._number[agent_id]: LateTimers(text) for agent_id, text in scenario.lateness.items()}
-        """Number of an agent with the key `lateness` -> its late timers."""
+        """The late timers of the agents that the scenario key `lateness` names, by agent number."""
         with_disk = self.roster if interactive else scenario.with_disk()
         self._with_disk = {self._number[agent_id] for agent_id in with_disk}
         """Numbers of the agents that may reboot with the data on their disks."""
@@ -122,7 +122,7 @@ class EventLoop:
         self._recent_messages: deque[tuple[int, int, Message, float]] | None = (
             deque(maxlen=KEPT_MESSAGES) if interactive else None
         )
-        """Messages for a rogue node that may start later in the run. None if no rogue node can start."""
+        """Messages for a rogue node that may start later in the run, or None if no rogue node can start."""
         self._sought: SoughtRun | None = None
         self._found: int | None = None
         """The ID of the agent that ran the handler for which the caller waits."""
@@ -151,13 +151,13 @@ class EventLoop:
 
     @property
     def public_keys(self) -> "PublicKeys | None":
-        """The public keys of the vehicles. None if the mission is not secured."""
+        """The public keys of the vehicles, or None if the mission is not secured."""
         return self._keys.mission.public if self._keys else None
 
     @property
     def verified(self) -> "Callable[[UnverifiedSignature], bool] | None":
-        """A function that verifies signatures, with a cache of the signatures made in this run. None if the mission is
-        not secured.
+        """A function that verifies signatures, with a cache of the signatures made in this run. The value is None if
+        the mission is not secured.
         """
         return self._keys.crypto.verify if self._keys else None
 

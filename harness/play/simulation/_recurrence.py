@@ -42,7 +42,7 @@ class AgentAtRest:
     local_s: float
     """The time on this agent's clock at the next timer expiry of the whole swarm."""
     wakes_s: float | None
-    """Mission second at which this agent's next timer expires. None if no timer runs."""
+    """Mission second at which this agent's next timer expires, or None if no timer runs."""
 
 
 class RecurrenceSearch:
@@ -65,7 +65,9 @@ class RecurrenceSearch:
     def _reset(self) -> None:
         self._steps: list[CycleStep] = []
         self._answered_by: dict[int, set[int]] = defaultdict(set)
-        """Agent in a reconcile -> the agents that have answered its queries since the stored state."""
+        """The agents that have answered the queries of an agent in a reconcile since the stored state, by the ID of the
+        agent in the reconcile.
+        """
         self._order_is_certain = True
         """False if two timers expire so close to each other that rounding may decide their order."""
         self._delays_matter = False

@@ -52,9 +52,9 @@ class MessageInFlight:
     rank: int
     draws: RandomDraws
     datagram: RecordedBytes | None
-    """The datagram in the form that traces record. None if no code has encoded it yet."""
+    """The datagram in the form that traces record, or None if no code has encoded it yet."""
     encoded: bytes | None = None
-    """The datagram as bytes, which each receiver decodes itself. None if the receivers share `message`."""
+    """The datagram as bytes, which each receiver decodes itself. The value is None if the receivers share `message`."""
 
     def __lt__(self, other: object) -> bool:
         return False  # two copies with equal time, rank and receiver are equal
@@ -69,7 +69,7 @@ class _AnswerLog:
     """The stored answers to one query, and the agents that sent this query."""
 
     answers: dict[int, list[MessageInFlight]] = field(default_factory=dict)
-    """Sender -> its answers to the query, in the order of sending."""
+    """The answers of each sender to the query, in the order of sending."""
     askers: set[int] = field(default_factory=set)
     """Numbers of the agents that have sent the query and still accept answers to it."""
     answer_count: int = 0
@@ -157,15 +157,19 @@ class VirtualAir:
         deliver_all: bool,
     ) -> None:
         self.busy_until = [0.0] * len(roster)
-        """Agent number -> earliest possible end of the agent's current reconcile. Until this time, the agent answers no
-        query.
+        """The earliest possible end of each agent's current reconcile, by agent number. Until this time, the agent
+        answers no query.
         """
         self.started_at = [0.0] * len(roster)
-        """Agent number -> time of its start. The agent does not receive messages that were sent before this time."""
+        """The time at which each agent started, by agent number. The agent does not receive messages that were sent
+        before this time.
+        """
         self.paused_at: dict[int, float] = {}
-        """Number of a paused agent -> start of the pause. Inputs of the agent wait until the end of the pause."""
+        """The start of the pause of each paused agent, by agent number. Inputs of the agent wait until the end of the
+        pause.
+        """
         self.open_queries: list[dict[QueryKind, _OpenQuery]] = [{} for _ in roster]
-        """Agent number -> its open queries."""
+        """The open queries of each agent, by agent number."""
         self._quiet_at = 0.0
         """The time at which all messages in transit have arrived. Messages on a shared channel are not included."""
         self.position: ScheduledInput = (0.0, 0, 0, None)
@@ -183,7 +187,9 @@ class VirtualAir:
         self._waiting: dict[str, list[tuple[MessageInFlight, int]]] = defaultdict(list)
         self._arrived_at: dict[str, float] = {}
         self._held: dict[int, list[tuple[MessageInFlight, int, float]]] = defaultdict(list)
-        """Number of a hold -> the held messages, each with its receiver and its arrival time without the hold."""
+        """The messages that each hold delays, by the number of the hold. Each message has its receiver, and its arrival
+        time without the hold.
+        """
 
     def deliver_everything(self) -> None:
         """Deliver all messages from now on, including those that cannot have an effect on their receiver."""

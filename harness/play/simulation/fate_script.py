@@ -28,8 +28,8 @@ class _ScriptedFate:
     matches: int = 0
     decided: int = 0
     arrivals: dict[int, list[float]] = field(default_factory=dict)
-    """Number of a datagram -> the mission seconds at which its copies arrive. The matching datagrams are numbered from
-    0. Only datagrams that have not been sent yet are included.
+    """The mission seconds at which the copies of a datagram arrive, by the number of the datagram. The matching
+    datagrams are numbered from 0. Only datagrams that have not been sent yet are included.
     """
     holds: bool = False
     """True while the fate holds messages and the end of the hold is unknown."""
@@ -198,7 +198,7 @@ class LateTimers:
 
     def __init__(self, text: str = "") -> None:
         self.running: dict[str, RunningTimer] = {}
-        """Name of a timer -> the timer."""
+        """The running timers of the agent, by name."""
         self._late_by_s = dict(parse_pairs(text))
         self._started = 0
 

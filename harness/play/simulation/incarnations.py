@@ -33,18 +33,19 @@ class SimulatedIncarnation:
     agent: VirtualAgent
     source: RandomEvents
     clock: AgentClock | None
-    """The clock of the agent. None if the agent's clock shows mission time."""
+    """The clock of the agent, or None if the agent's clock shows mission time."""
     started_at: float
     state: AgentState | None = None
-    """The protocol state of the agent. None for a foreign agent, whose state the harness cannot read."""
+    """The protocol state of the agent, or None if the agent is a separate program, whose state the harness cannot read.
+    """
     secured: KeyedAgent | None = None
-    """The same agent, with its interface for keys. None if the agent has no keys."""
+    """The same agent, with its interface for keys, or None if the agent has no keys."""
     rebooted: bool = False
     """True if the agent started with the data on its disk, after a power failure."""
     deadline: float | None = None
     """Mission second at which the agent's next timer expires."""
     waiting: list[ScheduledInput] | None = None
-    """Inputs that have arrived during a pause. None if the agent is not paused."""
+    """Inputs that have arrived during a pause, or None if the agent is not paused."""
     resumed_at: float = 0.0
     """Mission second at which the last pause ended. Answers that arrived during the pause are handled at this time."""
     bytes_sent: int = 0

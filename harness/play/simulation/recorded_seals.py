@@ -16,7 +16,7 @@ class RecordedSeals:
     """
 
     sealed: Mapping[bytes, bytes]
-    """Encoded last event of a block -> encrypted event data of the block."""
+    """The encrypted event data of each block, by the last event of the block, encoded as bytes."""
 
     def __call__(self, event_data: bytes, timestamp_us: int) -> bytes:
         try:

@@ -47,7 +47,7 @@ class DiskRecorder:
         """Create the recorder. `trace_quota` is the maximum size of each trace in bytes."""
         self._rundir = rundir
         self._left = defaultdict[int, int](lambda: trace_quota)
-        """Agent -> number of bytes by which its trace may still grow."""
+        """The number of bytes by which the trace of each agent may still grow."""
         self._written_bytes = 0
         """Total size of all traces when parts of them were last packed, in bytes."""
         self._traces: dict[int, TraceFile] = {}
@@ -55,7 +55,7 @@ class DiskRecorder:
 
     @property
     def traces(self) -> dict[int, Trace] | None:
-        """The traces by agent. None if a trace file lacks a part of the trace."""
+        """The traces by agent, or None if a trace file lacks a part of the trace."""
         return None if self.problems() else dict(sorted(self._collected.by_agent.items()))
 
     def begin(self, incarnation: SimulatedIncarnation) -> None:

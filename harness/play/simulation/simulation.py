@@ -98,11 +98,11 @@ class Simulation(EventLoop):
         self._breathe = on_progress
         self._pace = pace
         self._disks: dict[int, DiskContents] = {}
-        """Agent number -> content of the agent's disk, for agents that are switched off and will reboot with this disk.
+        """The content of the disk of each agent that is switched off and will reboot with this disk, by agent number.
         """
         self._switched_off: dict[int, SimulatedIncarnation] = {}
         self._failures: dict[int, AgentFailedError | AgentLacksError] = {}
-        """Number of an agent -> its last failure."""
+        """The last failure of each agent, by agent number."""
         self.failures: list[AgentFailedError] = []
         """The failures of agents that crashed or hung, in the order of time."""
         self._failed_incarnations: list[list[AgentFailure]] = [[] for _ in self.roster]

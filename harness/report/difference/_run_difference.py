@@ -56,7 +56,7 @@ def name(block_hash: str, names: Mapping[str, str]) -> str:
 
 
 def completed_blocks(lines: Iterable[HandlerRunLine], agent_id: int) -> dict[str, str]:
-    """Return block hash -> name, such as 3.2, for the blocks that the agent completed."""
+    """Return the names of the blocks that the agent completed, such as 3.2, by block hash."""
     names: dict[str, str] = {}
     for line in lines:
         if b'"complete"' in line.text:
@@ -135,7 +135,8 @@ class RunDifference:
     keys: list[KeyDifference]
     """The keys of the scenario with different values. The seed of the run counts as the key `seed`."""
     programs: dict[Literal["a", "b"], list[AgentProgram]]
-    """The programs of the agents in each run. Empty if all agents ran the harness's own program."""
+    """The programs of the agents in each run. The list of a run is empty if all agents ran the harness's own program.
+    """
     agents: dict[int, AgentDifference]
     """An entry for every agent of the mission. In the entry of an agent without a difference, both fields are None."""
     handler_runs: int
@@ -149,8 +150,8 @@ class RunDifference:
 
     @property
     def first(self) -> int | None:
-        """The agent whose first difference has the earliest mission time. If this is true for several agents, return
-        the lowest ID. None if there are no differences.
+        """The agent whose first difference has the earliest mission time. If this is true for several agents, the value
+        is the lowest ID. It is None if there are no differences.
         """
         at_s = {
             agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None

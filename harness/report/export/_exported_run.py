@@ -94,7 +94,7 @@ class ExportedRun:
 
     @cached_property
     def block_names(self) -> dict[str, str]:
-        """Block hash -> name of the block, such as "4.11"."""
+        """The names of the blocks, such as "4.11", by block hash."""
         return name_blocks(self.archive.exports.by_agent)
 
     def block(self, block_hash: str) -> str:

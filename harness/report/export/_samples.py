@@ -41,7 +41,7 @@ class FieldPosition:
     metres: Metres
     """Metres east, north and up from the centre of the field."""
     place: EarthPosition | None
-    """The position on Earth. None if the location of the field is unknown."""
+    """The position on Earth, or None if the location of the field is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +168,9 @@ class MissionTime:
     """The time of mission second 0, in nanoseconds since the Unix epoch."""
     speedup: float
     by_agent: Mapping[int, int]
-    """Agent ID -> the time of mission second 0, for agents with other clocks."""
+    """The time of mission second 0 on the clock of an agent, by agent ID. Only agents whose clock differs from the
+    clock of the mission are included.
+    """
 
     def at(self, mission_s: float, agent: int | None = None) -> int:
         """Convert a mission second to nanoseconds since the Unix epoch. If `agent` is given, use the clock of this

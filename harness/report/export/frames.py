@@ -17,7 +17,9 @@ BATCH = 20_000
 
 Record = TypeVar("Record")
 Columns = Mapping[str, tuple[Any, Callable[[Record], Any]]]
-"""Name of a column -> the type of the column, and a function that returns the value of the column for a record."""
+"""The definition of each column, by name. The definition consists of the type of the column, and a function that
+computes the value of the column from a record.
+"""
 
 _NAME = pl.Categorical
 """Column type for text with few distinct values."""

@@ -39,7 +39,7 @@ Timed = tuple[int, str, Any]
 METADATA_VERSION: Literal[8] = 8
 """Version of the bag format. ROS 2 Humble and later versions read it."""
 LEVELS = {"info": 20, "warning": 30, "error": 40}
-"""Name of a level -> the number of the level in rcl_interfaces/Log, for INFO, WARN and ERROR."""
+"""The number of each log level in rcl_interfaces/Log, by the name of the level: INFO, WARN or ERROR."""
 _LARGEST = 2**32 - 1
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _NS = 1_000_000_000

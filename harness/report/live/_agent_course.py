@@ -72,7 +72,7 @@ class AgentActions:
         self.at_s = 0.0
         """Mission second of the last entry that was read."""
         self.problem: str | None = None
-        """The reason why the rest of the trace cannot be read. None if there is no problem."""
+        """The reason why the rest of the trace cannot be read, or None if there is no problem."""
         self.has_messages_without_effect = False
         """True if the trace records any message that had no effect on its receiver. By default, traces of virtual time
         omit such messages.
@@ -116,8 +116,8 @@ class AgentActions:
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the next entry, which was already read but not processed. None if there is no such
-        entry.
+        """The mission second of the next entry, which was already read but is not processed yet. The value is None if
+        there is no such entry.
         """
         return None if self._ahead is None else self._ahead.t
 

@@ -104,8 +104,8 @@ class NetworkAndVehicles:
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the next entry, which was already read but not processed. None if there is no such
-        entry.
+        """The mission second of the next entry, which was already read but is not processed yet. The value is None if
+        there is no such entry.
         """
         ahead = (self._conditions.ahead, self._tracks.ahead)
         return min((line.at_s for line in ahead if line is not None), default=None)

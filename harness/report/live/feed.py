@@ -132,7 +132,7 @@ class ChangeFeed:
         self._surroundings = NetworkAndVehicles(directory, self._roster)
         self._broadcasts: dict[tuple[int, int], _Broadcast] = {}
         self._reported: dict[tuple[int, int], _Broadcast] = {}
-        """(sender, sequence number) -> the message, for the last messages that the page got."""
+        """The last messages that the page got, by sender and sequence number."""
         self._polls = 0
         self._leaves_out_messages = False
         self._messages_from_s = -1.0
@@ -235,8 +235,8 @@ class ChangeFeed:
 
     @property
     def next_s(self) -> float | None:
-        """The mission second of the next entry, which was already read but not processed. None if there is no such
-        entry.
+        """The mission second of the next entry, which was already read but is not processed yet. The value is None if
+        there is no such entry.
         """
         ahead = (self._surroundings.next_s, *(course.next_s for course in self._courses))
         return min((at_s for at_s in ahead if at_s is not None), default=None)

@@ -66,7 +66,7 @@ class LivePage:
         self._writer, self._reader = _thread(self._write_lines), _thread(self._read_requests)
         self._state_sender = _thread(self._send_state)
         self.problem: str | None = None
-        """A sentence that reports that the server ended before the end of the run. None if there was no problem."""
+        """A sentence that reports that the server ended before the end of the run, or None if there was no problem."""
 
     def tee(self, progress: ProgressDisplay) -> ProgressDisplay:
         """Return a progress display that forwards all progress to `progress` and also updates the page."""

@@ -20,19 +20,19 @@ class Logbook:
     """The chain exports of a swarm, with the facts that are needed to print them."""
 
     exports: dict[int, Export]
-    """Agent ID -> the chain export of the agent."""
+    """The chain export of each agent, by agent ID."""
     names: dict[str, str]
-    """Block hash -> name of the block."""
+    """The name of each block, by block hash."""
     telemetry: bool = True
     """True if the events come from the source `mavlink`. If the exports do not belong to a run, this is assumed."""
     absent: dict[int, str] = field(default_factory=dict)
-    """Agent ID -> a sentence, for each agent of the mission without an export."""
+    """A sentence about each agent of the mission that has no export, by agent ID."""
     errors: list[str] = field(default_factory=list)
     """A sentence for each unusable file."""
     event_data: EventData = field(default_factory=EventData)
     """The reader of the events in blocks."""
     epoch_us: int | None = None
-    """The timestamp of mission second 0 in microseconds. None if it is unknown."""
+    """The timestamp of mission second 0 in microseconds, or None if it is unknown."""
 
     def name(self, block_hash: str) -> str:
         return self.names.get(block_hash, block_hash[:12])

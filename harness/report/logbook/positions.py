@@ -42,7 +42,7 @@ class LogEntry:
     is_position: bool
     position: GlobalPosition | None
     """The position in the event. If the event contains no position, this is the last position of the vehicle before the
-    event. None if no earlier position is known.
+    event. The value is None if no earlier position is known.
     """
     position_age_s: float | None
     """The age of the position at the time of the event, in seconds."""

@@ -36,9 +36,9 @@ class AgentReaction:
     """Index of the action's first handler run in the agent's trace."""
     runs: list[HandlerRun]
     cause: "AgentReaction | None" = None
-    """The action of another agent that sent the triggering message. None if no message triggered this action."""
+    """The action of another agent that sent the triggering message, or None if no message triggered this action."""
     receivers: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
-    """Sequence number of a sent message -> the receivers of the message."""
+    """The receivers of each message that the action sent, by the sequence number of the message."""
     at_s: float = 0.0
     """Mission second of the first cause of this action. If timers expired late, this is the time at which the cause
     would have happened without their delay.
@@ -200,7 +200,7 @@ def _actions_with_causes(traces: Mapping[int, Trace]) -> list[AgentReaction]:
             for message in run.sent:
                 sent[action.agent_id, message.seq].append(action)
     due: dict[tuple[int, object], float] = {}
-    """A pair (agent ID, timer) -> the mission second at which the timer should expire."""
+    """The mission second at which each timer should expire, by agent ID and timer."""
     for action in sorted(actions, key=lambda action: (action.runs[0].t, action.agent_id, action.position)):
         run = action.runs[0]
         timer = run.trigger.timer if isinstance(run.trigger, TimerTrigger) else None

@@ -112,7 +112,7 @@ def _group_of(block: RecordedBlock) -> str:
 
 
 def _places(block: RecordedBlock) -> dict[int, str]:
-    """Return agent ID -> the place at which the agent holds the block: chain, deque or others. If an agent holds the
+    """Return the place at which each agent holds the block (chain, deque or others), by agent ID. If an agent holds the
     block at two places, return the first place.
     """
     places: dict[int, str] = {}

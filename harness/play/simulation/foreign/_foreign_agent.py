@@ -127,9 +127,9 @@ class ForeignAgent:
         self._sent: list[tuple[bytes, RecordedBytes]] = []
         self._trace: list[Entry] = []
         self._completed: list[bytes] | None = [] if tracing else None
-        """Hashes of the completed blocks, which the trace shows. None without a trace."""
+        """Hashes of the completed blocks according to the trace, or None if no trace is written."""
         self._status: AgentStatus | None = None
-        """The current status of the agent. None if the status is unknown, because an input may have changed it."""
+        """The current status of the agent, or None if the status is unknown, because an input may have changed it."""
         self._export: dict[str, Any] | None = None
         """The export at the end of the incarnation."""
         first = {
