@@ -1,13 +1,14 @@
-"""Compare the speed with that of another revision and of a bare model: `python -m benchmarks.against HEAD~20`.
+"""Compare the speed of this revision with another revision and with a bare model: `python -m benchmarks.against
+HEAD~20`.
 
-The argument is a revision, which is checked out in a temporary directory, or the directory of another clone. Each side
-plays in a process of its own. In each round, the two sides and the bare model (`benchmarks.bare_model`) play the same
-seed alternately. A ratio below 1 means that this revision needs less processor time than the other one or the model.
-A clone with compiled modules uses them, and a revision that is checked out does not have any. Thus `HEAD` measures the
-effect of the compilation.
+The argument is the directory of another clone, or a revision, which the benchmark checks out in a temporary directory.
+Each of the two sides plays in its own process. In each round, the two sides and the bare model
+(`benchmarks.bare_model`) play the same seed alternately. A ratio below 1 means that this revision needs less processor
+time than the other one or the model. If this clone has compiled modules, it uses them. A revision that the benchmark
+checks out has no compiled modules. Thus the argument `HEAD` measures the effect of the compilation.
 
 The scenario has 20 minutes at 15 % loss with a final reconcile. Each revision judges its own runs. `--large` also plays
-50 agents, and a larger proof, which takes minutes.
+50 agents and a larger proof. Both together take minutes.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ LARGE = {
     "50 agents, traced and judged": ("traced 50", "bare 50"),
     "a state of prove, 3/3 lossy": ("prove 3/3", None),
 }
-"""Row -> the runs of both revisions, and the runs of the bare model."""
+"""Rows of the table. Each has the kind of runs that both revisions play, and the kind of runs of the bare model."""
 
 
 class Player:
@@ -58,7 +59,7 @@ class Player:
         )
 
     def seconds(self, what: str, seed: int) -> float:
-        """Return the processor time of each run in seconds."""
+        """Play runs of the kind `what` with this seed, and return the processor seconds per run."""
         assert self._process.stdin and self._process.stdout, "they are pipes"
         self._process.stdin.write(f"{what}/{seed}\n")
         self._process.stdin.flush()
@@ -73,8 +74,9 @@ class Player:
 
 @contextmanager
 def checked_out(revision: str) -> Iterator[Path]:
-    """Check out this revision into a temporary directory, which exists until the block ends. The directory of another
-    clone stays as it is.
+    """Check out this revision into a temporary directory, which exists until the block ends.
+
+    If the argument is the directory of another clone, return this directory unchanged.
     """
     if (Path(revision) / "harness").is_dir():
         yield Path(revision).resolve()

@@ -1,14 +1,15 @@
-"""A bare model of the protocol in one file: the unit of the speed measurements.
+"""Simulate the protocol with a minimal model in one file. The speed measurements use the model as their unit.
 
-`python -m benchmarks.bare_model --agents 5 --loss 0.15 --seeds 20` prints how its missions end, as a check.
+`python -m benchmarks.bare_model --agents 5 --loss 0.15 --seeds 20` prints the results of missions of the model, as a
+check of the model.
 
 The model plays a mission of 20 minutes with Algorithms 1 to 21, in the reading of the thesis that the agents use by
-default. Each message goes through one queue to each receiver that does not lose it, and each receiver handles it. A
-programmer would write such a model to study the protocol alone. It has no datagrams, no records, no checks and no
-faults, and all agents are correct. Hashes are those of Python tuples, not SHA-256.
+default. All messages go through one queue. It has an entry for each receiver that does not lose the message. A
+programmer would write such a model to study the protocol alone. The model has no datagrams, no records, no checks and
+no faults, and all agents are correct. Hashes are those of Python tuples, not SHA-256.
 
-A mission of the model and a simulated run with the same seed are different draws from the same distribution. Therefore
-a comparison needs several seeds.
+A mission of the model and a simulated run use their random numbers differently. With the same seed, they are different
+samples of the same distribution. Therefore a comparison needs several seeds.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ VOTE_S = 10.0
 PHASE_S = 5.0
 GAP_S = 0.1
 LATENCY_S = (0.002, 0.05)
-"""Least and greatest delay of a message."""
+"""Minimum and maximum delay of a message in seconds."""
 EVENT_MEAN_S = 30.0
 EVENT_BYTES = (32, 64, 128, 256)
 EVENT_HEADER_BYTES = 11
 FULL_BYTES = 1024 - 256 - EVENT_HEADER_BYTES
 INCEPTION = 0
 TOP = (0, 0)
-"""The answer "Is Top Of Chain". It sorts before every block."""
+"""The answer "Is Top Of Chain". In sorted order, it comes before every block."""
 
 Block = tuple[int, int]
-"""(agent, number of the block)."""
+"""A block as a pair: the ID of its agent, and its number among the blocks of this agent."""
 
 
 class Tally:
-    """The votes for and against, and the agents that have voted."""
+    """The votes for and against a block, and the agents that have voted."""
 
     def __init__(self, yes: int = 0) -> None:
         self.yes = yes
@@ -67,7 +68,7 @@ class Due(NamedTuple):
 
 
 class Network:
-    """The queue of all inputs, in order of time."""
+    """The simulated network, with a queue of all inputs in order of time."""
 
     def __init__(self, agents: int, loss: float, seed: int) -> None:
         self.now = 0.0
@@ -92,7 +93,7 @@ class Network:
                 self.after(least + (greatest - least) * draw(), getattr(agent, handler), sender.number, *arguments)
 
     def run(self, until_s: float) -> None:
-        """Handle all inputs up to this time. Stop earlier when no input is left."""
+        """Handle all inputs up to the time `until_s`. Stop earlier when no input is left."""
         queue = self._queue
         while queue and queue[0].at <= until_s:
             due = heappop(queue)
@@ -111,20 +112,23 @@ class BareAgent:
         self._deque: deque[Block] = deque()
         self.chain: list[Block] = []
         self._hashes = [INCEPTION]
-        """The chain hash of each block, from the inception block on."""
+        """The chain hash after each block, from the inception block on."""
         self._heights = {INCEPTION: 0}
         self._held: set[Block] = set()
-        """The blocks of the chain."""
+        """The same blocks as in the chain, as a set."""
         self._stack: list[Block] = []
         self.reconciling = False
         self._timers: dict[str, int] = {}
-        """Running timer -> number of its start. A later start or a stop makes an expiry in the queue obsolete."""
+        """For each running timer, the number of its last start.
+
+        If the timer is started again or stopped, its expiry in the queue no longer has this number and is ignored.
+        """
         self._starts = 0
         self._votes = Tally()
         self._voted_chain = INCEPTION
         self._answers = Tally()
         self._successors: dict[Block, list[int]] = {}
-        """Successor -> number of agents that named it, and its timestamp."""
+        """For each successor, the number of agents that named it, and its timestamp."""
         self._responders: set[int] = set()
         self._wanted: Block | None = None
         network.after(network.random.random(), self._maybe_log)
@@ -309,7 +313,8 @@ class BareAgent:
 def play(agents: int, loss: float, seed: int, settle_s: float = 1200.0, *, final_reconcile: bool = True) -> Network:
     """Play a mission until all agents are idle, for at most `settle_s` seconds after minute 20. Return its network.
 
-    With `final_reconcile`, the loss then ends, and each agent in turn reconciles, until a round changes no chain.
+    With `final_reconcile`, the network then loses nothing, and each agent in turn reconciles. This repeats until a
+    round of all agents changes no chain.
     """
     network = Network(agents, loss, seed)
     network.run(MISSION_S + settle_s)

@@ -2,9 +2,10 @@
 
     python -m benchmarks.calibrating [--flights N] [--first NUMBER] [--channel PRESET]
 
-Each flight is a run in virtual time with captures. The number of a flight determines its scenario: the vehicles' plans,
-the exponent, the shadowing, the power and a loss at any distance. `calibrate` gets the directory of the run. The true
-values of `range_m`, `spread` and `floor` are those of `harness.field.calibrate._delivery_model`.
+Each flight is a run in virtual time with captures. The number of a flight determines its scenario. The scenario has the
+vehicles' plans, and these parameters of the radio: the path loss exponent, the shadowing, the power, and a loss that
+does not depend on the distance. `calibrate` gets the directory of the run. The true values of `range_m`, `spread` and
+`floor` are those of `harness.field.calibrate._delivery_model`.
 
 With `--channel`, all vehicles share a radio channel with this preset. The shadowing of each link is then correlated in
 space and time, and frames collide.
@@ -33,7 +34,9 @@ from netem.radio import LogDistance
 def scenario_of(
     number: int, channel: str | None = None, agents: int = 5, duration_s: float = 1200.0
 ) -> tuple[dict[str, Any], DeliveryModel]:
-    """Return the scenario of a flight and its true parameters. `channel` is the preset of a shared channel."""
+    """Return the scenario of a flight and its true parameters. `channel` is the name of a preset of a shared
+    channel.
+    """
     rng = Random(f"calibrating/{number}")
     log_distance = {
         "exponent": round(rng.uniform(2.0, 3.0), 2),
@@ -73,8 +76,8 @@ def calibrated(number: int, directory: Path, **options: Any) -> tuple[Calibratio
 
 
 def covered(calibration: CalibrationResult, truth: DeliveryModel) -> dict[str, bool]:
-    """Return, for each true parameter, true if its confidence interval contains it. The result is empty without a
-    fit.
+    """Return, for each true parameter, whether its confidence interval contains it. The result is empty if `calibrate`
+    found no fit.
     """
     if calibration.fit is None:
         return {}

@@ -1,10 +1,11 @@
 """Measure the rate and the cost of packet captures: `python -m benchmarks.capture [--vehicles N] [--bytes B] [--rounds
 R]`.
 
-In a lab without conditions one vehicle broadcasts at each rate, in a new lab for each rate. N vehicles capture N frames
-of each packet: one at its sender, and one at each other vehicle. `dropped` is the share of frames missing in the files,
-counted by the kernel. `processor_us` is the processor time of the capture for each frame, including the writing of the
-files. The last row has no limit of the rate.
+The benchmark opens a lab without network conditions for each rate. In each lab, one vehicle broadcasts packets at this
+rate. With N vehicles, the captures contain N frames of each packet: one at the sender, and one at each other vehicle.
+`dropped` is the share of frames that are missing in the files. The kernel counts them. `processor_us` is the processor
+time of the capture for each frame, including the writing of the files. The last row is measured without a limit of the
+rate.
 """
 
 from __future__ import annotations
@@ -36,8 +37,9 @@ _Row = dict[str, Any]
 
 
 async def once(vehicles: int, rate: int, packets: int, size: int, folder: Path) -> dict[str, float]:
-    """Broadcast packets with `size` bytes of data at `rate` packets per second, and return figures. 0 means no
-    limit.
+    """Broadcast packets with `size` bytes of data at `rate` packets per second, and return the measured figures.
+
+    A rate of 0 means no limit.
     """
     captures = folder / f"{rate}-{time.monotonic_ns()}"
     captures.mkdir()
@@ -58,12 +60,12 @@ async def once(vehicles: int, rate: int, packets: int, size: int, folder: Path) 
 
 
 def _pause_s(rate: int) -> float:
-    """Return the pause between two groups of packets in seconds. A packet itself takes about 20 microseconds."""
+    """Return the pause between two groups of packets in seconds. Sending a packet takes about 20 microseconds."""
     return max(0.0, _BURST / rate - _BURST * 20e-6) if rate else 0.0
 
 
 async def _broadcast(lab: Lab, packets: int, size: int, pause_s: float, folder: Path) -> float:
-    """Return the duration of the broadcasts in seconds."""
+    """Broadcast the packets from vehicle 1, and return the duration in seconds."""
     numbers = (_PORT, packets, 0, lab.broadcast, size, pause_s)
     argv = [sys.executable, "-I", "-S", _probe.__file__, "broadcast", *map(str, numbers)]
     output = folder / "broadcast.log"

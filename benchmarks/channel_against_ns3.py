@@ -85,7 +85,7 @@ LIBRARIES = ("core", "network", "mobility", "propagation", "wifi")
 QUEUE = 10
 QUESTION_BYTES, ANSWER_BYTES, BEACON_BYTES = 78, 47, 100
 HEADER_BYTES = 64
-"""IPv4 and UDP 28, LLC 8, MAC header 24, frame check sequence 4."""
+"""Bytes of all headers: 28 for IPv4 and UDP, 8 for LLC, 24 for the MAC header, and 4 for the frame check sequence."""
 
 RADIO = LogDistance()
 ENERGY_DBM = -62.0
@@ -113,15 +113,18 @@ JITTERS_MS = (0.5, 5.0, 48.0)
 METRES = (50.0, 150.0, 250.0, 350.0, 500.0)
 MESSAGES = {2: 12_000, 3: 12_000, 5: 8_000, 20: 4_000, 50: 2_500}
 BATCHES = 20
-"""Parts of a cell whose spread gives the standard error."""
+"""Number of parts of a cell. Their differences give the standard error."""
 TOLERANCE = 3.0
-"""Points of delivery by which the model may differ from ns-3."""
+"""Maximum difference between the delivery of the model and that of ns-3, in percentage points."""
 VOTES = {2: 3_000, 5: 1_500, 20: 400, 50: 120}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One setting of stations and traffic. `load` counts for beacons and hidden stations, `jitter_ms` for votes."""
+    """One setting of stations and traffic.
+
+    Beacons and hidden stations use `load`. Votes use `jitter_ms`.
+    """
 
     family: Family
     standard: Standard
@@ -143,20 +146,20 @@ class Cell:
 
     @property
     def warm_up(self) -> int:
-        """Return the number of first messages that do not count, because the queues are still filling."""
+        """Return the number of messages at the beginning that do not count, because the queues are not yet full."""
         return (40 if self.load > 0.6 else 5) * self.n
 
     @property
     def after(self) -> int:
-        """Return the number of messages that are sent after the counted ones, so that the load stays the same until the
-        end.
+        """Return the number of messages after the counted ones. They keep the load the same until the last counted
+        message.
         """
         return (12 if self.load > 0.6 else 3) * self.n
 
 
 @dataclass(frozen=True)
 class Delivery:
-    """Shares from 0 to 1 with their standard errors. Only votes have `asked` and `majority`."""
+    """Shares from 0 to 1 with their standard errors. `asked` and `majority` are known only for votes."""
 
     delivered: float
     error: float
@@ -193,9 +196,10 @@ def cells() -> Iterator[Cell]:
 
 
 def places(cell: Cell) -> list[Place]:
-    """Return the places of the stations. Those on a line are up to 4 m away from equal distances.
+    """Return the positions of the stations in metres.
 
-    With equal distances, many frames of hidden stations would arrive at the same nanosecond.
+    The positions on a line differ by up to 4 m from equal distances. With equal distances, many frames of hidden
+    stations would arrive at the same nanosecond.
     """
     if cell.family == "hidden":
         return [Place(0.0, cell.metres * station + 4 * (0.618 * station**2 % 1), 0.0) for station in range(cell.n)]
@@ -239,7 +243,7 @@ def in_ns3(program: Path, cell: Cell) -> Delivery | None:
 
 
 def measure(jobs: int) -> None:
-    """Play all settings that the table lacks, and write the table after each of them."""
+    """Play the cells that the table lacks in ns-3. Write the table after each cell."""
     found = read_table() if TABLE.exists() else {}
     missing = [cell for cell in cells() if cell not in found]
     with tempfile.TemporaryDirectory() as directory, ThreadPoolExecutor(jobs) as pool:
@@ -349,7 +353,7 @@ def votes(cell: Cell, channel: Channel) -> Delivery:
 
 
 def mean(samples: Sequence[float]) -> tuple[float, float]:
-    """Return the mean and its standard error."""
+    """Return the mean of the values and its standard error."""
     return fmean(samples), stdev(samples) / math.sqrt(len(samples))
 
 
@@ -357,7 +361,7 @@ def mean(samples: Sequence[float]) -> tuple[float, float]:
 
 
 def compare(jobs: int) -> Rows:
-    """Play the settings of the table in the model. A row contains the figures in percent and their difference."""
+    """Play the cells of the table in the model. Return rows with both figures in percent and their difference."""
     table = read_table()
     with ProcessPoolExecutor(jobs) as pool:
         played = dict(zip(table, pool.map(in_model, table, chunksize=8), strict=True))
@@ -377,7 +381,7 @@ def compare(jobs: int) -> Rows:
 
 
 def summary(rows: Rows) -> Rows:
-    """Return the number of settings, and the lowest and highest difference, for each group."""
+    """Return, for each group of cells, their number and the lowest and highest difference."""
     groups: dict[tuple[str, str, int], list[float]] = {}
     for row in rows:
         groups.setdefault((row["family"], row["standard"], row["n"]), []).append(row["difference"])

@@ -5,7 +5,7 @@
 The number of a run determines its scenario: 2 to 12 agents, loss, bursts, delays, duplicates, partitions, kills and
 restarts, reboots, pauses, clocks that drift, keys, a shared channel, and readings of the thesis. Each run is written to
 a directory, and the checker judges the files of this directory. The benchmark prints each finding with the number of
-its run. With findings, the exit status is 1.
+its run. The exit status is 1 if a check reports a finding.
 """
 
 import argparse
@@ -81,7 +81,11 @@ def _death(draw: Random, agents: int, duration_s: float) -> list[dict[str, Any]]
 
 
 def varied(number: int) -> Scenario:
-    """Return the scenario of a run: in half of the runs that of `scenario`, otherwise with other conditions too."""
+    """Return the scenario of a run.
+
+    In half of the runs it is the scenario that `scenario` returns. In the other runs it has other conditions, such as
+    delays, links, keys or a shared channel.
+    """
     drawn = scenario(number).model_dump(mode="json", exclude_defaults=True, by_alias=True)
     draw = Random(f"varied {number}")
     kind = draw.choice(["", "", "", "", "delay", "links", "security", "channel"])
@@ -108,7 +112,7 @@ def varied(number: int) -> Scenario:
 
 
 def of_processes(number: int) -> Scenario:
-    """Return the scenario of a run whose agents run as processes: 2 to 6 agents, 300 mission seconds."""
+    """Return the scenario of a run whose agents are processes. It has 2 to 6 agents and takes 300 mission seconds."""
     draw = Random(f"processes {number}")
     agents, lost = draw.randint(2, 6), draw.choice([0.0, 0.15, 0.3])
     document: dict[str, Any] = {
@@ -129,7 +133,7 @@ def of_processes(number: int) -> Scenario:
 
 
 def judge(backend: BackendName, number: int) -> tuple[list[str], dict[str, str]]:
-    """Return a sentence for each bad verdict, and all verdicts."""
+    """Play and judge a run. Return a sentence for each bad verdict, and all verdicts."""
     with tempfile.TemporaryDirectory(prefix="clean-run-") as directory:
         asked = varied(number) if backend == "sim" else of_processes(number)
         result = run(asked, number, Path(directory, "run"), backend=backend).result
@@ -140,7 +144,7 @@ def judge(backend: BackendName, number: int) -> tuple[list[str], dict[str, str]]
 
 
 def _first(judgement: Judgement) -> str:
-    """Return the first piece of evidence of a verdict, if it has evidence."""
+    """Return the first piece of evidence of a judgement, or an empty text if it has no evidence."""
     return f"; {judgement.evidence[0].detail}" if judgement.evidence else ""
 
 

@@ -2,9 +2,9 @@
 
     python -m benchmarks.conditions [--packets N] [--rounds R] [--json]
 
-Each round asks all questions of `netem.measure` to each engine of this machine and to the medium, in turn. A row has
-the mean, minimum and maximum of the measured values. `inside` counts the rounds in which the first 99.9 % interval
-contained the requested value: 999 of 1000, if the engine is correct.
+Each round makes all measurements of `netem.measure` with each engine of this machine, and with the simulated medium. A
+row has the mean, minimum and maximum of the measured values. `inside` counts the rounds in which the first confidence
+interval (99.9 %) contained the requested value. With a correct engine, it does so in 999 of 1000 rounds.
 """
 
 from __future__ import annotations

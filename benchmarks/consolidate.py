@@ -29,7 +29,7 @@ SHAPES = {
 
 
 def block(agent_id: int, number: int, lots: random.Random) -> Block:
-    """Return a block with 13 positions, which fill 975 of 1,024 bytes."""
+    """Return a block with 13 position events, which fill 975 of 1,024 bytes."""
     at_us = EPOCH_US + 10_000_000 * number
     data = b""
     for event in range(EVENTS_IN_A_BLOCK):

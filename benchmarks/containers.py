@@ -1,9 +1,9 @@
 """Measure the start and stop of agents: `python -m benchmarks.containers [--rounds R] [--json] [N ...]`.
 
 Each round starts the agents in containers, and then as processes. Containers need root and a Docker engine. They use
-the files of this machine, so no image is built. Up is the time from the beginning until the last agent answers,
-including the network. Down is the time from the first SIGTERM until the last container or the lab is gone. Ratios are
-of one round.
+the files of this machine, so no image is built. Up is the time from the beginning until the last agent answers. It
+includes the start of the network. Down is the time from the first SIGTERM until the last container or the lab is gone.
+Each ratio compares containers and processes in the same round.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""Edit the core in place by mistake, and count the commands that find each mistake and name its handler.
+"""Edit the agent core as if by mistake, and count the commands that find each mistake and name its handler.
 
     python -m benchmarks.core_edits [EDIT ...]
 
-`core_edits.yaml` has the edits. An edit is made in a copy of the clone. Each command then plays the same mission: five
-agents lose 30 % of the messages, 10 % arrive twice, and an operator orders reconciles. The benchmark prints a row for
-each edit: `named` if the command failed and printed the handler, `red` if it only failed, and `green` otherwise.
-With a `green`, the exit status is 1. EDIT is the number of an edit, from 1.
+`core_edits.yaml` has the edits. The benchmark makes each edit in a copy of the clone. Each command then plays the same
+mission. Its five agents lose 30 % of the messages and receive 10 % twice, and an operator orders reconciles. The
+benchmark prints a row for each edit: `named` if the command failed and printed the handler, `red` if it only failed,
+and `green` otherwise. The exit status is 1 if a row contains `green`. EDIT is the number of an edit, from 1.
 """
 
 import os
@@ -60,7 +60,7 @@ LIMIT_S = 600.0
 
 
 class Edit(NamedTuple):
-    """An edit of a file of `ucp`, and the handler that it breaks. `handler` is empty if it breaks no handler."""
+    """An edit of a file of `ucp`, and the handler that the edit breaks. `handler` is empty if no handler is broken."""
 
     about: str
     handler: str
@@ -69,7 +69,9 @@ class Edit(NamedTuple):
     new: str
 
     def make(self, clone: Path) -> None:
-        """Write a clone of the project with this edit. Raises ValueError if the core no longer has the text."""
+        """Write a clone of the project with this edit. Raises ValueError if the file no longer contains the text to
+        replace.
+        """
         for folder in FOLDERS:
             shutil.copytree(ROOT / folder, clone / folder)
         shutil.copy2(ROOT / "pyproject.toml", clone)

@@ -1,9 +1,9 @@
 """Compare the number of agent states that a search and random seeds reach: `python -m benchmarks.explore`.
 
-Each round gives both methods the same processor time on one core. The order changes from round to round, and each round
-has its own seeds. The same code plays, follows and judges the runs of both. `small` has three agents that complete
-about three blocks. For it, `prove` knows all local states that exist if messages may be lost. `five` is a mission of
-five agents with about eight blocks.
+Each round gives both methods the same processor time on one core. The order of the methods changes from round to round,
+and each round has its own seeds. The same code plays and judges the runs of both methods. The mission `small` has three
+agents that complete about three blocks. `prove` knows all agent states that this mission can reach if messages may be
+lost. The mission `five` has five agents and about eight blocks.
 """
 
 import argparse
@@ -34,7 +34,9 @@ SEEDS_OF_ROUND = 1_000_000
 
 
 def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, ReachedStates]:
-    """Return the number of runs with random seeds, and the agent states that they reached."""
+    """Play runs with random seeds until the time is over. Return the number of runs, and the agent states that they
+    reached.
+    """
     reached, runs, ends_s = ReachedStates(), 0, time.process_time() + budget_s
     while time.process_time() < ends_s:
         reached.add(play_trial(scenario, first_seed + runs).reached)
@@ -43,8 +45,9 @@ def seeds_alone(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[i
 
 
 def hunted(scenario: Scenario, first_seed: int, budget_s: float) -> tuple[int, ReachedStates]:
-    """Return the number of runs of a search, and the agent states that they reached, including the start of the
-    search.
+    """Search until the time is over. Return the number of runs, and the agent states that they reached.
+
+    The runs at the start of the search count too.
     """
     ends_s = time.process_time() + budget_s
     limits, begun = initial_documents(scenario, range(first_seed, first_seed + 4))
@@ -88,7 +91,7 @@ def compare(scenario: Scenario, rounds: int, seconds: float) -> None:
 
 
 def of(reached: ReachedStates, there: ExistingStates | None) -> str:
-    """Return the number of agent states as text, with the number of those that exist within the bounds."""
+    """Return the number of reached agent states as text, with the number of states that exist within the bounds."""
     if there is None:
         return str(len(reached.states))
     return f"{len(reached.states)} ({len(reached.states & there.states)} of {len(there.states)})"

@@ -4,8 +4,8 @@
                                       [--only KIND]
 
 Each flight is damaged once in each way of `DAMAGES`. `reconstruct`, `replay`, `check` and `consolidate` then read the
-damaged files. The agents are right, so each accusation is false. The benchmark prints each accusation and each
-traceback with the number of its flight. With any of them, the exit status is 1.
+damaged files. The agents are correct, so each accusation is false. The benchmark prints each accusation and each
+traceback with the number of its flight. The exit status is 1 if there is an accusation or a traceback.
 """
 
 import argparse
@@ -155,7 +155,7 @@ def cut_block_out(home: Path, draw: Random) -> None:
 
 
 def fill_disk(home: Path, draw: Random) -> None:
-    """Remove a long part of a file, from the middle of one line to the beginning of another."""
+    """Remove a long part of a file, which begins within one line and ends within another line."""
     path = _a_trace(home, draw)
     lines = _lines(path)
     begin = draw.randrange(1, len(lines) // 2)
@@ -268,7 +268,7 @@ def interleave_traces(home: Path, draw: Random) -> None:
 
 
 def set_clock_back(home: Path, draw: Random) -> None:
-    """Decrease all times of a trace from one line on, as a clock does that GPS or NTP corrects."""
+    """Decrease all times of a trace from one line on, as if GPS or NTP had set the clock back."""
     path = _a_trace(home, draw)
     lines = _lines(path)
     start, by_s = draw.randrange(1, len(lines)), draw.uniform(0.5, 30.0)
@@ -287,7 +287,7 @@ def end_lines_as_windows(home: Path, draw: Random) -> None:
 
 
 def pack_half_a_line(home: Path, draw: Random) -> None:
-    """Pack a trace with gzip, in two parts, of which the second ends within a line."""
+    """Pack a trace with gzip in two parts. The second part begins within a line."""
     path = _a_trace(home, draw)
     lines = _lines(path)
     last = lines[-1][: len(lines[-1]) // 2]
@@ -298,7 +298,7 @@ def pack_half_a_line(home: Path, draw: Random) -> None:
 
 
 def cut_packed_trace(home: Path, draw: Random) -> None:
-    """Pack a trace with gzip, and cut the end of the file off."""
+    """Pack a trace with gzip, and cut off the end of the packed file."""
     path = _a_trace(home, draw)
     packed = gzip.compress(path.read_bytes())
     path.with_name(f"{path.name}.gz").write_bytes(packed[: int(len(packed) * draw.uniform(0.3, 0.99))])
@@ -342,7 +342,7 @@ DAMAGES: dict[str, Damage] = {
 
 
 def scenario(number: int, backend: BackendName, quirk: str | None = None) -> Scenario:
-    """Return the scenario of a flight: loss, faults, and either clocks that drift or captures."""
+    """Return the scenario of a flight. It has loss and faults, and either clocks that drift or packet captures."""
     draw = Random(f"field damage {number}")
     agents = draw.choice([3, 4, 5, 6])
     duration_s = 300.0
@@ -408,7 +408,7 @@ ACCUSATION = re.compile(
     r"expired too early(?!.*as if the clock had been set back)",
     re.IGNORECASE,
 )
-"""A text of `reconstruct` that blames an agent."""
+"""Matches an output of `reconstruct` that blames an agent."""
 
 
 @dataclass(frozen=True)
@@ -421,11 +421,7 @@ class Undamaged:
 
 @dataclass
 class Concluded:
-    """The conclusions of all commands from one set of files.
-
-    `accusations` has a sentence for each statement that an agent is wrong, and `reasons` for each chain that
-    `reconstruct` declares impossible.
-    """
+    """The conclusions of all commands from one set of files."""
 
     damage: str
     chains: int = 0

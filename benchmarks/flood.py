@@ -1,11 +1,12 @@
 """Flood an agent with forged datagrams: `python -m benchmarks.flood [--per-s 40000] [--seconds 5] [-- COMMAND ...]`.
 
-A secured agent runs as a process in a lab. A vehicle of its mission asks it 20 questions per second, and a process in
-the same place sends forged datagrams. For each class, a row has the number of forged datagrams per second that were
-sent and read, the share of the questions that the agent answered, and the processor time of the agent for one datagram
-that it read. The kernel discards datagrams that the agent does not read in time. The share therefore depends on the
-machine: the flood, the network and the agent need two free cores. On a busy machine, `--speedup 0.1 --per-s 4000` plays
-the same flood in slow motion: 40,000 datagrams arrive in a mission second.
+A secured agent runs as a process in a lab. Another vehicle of its mission sends it 20 queries per second, and a process
+on this other vehicle sends forged datagrams. The table has a row for each class of forged datagrams. A row has the
+number of forged datagrams that were sent per second, the number that the agent read per second, the share of the
+queries that the agent answered, and the processor time of the agent for one datagram that it read. The kernel discards
+datagrams that the agent does not read in time. The share of answered queries therefore depends on the machine: the
+flood, the network and the agent need two free cores. On a busy machine, `--speedup 0.1 --per-s 4000` plays the same
+flood in slow motion: 40,000 datagrams arrive in a mission second.
 """
 
 import argparse
@@ -49,7 +50,7 @@ CLASSES: dict[str, Forge] = {
 
 
 def forged(name: str, good: bytes) -> list[bytes]:
-    """Return datagrams of a class, made of an authentic one that the agent has received."""
+    """Return forged datagrams of a class. They are made from an authentic datagram that the agent has received."""
     rng = Random(1)
     return [CLASSES[name](good, rng) for _ in range(DISTINCT)]
 
@@ -69,7 +70,7 @@ def flood(send: Callable[[bytes], object], datagrams: Sequence[bytes], per_s: fl
 
 
 def process_of(agent: BenchAgent) -> Path:
-    """Return the directory in /proc of the agent's process, which has another number in the lab."""
+    """Return the directory of the agent's process in /proc. Inside the lab, the process has a different process ID."""
     mission = f"{agent.process.agent_id}.mission.json".encode()
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -80,7 +81,7 @@ def process_of(agent: BenchAgent) -> Path:
 
 
 def processor_s(process: Path) -> float:
-    """Return the processor time of a process so far."""
+    """Return the processor seconds that a process has used so far."""
     fields = (process / "stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -91,7 +92,7 @@ async def dropped(agent: BenchAgent) -> int:
 
 
 async def row(peers: SecuredPeers, name: str, per_s: float, seconds: float) -> str:
-    """Flood the agent with one class, and return the row."""
+    """Flood the agent with forged datagrams of one class, and return the row of the table."""
     socket = peers.agent.peer_socket
     good = await peers.require_single_answer("its start")
     datagrams = forged(name, good)
@@ -122,7 +123,7 @@ async def row(peers: SecuredPeers, name: str, per_s: float, seconds: float) -> s
 
 
 async def flood_all(command: Sequence[str], per_s: float, seconds: float, speedup: float) -> None:
-    """Print a row for each class."""
+    """Flood a new agent with each class, and print a row for each."""
     keys = KeySet.derived(os.urandom(32), ROSTER)
 
     def prepare(directory: Path) -> None:

@@ -1,11 +1,12 @@
 """Measure the processor time of a swarm of real vehicle programs: `python -m benchmarks.flying [--vehicles 20]
 [--seconds 90]`.
 
-The ArduCopters fly a plan at speedup 1, with agents at 15 % loss. A ground station requests four updates per second
-from each vehicle, and a client reads the live page. Ground station and client belong to this process, which is not
-counted. The benchmark prints the processor seconds (user and system) of the vehicles, and of the other parts: agents,
-harness, and the server of the page. A vehicle keeps up if its real-time factor is at least 0.99. The other parts should
-use at most 60 % of a core. The environment variable ARDUPILOT_SITL names the directory with the binary.
+ArduCopters fly a plan at speedup 1, and their agents lose 15 % of the messages. A ground station requests four updates
+per second from each vehicle, and a client reads the live page. Ground station and client run in the process of the
+benchmark, whose processor time does not count. The benchmark prints the processor seconds (user and system) of the
+vehicles, and those of the other parts (agents, harness, and the server of the page). A vehicle keeps up if its
+real-time factor is at least 0.99. The other parts should use at most 60 % of a core. The environment variable
+ARDUPILOT_SITL names the directory with the binary.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def scenario(vehicles: int, seconds: float) -> dict[str, Any]:
 
 
 class GroundStation(asyncio.DatagramProtocol):
-    """A ground station that requests all messages of each vehicle, and counts the received bytes."""
+    """A ground station that requests all types of messages from each vehicle, and counts the received bytes."""
 
     def __init__(self) -> None:
         self.taken = 0
@@ -64,7 +65,9 @@ class GroundStation(asyncio.DatagramProtocol):
 
 
 def spent(root: int, run: Path) -> dict[str, float]:
-    """Return the processor seconds that a process and its descendants have used, by their part in the run."""
+    """Return the processor seconds that a process and its descendants have used, by the part of the run to which they
+    belong.
+    """
     processes: dict[int, tuple[int, float]] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdecimal():

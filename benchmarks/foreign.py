@@ -1,13 +1,13 @@
 """Measure the speed of agents in another language in virtual time: `python -m benchmarks.foreign [-- COMMAND...]`.
 
-COMMAND is the agent; without it, the benchmark uses the harness's own agent as a program. The missions have 20 minutes,
-five agents and 15 % loss. They run on `--jobs` cores with traces and all checks. The same missions also run with the
-harness's own agent inside the simulation.
+COMMAND starts the agent. Without COMMAND, the benchmark uses the harness's own agent as a separate program. The
+missions have 20 minutes, five agents and 15 % loss. They run on `--jobs` cores with traces and all checks. For
+comparison, the same missions also run with the harness's own agent inside the simulation.
 
-`--same SEEDS` instead plays all scenarios of the library with some seeds. It prints the missions in which a correct
-agent exports other chains, or gets other verdicts, than the own agent inside the simulation. If COMMAND is the own
-agent, the traces must be equal, too. Swarms with a proof that they never finish do not count, because the harness
-cannot prove this for agents whose state it does not know.
+`--same SEEDS` instead plays all scenarios of the library with some seeds. It prints the missions in which the agent
+exports other chains, or gets other verdicts, than the harness's own agent inside the simulation. If COMMAND is the
+harness's own agent, the traces must also be equal. A swarm does not count if the harness proves that it never finishes,
+because the harness cannot prove this for agents whose state it does not know.
 """
 
 import argparse
@@ -31,7 +31,7 @@ def of_library(name: str, command: list[str] | None) -> Scenario:
 
 
 def measure(scenario: Scenario, missions: int, jobs: int) -> tuple[float, int]:
-    """Return the wall time of all missions in seconds, and the number of their handler runs."""
+    """Return the wall time of all missions in seconds, and the total number of handler runs."""
 
     def work(seed: int) -> int:
         result = simulate(scenario, seed, tracing=True, deliver_all=True)
@@ -72,7 +72,7 @@ def left_behind(simulated: Simulated, *, with_traces: bool) -> object:
 
 
 def same(command: list[str], seeds: int, jobs: int) -> int:
-    """Return the number of missions in which the agents behave differently."""
+    """Return the number of missions in which the agents of COMMAND behave differently from the harness's own agents."""
 
     def work(task: tuple[str, int]) -> str:
         name, seed = task

@@ -1,11 +1,11 @@
 """Send forged, repeated and otherwise invalid datagrams to secured agents: `python -m benchmarks.forgeries [--each
 1000000]`.
 
-An agent with keys, which has received messages of others, gets `--each` forged datagrams of each class. A row counts
-the accepted ones, shows whether the state of the agent changed, and gives the processor time for one datagram, also as
-a multiple of the time for a datagram with a wrong tag. The time to make them does not count. `--only CLASS ...`
-selects classes. In mission time, 40,000 datagrams arrive per second, so the budgets for wrong signatures and unknown
-boots refill slowly.
+An agent with keys first receives messages of other agents, and then `--each` forged datagrams of each class. The table
+has a row for each class. A row has the number of accepted datagrams, whether the state of the agent changed, and the
+processor time for one datagram. It also gives this time as a multiple of the time for a datagram with a wrong tag. The
+time to make the datagrams does not count. `--only CLASS ...` selects classes. In each mission second, 40,000 datagrams
+arrive. The budgets for wrong signatures and unknown incarnations therefore refill slowly.
 
 `--replays RUNS` plays simulated missions in which all agents receive each datagram again later. `--nonces RUNS` plays
 simulated missions with reboots, with and without their disk, and counts repeated pairs of key and nonce.
@@ -41,10 +41,10 @@ OTHERS = KeySet.derived(b"another mission".ljust(32, b"\0"), ROSTER)
 EPOCH = 5
 NOW = EPOCH * KEYS.public.epoch_s
 POOL = 512
-"""Number of datagrams from which a class makes its forgeries, if they take long to make."""
+"""Number of authentic datagrams from which a class makes its forgeries, if each takes long to make."""
 AT_ONCE = 2000
 PER_S = 40_000
-"""Number of datagrams per mission second."""
+"""Number of forged datagrams that arrive per mission second."""
 RUNS_AT_ONCE = 500
 LATER_S = (1.0, 40.0)
 
@@ -57,7 +57,9 @@ def session(agent_id: int, keys: KeySet = KEYS, now: float = NOW) -> Session:
 
 
 def listener() -> SecuredAgent:
-    """Return agent 1, which has received one datagram from each other agent, and a challenge to agent 3."""
+    """Return agent 1, which has received one datagram from each other agent, and a challenge that agent 2 sent to agent
+    3.
+    """
     agent = SecuredAgent(session(1), 1, ROSTER, b"test", tracing=False)
     for other in ROSTER[1:]:
         agent.receive_datagram(session(other).seal(0, messages(Random(0))[0], None, None, 0), NOW)
@@ -75,14 +77,14 @@ def challenge_to_another() -> bytes:
 
 
 def messages(draw: Random) -> list[Message]:
-    """Return one message of each type and form."""
+    """Return a message of each type. Types with several forms have a message of each form."""
     a, b = draw.randbytes(32), draw.randbytes(32)
     block = Block(2, draw.randrange(2**40), draw.randbytes(draw.randrange(1, 300)))
     return [BlockAddRequest(a, b), CommitBlock(block, a), ChainContainResponse(a, True), BlockResponse(block)]
 
 
 def pool(maker: Session, draw: Random, first: int = 1) -> list[bytes]:
-    """Return datagrams that no agent has received yet."""
+    """Return authentic datagrams that no agent has received yet."""
     made = []
     while len(made) < POOL:
         for message in messages(draw):
@@ -174,7 +176,7 @@ def lengths_that_lie(draw: Random) -> Iterator[bytes]:
 
 
 def forged_revocations(draw: Random) -> Iterator[bytes]:
-    """Yield revocations of an outsider, each with a number that no agent knows."""
+    """Yield revocations that an attacker without keys has signed. Each has a number that no agent knows."""
     body = Revocation.signed(Ed25519PrivateKey.generate(), KEYS.public.mission, 7, [1]).encode()
     for number in cycle(range(8, 2**16)):
         signed = number.to_bytes(2, "big") + body[2:]
@@ -192,7 +194,7 @@ def far_epochs(draw: Random) -> Iterator[bytes]:
 
 
 def recorded_challenges(draw: Random) -> Iterator[bytes]:
-    """Yield the challenge that the listener has received."""
+    """Yield, again and again, the challenge that the listener has received."""
     yield from cycle([challenge_to_another()])
 
 
@@ -233,7 +235,9 @@ def all_of(agent: SecuredAgent) -> dict[str, Any]:
 def forge(
     make: Callable[[Random], Iterator[bytes]], count: int, seed: int = 1
 ) -> tuple[int, bool, float, Counter[str]]:
-    """Return the number of accepted forgeries, true if the state changed, processor seconds, and reasons for drops."""
+    """Send forged datagrams to an agent. Return the number of accepted datagrams, whether the state of the agent
+    changed, the processor seconds, and the number of dropped datagrams by reason.
+    """
     agent, forgeries = listener(), make(Random(1))
     before, seconds, answered, now = all_of(agent), 0.0, 0, NOW
     for _ in range(-(-count // AT_ONCE)):
@@ -258,7 +262,9 @@ def flying(duration_s: float, **more: Any) -> Scenario:
 
 
 class ReplayingAir(VirtualAir):
-    """A simulated network that delivers each message to all other agents again, `LATER_S` seconds later."""
+    """A simulated network that delivers each message again to all other agents. LATER_S has the delays of the
+    repetitions.
+    """
 
     def broadcast(
         self,
@@ -281,8 +287,8 @@ def replays(runs: int, loss: float) -> tuple[int, int, list[str]]:
     """Return the number of missions with unchanged chains, the number of datagrams dropped as repeated, and the
     findings.
 
-    With loss, an agent that lost a datagram handles its first repetition, as if the radio was slow. The chains may then
-    differ, so the checker judges each step instead.
+    With loss, an agent that lost a datagram handles its first repetition, as if the radio were slow. The chains may
+    then differ, so the checker judges each step instead.
     """
     same, dropped, bad = 0, 0, list[str]()
     for seed in range(runs):
@@ -296,7 +302,7 @@ def replays(runs: int, loss: float) -> tuple[int, int, list[str]]:
 
 
 def nonces(seeds: Iterable[int]) -> tuple[int, int]:
-    """Return the number of encrypted datagrams, and the number of those that reused a key and nonce."""
+    """Return the number of encrypted datagrams, and the number of datagrams that reused a pair of key and nonce."""
     used: set[tuple[int, int]] = set()
     sealed = twice = 0
     sealing = SenderKeys.encrypt

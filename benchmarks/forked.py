@@ -1,10 +1,10 @@
 """Count the swarms that never become idle after a partition, for each protocol correction: `python -m
 benchmarks.forked`.
 
-A random partition divides 3 to 8 agents, which complete some blocks in their groups. Then the partition heals, and no
-messages are lost. The agents complete one to three more blocks, and have 20 minutes to become idle. In half of the runs
-each message takes 20 ms, in the others 2 to 50 ms. The same runs are repeated with each cure of
-docs/explanation/livelocks.md.
+A random partition divides 3 to 8 agents into groups, in which they complete some blocks. Then the partition ends. No
+messages are lost otherwise. The agents complete one to three more blocks, and have 20 minutes to become idle. In half
+of the runs each message takes 20 ms, in the others 2 to 50 ms. The benchmark repeats the same runs with each protocol
+correction of docs/explanation/livelocks.md.
 """
 
 import argparse

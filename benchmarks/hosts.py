@@ -1,9 +1,9 @@
 """Measure how fast a swarm on several workers starts: `python -m benchmarks.hosts [--workers W] [--json] [N ...]`.
 
-The workers of a Dask cluster are processes of this machine, so they share its processors. A real cluster has more of
-them. Each round plays the start and the end of a mission of N agents, on the workers and in the lab alone (`here`).
-Up is the time from the beginning until the mission begins, without the import of Dask. Down is the time from the end
-of the mission until all agents have ended. Needs root, or a /dev/net/tun that this user may open.
+The workers of the Dask cluster are processes of this machine, so they share its processors. A real cluster has more
+processors. Each round plays the start and the end of a mission of N agents, first on the workers and then in one lab
+without Dask (`here`). Up is the time from the beginning until the mission begins, without the import of Dask. Down is
+the time from the end of the mission until all agents have ended. Needs root, or a /dev/net/tun that this user may open.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def cluster(workers: int, folder: Path, stack: contextlib.ExitStack) -> str:
 
 
 def wait_for(log: Path, words: str, count: int) -> list[str]:
-    """Return the lines of the log with these words, as soon as there are `count` lines."""
+    """Wait until the log has `count` lines that contain these words, and return the lines."""
     deadline = time.monotonic() + LIMIT_S
     while time.monotonic() < deadline:
         if log.exists():

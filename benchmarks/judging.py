@@ -2,8 +2,8 @@
 
     python -m benchmarks.judging [ROUNDS]
 
-The records come from scenarios/loss_15.yaml in virtual time, with 5, 20 and 50 agents. Bytes are those of traces on
-disk.
+The records come from scenarios/loss_15.yaml in virtual time, with 5, 20 and 50 agents. The size of a record is the size
+of the traces on disk in bytes.
 """
 
 import statistics
@@ -18,7 +18,7 @@ from harness.scenario import Scenario, load_scenario
 SCENARIO = Path(__file__).parent.parent / "scenarios" / "loss_15.yaml"
 AGENTS = (5, 20, 50)
 MEAN_S = 30.0
-"""Seconds between two events of an agent in a swarm of five; larger swarms have the same total rate of events."""
+"""Mean seconds between two events of an agent in a swarm of five. Larger swarms have the same total rate of events."""
 
 
 def scenario(agents: int) -> Scenario:

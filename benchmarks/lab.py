@@ -2,12 +2,12 @@
 ...]`.
 
 With `--mininet`, each round also starts and stops the same number of Mininet hosts on one Linux bridge. This needs root
-and the Debian packages mininet and bridge-utils. `build` and `start` are compared with `Lab.open`, and `stop` with
-`Lab.close`. Ratios are of one round. The time of the lab includes the start of its first process; the time of Mininet
-does not.
+and the Debian packages mininet and bridge-utils. The benchmark compares Mininet's `build` and `start` with `Lab.open`,
+and Mininet's `stop` with `Lab.close`. Each ratio compares the two in the same round. The time of the lab includes the
+start of its first process. The time of Mininet does not.
 
-`--pairs` measures `Lab.apply` instead, with each engine that works on this machine. Each directed pair of vehicles gets
-a loss of its own (`first`), and then another one (`change`).
+`--pairs` measures `Lab.apply` instead, with each engine that works on this machine. Each directed pair of vehicles
+first gets its own loss rate (`first`), and then a different one (`change`).
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ _Row = dict[str, Any]
 
 
 class _CannotError(Exception):
-    """An error: this machine lacks a requirement. The message names it."""
+    """An error: this machine lacks a requirement. The message names the requirement."""
 
 
 async def lab_once(vehicles: int, log: Path) -> _Row:
-    """Return the seconds in which a virtual network starts and stops, and its engine."""
+    """Return the seconds that a virtual network takes to start and to stop, and the name of its engine."""
     start = time.perf_counter()
     lab = await Lab.open(range(1, vehicles + 1), log=log)
     up = time.perf_counter()
@@ -55,7 +55,7 @@ async def lab_once(vehicles: int, log: Path) -> _Row:
 
 
 def mininet_once(hosts: int) -> _Row:
-    """Return the seconds in which Mininet starts and stops this number of hosts."""
+    """Return the seconds that Mininet takes to start and to stop this number of hosts."""
     argv = _namespaces.command([_PYTHON, str(_MININET), str(hosts)], user_namespace=False)
     done = subprocess.run(argv, capture_output=True, text=True, timeout=_MININET_DEADLINE_S, check=False)
     if done.returncode != 0:
@@ -94,7 +94,7 @@ def up_and_down(vehicles: int, rounds: int, mininet: bool, log: Path) -> _Row:
 
 
 def pairs(vehicles: int, rounds: int, log: Path) -> list[_Row]:
-    """Return a row for each engine that works on this machine."""
+    """Return a table row for each engine that works on this machine."""
     rows, refusals = [], []
     for engine in get_args(EngineName):
         try:
@@ -112,7 +112,7 @@ def pairs(vehicles: int, rounds: int, log: Path) -> list[_Row]:
 
 
 async def pairs_once(vehicles: int, engine: EngineName, log: Path) -> tuple[float, float]:
-    """Return the seconds to set a loss for each pair of vehicles, and the seconds to change all of them."""
+    """Return the seconds to set a loss rate for each pair of vehicles, and the seconds to change all loss rates."""
     directed = list(itertools.permutations(range(1, vehicles + 1), 2))
     losses = [number / (len(directed) + 1) for number in range(1, len(directed) + 1)]
     seconds = []

@@ -1,13 +1,14 @@
 """Measure a link of the lab without conditions: `python -m benchmarks.link [--rounds R] [--seconds S] [--json]`.
 
-Each link connects two vehicles. The links exist side by side in one private network, and each round measures all of
-them: a veth pair made with ip(8) (`veth`), the switch of the lab without an engine (`switch`), and the switch with each
-engine that works on this machine, without conditions. Ratios are relative to the veth pair of the same round.
+Each link connects two vehicles. All links exist at the same time in one private network, and each round measures all of
+them. One link is a veth pair made with ip(8) (`veth`), and another one is the switch of the lab without an engine
+(`switch`). For each engine that works on this machine, there is also a switch with this engine, without conditions.
+Ratios are relative to the veth pair of the same round.
 
-UDP counts datagrams of 512 bytes that arrive in a second, while the sender sends without pause. It also measures the
-processor time to send, transport and receive a datagram. TCP counts bytes received in a second on one connection. A
-round trip is a datagram of 64 bytes and its echo. Both ends are Python programs, on separate processors if there are
-two. All figures include their own time.
+The figures for UDP are the number of datagrams of 512 bytes that arrive per second, while the sender sends without
+pause, and the processor time to send, transport and receive a datagram. The figure for TCP is the number of bytes that
+one connection receives per second. A round trip is a datagram of 64 bytes and its echo. Both ends are Python programs,
+on separate processors if there are two. All figures include the time of these programs.
 """
 
 from __future__ import annotations
@@ -47,13 +48,16 @@ _fork = multiprocessing.get_context("fork")  # a socket stays in the network in 
 
 @dataclass(frozen=True)
 class Link:
-    """Vehicles 1 and 2, and a function that enters the network of each (`VirtualSwitch.inside`)."""
+    """A link between vehicles 1 and 2.
+
+    `inside` is a function that enters the network of a vehicle (`VirtualSwitch.inside`).
+    """
 
     name: str
     inside: Callable[[int], AbstractContextManager[None]]
 
     def datagrams(self) -> tuple[socket.socket, socket.socket]:
-        """Return a UDP socket in each network, connected to the other one."""
+        """Return two connected UDP sockets, one in the network of each vehicle."""
         ends = []
         for vehicle, peer in ((1, 2), (2, 1)):
             with self.inside(vehicle):
@@ -65,7 +69,7 @@ class Link:
         return ends[0], ends[1]
 
     def stream(self) -> tuple[socket.socket, socket.socket]:
-        """Return both ends of a TCP connection from 1 to 2."""
+        """Return both ends of a TCP connection from vehicle 1 to vehicle 2."""
         with self.inside(2):
             listener = socket.create_server((addresses.address(2), _PORT))
         with listener, self.inside(1):
@@ -142,7 +146,9 @@ def _count_datagrams(receiver: socket.socket) -> float:
 
 
 def udp_cost(link: Link, seconds: float) -> dict[str, float]:
-    """Measure the processor time of a datagram that one process sends and receives, which other load hardly affects."""
+    """Measure the processor time of a datagram. One process sends and receives it, so other load hardly affects the
+    result.
+    """
     sender, receiver = link.datagrams()
     count = 0
     with sender, receiver:
@@ -196,7 +202,7 @@ def _echo(far: socket.socket) -> float:
 
 @contextmanager
 def _beside(function: Callable[[socket.socket], float], end: socket.socket) -> Iterator[Callable[[], float]]:
-    """Run the function in another process during the block; yield a function that waits for its result."""
+    """Run the function in another process during the block. Yield a function that waits for its result."""
     ours, theirs = _fork.Pipe(duplex=False)
 
     def run() -> None:
@@ -221,7 +227,7 @@ def _beside(function: Callable[[socket.socket], float], end: socket.socket) -> I
 
 
 def measure(rounds: int, seconds: float) -> dict[str, dict[str, list[float]]]:
-    """Return the figures of all rounds, by quantity and link."""
+    """Measure all links in each round. Return the figures by quantity and link."""
     found: dict[str, dict[str, list[float]]] = {}
     lines = links()
     for _ in range(rounds):

@@ -1,9 +1,10 @@
 """Measure the process of a shared channel in real time: `python -m benchmarks.live_channel [--agents 5 20 50]`.
 
 Each row is one run with processes and embedded vehicles. The processor time is that of the channel process alone, as a
-share of one core over the mission. The lateness is that of its deliveries, in mission time. Agents that wait for a
-processor answer later, so fewer answers collide than in virtual time. The last columns have the time from a question to
-its answer, and the share of lost copies, in virtual time in parentheses.
+share of the time of one core during the mission. The lateness is the delay of the deliveries by the channel process, in
+mission time. Agents that wait for a processor answer later, so fewer answers collide than in virtual time. The last
+columns have the time from a query to its answer, and the share of lost copies. The number in parentheses is the share
+of lost copies in virtual time.
 """
 
 import argparse
@@ -67,7 +68,7 @@ def row(asked: Scenario) -> None:
 
 
 def lost(channel: ChannelRecord, asked: Scenario) -> float:
-    """Return the share of copies that the channel lost."""
+    """Return the share of the copies of frames that the channel lost."""
     copies = channel.frames * (len(asked.roster) - 1)
     return sum(sum(counts.values()) for counts in channel.lost.values()) / copies if copies else 0.0
 

@@ -1,8 +1,8 @@
 """Start and stop Mininet hosts on one Linux bridge, once, for `benchmarks.lab`.
 
 `benchmarks.lab` runs it with Debian's own Python as the first process of private namespaces, so that everything that
-Mininet leaves behind ends with this process. It prints the seconds of `build` and `start`, and of `stop`, as JSON. The
-time of the import is not counted.
+Mininet leaves behind ends with this process. The program prints as JSON the seconds that Mininet takes for `build` and
+`start` together, and for `stop`. The time of the import is not counted.
 """
 
 import json

@@ -1,10 +1,11 @@
-"""Play two weeks of nights with planted regressions: `python -m benchmarks.nights`.
+"""Simulate two weeks of nightly runs with planted regressions: `python -m benchmarks.nights`.
 
-A clone of this repository gets two or three commits a day. Most of them change no behaviour. On some days one of them
-plants a regression, and the next day reverts it. Each night plays a matrix in virtual time with the code of its day,
-and compares it with the baseline as the nightly workflow does. The result has one row for each night: the planted
-regression, the report of the night, and the named commit. Two of three regressions in timing are in the core, where the
-step judge sees them too. The third is in the simulated network, where only figures and changed runs can show it.
+A clone of this repository gets two or three commits a day. Most of them change no behaviour. On some days, one of the
+commits plants a regression, and a commit on the next day reverts it. Each night plays a matrix in virtual time with the
+code of its day, and compares it with the baseline as the nightly workflow does. The result has one row for each night:
+the planted regression, the report of the night, and the named commit. Three regressions affect the timing. Two of these
+are in the core, so the check of steps finds them too. The third is in the simulated network, where only figures and
+changed runs can show it.
 """
 
 import argparse
@@ -76,11 +77,11 @@ PLANTS = {
         "    block = core.chain.get(message.block_hash)\n    if block is None or len(core.chain) % 2:",
     ),
 }
-"""Night -> the regression that is committed on its day."""
+"""The regression that is committed on the day before a night, by the number of the night."""
 
 
 class Project:
-    """The clone, and its commits."""
+    """The clone and its commits."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -92,13 +93,13 @@ class Project:
         return subprocess.run(command, cwd=self.directory, capture_output=True, text=True, check=True).stdout.strip()
 
     def commit_harmless(self, night: int, number: int) -> None:
-        """Commit a comment: in the core, in the documentation, or in the harness."""
+        """Commit a comment in a file of the core, the documentation or the harness."""
         path = self.directory / ("ucp/reconcile.py", "README.md", "harness/play/mission.py")[(night + number) % 3]
         path.write_text(f"{path.read_text(encoding='utf-8')}\n# Night {night}, change {number}.\n", encoding="utf-8")
         self.git("commit", "--quiet", "--all", "--message", f"Add a comment ({night}.{number})")
 
     def plant(self, plant: Plant) -> str:
-        """Commit the regression, and return the commit."""
+        """Commit the regression, and return the hash of the commit."""
         path = self.directory / plant.file
         text = path.read_text(encoding="utf-8")
         assert text.count(plant.right) == 1, plant
@@ -138,7 +139,7 @@ def play(project: Project, work: Path, night: int, seeds: int, bisect: str) -> d
 
 
 def reported(record: dict[str, Any], planted: str | None) -> list[str]:
-    """Return the fields of the table: worse figures, changed runs, violations, first handler, named commits."""
+    """Return the cells of a table row: worse figures, changed runs, violations, first handler and named commits."""
     against = record["against"] or {"changes": [], "changed_runs": [], "culprits": []}
     worse = sorted({change["metric"] for change in against["changes"] if change["worse"]})
     changed = sum(len(each["seeds"]) for each in against["changed_runs"])

@@ -1,8 +1,8 @@
 """Play runs for `benchmarks.against`, with the revision of the project that is first on PYTHONPATH.
 
-A line on standard input names the kind of run and a seed, such as "explore/3". The answer is the processor time of each
-run, in seconds. The program uses only functions that all revisions have. `bare_model` lies beside it, so that all
-revisions play the same model.
+Each line on standard input names a kind of run and a seed, such as "explore/3". The program answers with a line that
+contains the processor seconds per run. The program uses only functions that all revisions have. `bare_model` is in the
+same directory, so that all revisions play the same model.
 """
 
 import gc
@@ -46,14 +46,14 @@ FIVE, TWENTY, FIFTY = scenario(5), scenario(20), scenario(50)
 
 
 def explore(seed: int) -> int:
-    """Play seeds like `ucp-harness explore` on one core; return the number of runs."""
+    """Play seeds like `ucp-harness explore` on one core. Return the number of runs."""
     for number in range(SEEDS_OF_EXPLORE):
         explored(FIVE, seed * SEEDS_OF_EXPLORE + number)
     return SEEDS_OF_EXPLORE
 
 
 def matrix(seed: int) -> int:
-    """Play some seeds of all cells like `ucp-harness matrix` on one core; return the number of runs."""
+    """Play some seeds of all cells like `ucp-harness matrix` on one core. Return the number of runs."""
     cells = [scenario(5, loss, final_reconcile=False, settle_s=7200.0) for loss in LOSS]
     runs = list(product(cells, range(SEEDS_OF_MATRIX)))
     for of_loss, number in runs:
@@ -62,13 +62,15 @@ def matrix(seed: int) -> int:
 
 
 def proof(bounds: Bounds) -> int:
-    """Prove within these bounds on one core; return the number of states."""
+    """Prove the properties within these bounds on one core. Return the number of states."""
     with TemporaryDirectory() as directory:
         return prove(bounds, out=Path(directory) / "example.yaml").figures.states
 
 
 def shell(seed: int) -> int:
-    """Play a mission and write its run directory and report with the command in a new process."""
+    """Run `ucp-harness run` in a new process, which plays a mission and writes its run directory and report. Return
+    1.
+    """
     with TemporaryDirectory() as directory:
         command = [sys.executable, "-m", "harness.cli", "run", "loss_15", "--backend", "sim", "--seed", str(seed)]
         subprocess.run([*command, "--out", f"{directory}/run"], stdout=subprocess.DEVNULL, check=True)
@@ -98,7 +100,7 @@ for swarm in (FIVE, TWENTY, FIFTY):
 
 
 def processor_s() -> float:
-    """Return the processor time of this process and of the processes that it has started and that have ended."""
+    """Return the processor seconds of this process and of its child processes that have ended."""
     used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return sum(each.ru_utime + each.ru_stime for each in used)
 

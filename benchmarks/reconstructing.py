@@ -2,11 +2,11 @@
 
     python -m benchmarks.reconstructing [--simulated N] [--processes N] [--first NUMBER]
 
-The number of a flight determines its scenario: loss, bursts, partitions, kills and restarts, pauses, wrong and drifting
-clocks, and readings of the thesis. In virtual time the traces have the times of the agents' own clocks, without a
-record of the clock errors. `reconstruct` gets only files that vehicles have: traces, exports and captures. In some
-flights the files of one agent are missing. In some, one trace is cut in half. In some, there are only exports and
-captures.
+The number of a flight determines its scenario. Scenarios contain loss, bursts, partitions, kills and restarts, pauses,
+wrong and drifting clocks, and settings for readings of the thesis. In virtual time the traces have the times of the
+agents' own clocks, without a record of the clock errors. `reconstruct` gets only files that vehicles have: traces,
+exports and captures. In some flights the files of one agent are missing. In others, one trace is cut in half, or there
+are only exports and captures.
 """
 
 import argparse
@@ -40,12 +40,15 @@ JOBS = 2
 
 Kind = Literal["complete", "one agent missing", "a trace cut in half", "exports and captures only"]
 KINDS: dict[int, Kind] = {7: "one agent missing", 8: "a trace cut in half", 9: "exports and captures only"}
-"""The kind of a flight, by the last digit of its number. All other flights are complete."""
+"""The kind of a flight, by the last digit of the flight's number. Flights with other digits are complete."""
 
 
 @dataclass(frozen=True)
 class Tried:
-    """The result for one flight. `expected` chains can be reproduced, so an agent with a cut record does not count."""
+    """The result for one flight.
+
+    `expected` is the number of chains that can be reproduced. The chain of an agent with a cut record does not count.
+    """
 
     kind: Kind
     backend: str
@@ -94,7 +97,10 @@ def scenario(number: int, backend: BackendName) -> Scenario:
 
 
 def _within(drawn: Scenario, duration_s: float, agents: int) -> list[dict[str, Any]]:
-    """Return the drawn timeline, scaled to a shorter flight, without entries for agents that do not exist."""
+    """Return the drawn timeline with its times scaled to a shorter flight.
+
+    Return an empty list if an entry of the timeline names an agent that the flight does not have, or has no effect.
+    """
     shorter = duration_s / drawn.duration_s
     entries = [entry.model_dump(mode="json", exclude_defaults=True) for entry in drawn.timeline]
     named = {agent for entry in entries for agent in _agents_in(entry)}
@@ -130,7 +136,7 @@ def fly(number: int, backend: BackendName) -> Tried:
 
 
 def _bring_home(run: Path, home: Path, kind: Kind, draw: Random) -> int:
-    """Copy the files of the vehicles; return the number of chains that can be reproduced."""
+    """Copy the files of the vehicles. Return the number of chains that can be reproduced."""
     traces = sorted((run / "agents").glob("*.trace.jsonl"))
     exports = sorted((run / "agents").glob("*.chain.json"))
     struck = draw.choice(traces).name.partition(".")[0]
@@ -154,7 +160,9 @@ def _bring_home(run: Path, home: Path, kind: Kind, draw: Random) -> int:
 
 
 def _by_own_clock(path: Path) -> list[str]:
-    """Return the lines of a trace with the times of the agent's own clock, without its error."""
+    """Return the lines of a trace with the times that the agent's own clock showed, without the record of its clock
+    error.
+    """
     lines = path.read_text().splitlines(keepends=True)
     clock = json.loads(lines[0])["clock"]
     offset_s, rate = clock.get("offset_s", 0.0), 1 + clock.get("drift", 0.0)

@@ -1,9 +1,10 @@
 """Compare the proofs of wrong agents with and without state reductions: `python -m benchmarks.reductions [NAME]...`.
 
-Each bug of `tests/harness/proof/planted_bugs.py` is planted into a copy of `ucp/`. A process with this core proves the
-bounds of the bug three times: as `prove` does, with `--whole`, and with reductions although the core is edited. The
-first two must have the same findings. The third shows why the prover reduces no states of an edited core: it can miss a
-violation, or report one that no run shows. NAME is a part of a bug's name.
+Each bug of `tests/harness/proof/planted_bugs.py` is planted into a copy of `ucp/`. A process with this core runs the
+proof within the bounds of the bug three times: with the default options, with `--whole`, and with reductions although
+the core is edited. The first two must have the same findings. The third shows why the prover reduces no states of an
+edited core: with reductions, it can miss a violation, or report a violation that no run shows. NAME is a part of the
+name of a bug.
 """
 
 import json
@@ -23,13 +24,14 @@ from tests.harness.proof.edited_core import edited, environment
 from tests.harness.proof.planted_bugs import BUGS, PlantedBug
 
 LIMIT_S = 120.0
-"""Seconds after which a proof is given up."""
+"""Time limit of a proof in seconds."""
 
 
 def findings(bug: PlantedBug, kinds: Sequence[str] = ("default", "whole", "forced")) -> dict[str, list[str]]:
-    """Return the kinds of the findings of each of these proofs: the default, `--whole`, and forced reductions.
+    """Prove the bug in up to three ways: by default, with `--whole`, and with forced reductions. Return the kinds of
+    findings of each proof.
 
-    A proof that the prover refuses has the finding "refused". A proof without a result has "not decided".
+    The finding is "refused" if the prover refuses the agent, and "not decided" if a proof has no result.
     """
     with TemporaryDirectory(prefix="ucp-reductions-") as name:
         core = edited(Path(name), *bug.edits)
@@ -49,7 +51,7 @@ def findings(bug: PlantedBug, kinds: Sequence[str] = ("default", "whole", "force
 
 
 def _child() -> None:
-    """Prove the bounds on standard input with the core of this process."""
+    """Prove within the bounds on standard input with the agent core of this process."""
     document, kinds = json.load(sys.stdin)
     bounds = Bounds(**{**document, "faults": tuple(document["faults"])})
     json.dump({kind: _findings(bounds, kind) for kind in kinds}, sys.stdout)

@@ -1,9 +1,9 @@
 """Measure the delay that a remote agent adds: `python -m benchmarks.remote_delay [--rounds R] [--json]`.
 
-Each round plays one mission with local agents and one remote agent, which joins over a local link. The captures of the
-run show when a Block Add Request reaches the port of a vehicle, and when the answer leaves it. Half of the difference
-between the remote agent and the local agents is the added delay in one direction. Needs root, because the far end opens
-/dev/net/tun.
+Each round plays one mission with local agents and one remote agent, which joins over a local link. The packet captures
+of the run show when a Block Add Request reaches a vehicle's port of the switch, and when the answer arrives at this
+port. The benchmark compares this answer time of the remote agent with that of the local agents. Half of the difference
+is the added delay in one direction. Needs root, because the far end opens /dev/net/tun.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ FORMS = {"local_ms": ".3f", "remote_ms": ".3f", "added_ms": ".3f", "ping_ms": ".
 
 
 def answer_times(directory: Path) -> Iterator[tuple[int, float]]:
-    """Yield each vehicle that answered a Block Add Request, with the milliseconds at its port of the switch."""
+    """Yield the ID of each vehicle that answered a Block Add Request, with the answer time in milliseconds.
+
+    Both times are taken at the vehicle's port of the switch.
+    """
     captures = read_captures(capture_files([directory]))
     of_vehicle = {capture.number: capture for capture in captures.used}
     asked: dict[tuple[int, Any], int] = {}

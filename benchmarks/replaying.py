@@ -2,9 +2,9 @@
 
     python -m benchmarks.replaying [ROUNDS]
 
-The record is that of one of 20 agents that received all messages for two hours at 15 % loss in virtual time. The
-directory also has the records of the other agents, but no run.json. `open` is the duration of the whole command, from
-its start to the first prompt, including its end.
+The record is the trace of one of 20 agents in a run of two hours in virtual time. The trace contains all messages that
+the agent received at 15 % loss. The directory also has the traces of the other agents, but no run.json. `open` is the
+duration of the whole command, from its start to the first prompt, including its end.
 """
 
 import statistics
@@ -29,7 +29,9 @@ BACKS = 200
 
 
 def fly(directory: Path) -> None:
-    """Play two hours and deliver all messages, so that each trace contains all inputs of its agent."""
+    """Play a run of two hours. All messages are delivered and not omitted, so that each trace contains all inputs of
+    its agent.
+    """
     asked = scenario(AGENTS).model_copy(update={"duration_s": DURATION_S})
     simulation = Simulation(asked, 1, DiskRecorder(RunDirectory(directory)), deliver_all=True)
     story = mission.play(simulation, asked)
@@ -46,13 +48,13 @@ def timed(what: Callable[[], object]) -> float:
 
 
 def opened(directory: Path) -> None:
-    """Run the same command as a user."""
+    """Run `ucp-harness replay` like a user, until it has made one step."""
     command = [sys.executable, "-m", "harness.cli", "replay", directory, "--agent", str(AGENT), "--step"]
     subprocess.run(command, input=b"next\nquit\n", stdout=subprocess.DEVNULL, check=True)
 
 
 def backs(record: RecordedTrace) -> list[float]:
-    """Return the seconds that single steps back take, from random positions."""
+    """Return the duration in seconds of single steps back from random positions in the record."""
     player, draw = RecordPlayer(record), Random(1)
     player.to_end()
     took = []

@@ -1,8 +1,9 @@
 """Measure the report of a run: `python -m benchmarks.report [--agents 5 20 50] [--rounds 5] [--json]`.
 
-Each run has 20 minutes at 15 % loss in virtual time, and is judged first. 50 agents write over a million trace lines,
-and judging them takes two minutes. Each round then writes the report, and reads the trace lines without doing anything
-with them. The ratio compares the two on the same machine. Times are processor seconds, without the start of Python.
+Each run takes 20 minutes in virtual time with 15 % loss. The benchmark judges the run first. 50 agents write over a
+million trace lines, and the judgement takes two minutes. Each round then writes the report. It also reads the trace
+lines without using them, for comparison. The ratio compares the time for the report with the time for reading. Times
+are processor seconds, without the start of Python.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ MEGABYTE = 1e6
 
 
 def lines_alone(traces: list[Path]) -> int:
-    """Read the traces; return the number of their lines."""
+    """Read the traces without using their lines. Return the number of lines."""
     count = 0
     for path in traces:
         with path.open("rb") as file:

@@ -25,16 +25,18 @@ class Spread:
 
     @classmethod
     def of_ratios(cls, figures: Sequence[float], others: Sequence[float]) -> Spread:
-        """Return the ratios of two figures from the same rounds, so that a slow machine affects both."""
+        """Return the spread of the ratios of two figures. Each ratio is of the same round, so a slow machine affects
+        both figures.
+        """
         return cls.of(figure / other for figure, other in zip(figures, others, strict=True))
 
     def __format__(self, form: str) -> str:
-        """Format all three numbers with `form`: "0.42 (0.40..0.47)"."""
+        """Format the median, minimum and maximum with `form`, such as "0.42 (0.40..0.47)"."""
         return f"{self.median:{form}} ({self.least:{form}}..{self.most:{form}})"
 
 
 def show(rows: Sequence[Mapping[str, Any]], forms: Mapping[str, str], as_json: bool) -> None:
-    """Print rows with the same keys. `forms` contains the format for each key."""
+    """Print the rows of a table. All rows have the same keys, and `forms` contains the format for each key."""
     if as_json:
         json.dump([{k: asdict(v) if isinstance(v, Spread) else v for k, v in row.items()} for row in rows], sys.stdout)
         sys.stdout.write("\n")

@@ -1,11 +1,11 @@
 """Play all included scenarios with and without keys: `python -m benchmarks.secured_library [--seeds 8] [SCENARIO ...]`.
 
-In virtual time, with the same seed, all agents must export the same chains with keys and without: the same block
-hashes in the same order. A matrix is played at each of its loss rates. Without arguments the benchmark leaves out
-`growth_matrix`, because its swarms of 100 agents take hours with keys. Some parts of a scenario cannot be compared.
-The benchmark removes these parts from both runs, and prints them: injections, which agents with keys drop, revocations,
-which need keys, and restarts, after which agents with keys wait for echoes. If chains differ, it prints the name of the
-scenario, and the exit status is 1.
+In virtual time, with the same seed, all agents must export the same chains with keys and without: the same block hashes
+in the same order. A matrix is played at each of its loss rates. Without arguments the benchmark leaves out
+`growth_matrix`, because its swarms of 100 agents take hours with keys. Some parts of a scenario cannot be compared. The
+benchmark removes these parts from both runs, and prints their names. These are injections, because agents with keys
+drop them, revocations, because they need keys, and restarts, because agents with keys then wait for echoes. If chains
+differ, the benchmark prints the name of the scenario, and the exit status is 1.
 """
 
 import argparse
@@ -30,7 +30,9 @@ TOO_LARGE = "growth_matrix"
 
 
 class Compared(NamedTuple):
-    """A scenario to play with and without keys. `without` lists the parts that cannot be compared."""
+    """A scenario to play with and without keys. `without` lists the parts that were removed because they cannot be
+    compared.
+    """
 
     name: str
     scenario: Scenario
@@ -38,7 +40,9 @@ class Compared(NamedTuple):
 
 
 def in_both(name: str, scenario: Scenario) -> Compared:
-    """Return the parts of a scenario that have the same meaning with and without keys."""
+    """Remove the parts of a scenario that have a different meaning with keys. Return the rest and the names of these
+    parts.
+    """
     timeline = [entry for entry in scenario.timeline if not entry.injection]
     heard = [entry for entry in timeline if not (entry.fault and entry.fault.needs_keys)]
     alive = [entry for entry in heard if not (entry.fault and entry.fault.what in ("restart", "reboot"))]
@@ -65,7 +69,9 @@ def all_of(names: Sequence[str]) -> Iterator[Compared]:
 
 
 def difference(task: tuple[Compared, int]) -> str | None:
-    """Return the first difference between the chains with and without keys, or None if they are complete and equal."""
+    """Play the scenario with and without keys. Return the first difference between the chains, or None if they are
+    equal.
+    """
     (_, plain, _), seed = task
     without, keyed = (simulate(scenario, seed).result.chains for scenario in (plain, plain.secured()))
     for agent_id in sorted(without.keys() | keyed.keys()):
@@ -81,7 +87,7 @@ def difference(task: tuple[Compared, int]) -> str | None:
 
 
 def compare(asked: Sequence[Compared], seeds: range, jobs: int) -> dict[str, list[str]]:
-    """Return the seeds with a difference, for each scenario that has any."""
+    """Return the seeds with a difference, for each scenario that has such a seed."""
     different: dict[str, list[str]] = defaultdict(list)
     tasks = [(compared, seed) for compared in asked for seed in seeds]
     with sweep(tasks, difference, jobs, what="missions" if sys.stderr.isatty() else None) as outcomes:

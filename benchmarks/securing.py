@@ -1,12 +1,13 @@
 """Measure the cost of encryption and signatures: `python -m benchmarks.securing [--rounds 200] [--missions 20]`.
 
-The first table has the bytes and the processor time of each message, plain and secured, to send and to receive. The
-second one has whole missions in virtual time: a sweep, and runs with traces. Each secured run is compared with the
-plain run of the same seed.
+The first table has a row for each type of message. It has the bytes of a plain and of a secured message, and the
+processor time to send and to receive each. The second table is about whole missions in virtual time: a sweep, and runs
+with traces. Each secured run is compared with the plain run with the same seed.
 
 `--matrix SEEDS` plays the thesis's matrix with this number of seeds instead, like `ucp-harness matrix` on one core. It
-also prints the minimal cost: each datagram is only signed, or only signed and verified once. `--speedup 20` plays five
-agents as processes instead. The exit status is 1 if they do not keep up with the clock.
+also prints two lower limits of the cost. For the first, each datagram is only signed. For the second, it is signed and
+verified once. `--speedup 20` plays five agents as processes instead. The exit status is 1 if the processes do not keep
+up with the clock.
 """
 
 import argparse
@@ -119,7 +120,7 @@ def per_mission(missions: int) -> None:
 
 
 def matrix(seeds: int) -> None:
-    """Measure the same runs with and without keys, and the smallest cost that keys must have."""
+    """Measure the same runs with and without keys, and the lower limits of the cost of keys."""
     plain_s = secured_s = 0.0
     datagrams = 0
     for loss in LOSS_OF_MATRIX:
@@ -148,7 +149,10 @@ def matrix(seeds: int) -> None:
 
 
 def as_processes(speedup: float) -> bool:
-    """Return true if five agent processes keep up with the clock with and without keys, by their vote timers."""
+    """Return whether five agent processes keep up with the clock, with and without keys.
+
+    The delays of their vote timers show this.
+    """
     plain = Scenario.model_validate(
         {"name": "clock", "network": {"loss": 0.15}, "vehicles": {"kind": "none"}, "speedup": speedup}
     )

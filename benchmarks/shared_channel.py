@@ -1,8 +1,8 @@
 """Measure the cost of a shared radio channel in virtual time: `python -m benchmarks.shared_channel [--rounds 5]`.
 
 Each round plays the same mission without and with a channel, one after the other, with the same seed. The ratio
-compares the processor times of these two runs. A channel changes the number of messages, so the table has messages
-too. Runs have no traces.
+compares the processor times of these two runs. A channel changes the number of messages, so the table also shows this
+number. The runs write no traces.
 """
 
 import argparse

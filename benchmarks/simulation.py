@@ -1,11 +1,11 @@
 """Compare the speed of the simulation with that of a bare model: `python -m benchmarks.simulation [--rounds 5]`.
 
-`--agents 200 --loss 0.15 --settle 1200 --rounds 1` is the largest swarm. `--matrix` also measures 8 x 200 runs of five
-agents.
+`--agents 200 --loss 0.15 --settle 1200 --rounds 1` measures the largest swarm. `--matrix` also measures a matrix of
+five agents with 8 loss rates and 200 seeds.
 
-`benchmarks.bare_model` is the protocol alone, in one file. Rounds alternate between the two, so that a slow phase of
-the machine affects both. Times are processor times. The checker judges each simulation at its end. Runs with `--traced`
-have traces and all checks.
+The bare model (`benchmarks.bare_model`) is the protocol alone in one file. The simulation and the model run
+alternately, so that a slow phase of the machine affects both. Times are processor times. The checker judges each
+simulation at its end. Runs with `--traced` have traces and all checks.
 """
 
 import argparse

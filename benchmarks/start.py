@@ -1,9 +1,10 @@
 """Measure the start time of an agent and its memory: `python -m benchmarks.start HEAD~20 [--rounds 20]`.
 
-Another revision of the project is checked out in a temporary directory. Agents of both revisions start alternately,
-alone on the loopback interface. Ratios are of one round. An agent is ready when its control socket answers. The
-processor time is that of the whole process up to this moment. With `-- COMMAND...` the benchmark starts another agent
-in place of the other revision. The agent gets a mission file as in ucp/contract/CONTRACT.md.
+Another revision of the project is checked out in a temporary directory. Agents of both revisions start alternately.
+Each agent is alone on the loopback interface. Each ratio compares the two agents of one round. An agent is ready when
+its control socket answers. The processor time is that of the whole process up to this moment. With `-- COMMAND...` the
+benchmark starts another agent in place of the other revision. The agent gets a mission file, which
+ucp/contract/CONTRACT.md describes.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ def _mission() -> dict[str, Any]:
 
 
 def start(command: Sequence[str], root: Path) -> tuple[float, float, float]:
-    """Return the wall time and processor time in ms until the agent is ready, and its memory in MB."""
+    """Start an agent and wait until it is ready. Return its wall time and processor time in ms, and its memory in
+    MB.
+    """
     with tempfile.TemporaryDirectory() as directory:
         (Path(directory) / "7.mission.json").write_text(json.dumps(_mission()), encoding="utf-8")
         env = {**os.environ, "PYTHONPATH": str(root)}

@@ -1,9 +1,9 @@
 """Measure the web server of the live page: `python -m benchmarks.watch [--agents 50] [--minutes 4] [--speedup 1]`.
 
-A run in virtual time writes the files of real agents: all received messages are in the traces, and vehicles fly. Then
-these files grow again at the same times. The server process reads them ten times per second for one browser, which is a
-client in another process. The benchmark prints the processor seconds (user and system) of the server alone. 50 vehicles
-should take at most a fifth of a core.
+A run in virtual time with flying vehicles writes the same files as real agents, with all received messages in the
+traces. The benchmark then writes these files again, line by line at the same times. The server process reads the files
+ten times per second for one browser. A client in another process takes the place of the browser. The benchmark prints
+the processor seconds (user and system) of the server alone. 50 vehicles should take at most a fifth of a core.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def played(directory: Path, agents: int, minutes: float) -> None:
 
 
 def written(directory: Path) -> Written:
-    """Return each line of a run with the mission second at which it was written."""
+    """Return each line of a run's files with the mission second at which the line was written."""
     lines: Written = []
     for path in directory.rglob("*.jsonl"):
         at_s = 0.0
@@ -48,7 +48,7 @@ def written(directory: Path) -> Written:
 
 
 async def serve(directory: Path, lines: Written, speedup: float, ready: multiprocessing.Queue[object]) -> None:
-    """Let the files of a run grow, and read them. The time to write them is not counted."""
+    """Write the files of a run line by line, and serve its page. The time to write the files is not counted."""
     with closing(ChangeFeed(directory)) as feed, closing(ChangeLog()) as log:
         async with LivePageServer(log, directory, live=True).open(0) as address:
             ready.put(address)
@@ -74,7 +74,7 @@ async def serve(directory: Path, lines: Written, speedup: float, ready: multipro
 
 
 def read(address: str) -> None:
-    """Read all messages like a browser, without drawing them."""
+    """Read all messages of the server like a browser, without drawing them."""
 
     async def listen() -> None:
         async with aiohttp.ClientSession() as client, client.ws_connect(f"{address}live", max_msg_size=0) as socket:

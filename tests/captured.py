@@ -1,5 +1,6 @@
-"""Read packet captures independently of the harness, for comparison: packets with scapy, and other blocks with this
-module.
+"""Read packet captures independently of the harness, so that tests can compare both readings.
+
+scapy reads the packets, and this module reads the other blocks of a file.
 """
 
 import json
@@ -22,7 +23,7 @@ class CapturedFrame(NamedTuple):
 
     @property
     def payload(self) -> bytes:
-        """The data inside the UDP datagram."""
+        """The data of the UDP datagram in the frame."""
         return self.data[PAYLOAD_AT:]
 
 
@@ -50,7 +51,9 @@ def statistics(path: Path) -> dict[str, int]:
 
 
 def _options(path: Path, kind: int, fixed: int) -> dict[int, bytes]:
-    """Return the options of the only block of this kind. They follow `fixed` bytes of other data."""
+    """Return the options of the only block of this kind. In the block, the options follow `fixed` bytes of other
+    data.
+    """
     (body,) = (body[fixed:] for found, body in _blocks(path.read_bytes()) if found == kind)
     options = {}
     while len(body) >= 4:

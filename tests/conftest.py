@@ -1,7 +1,7 @@
 """Settings for all tests, and the pytest markers `lab`, `docker` and `uml`.
 
-A test with one of these markers needs private network namespaces, a Docker engine or User Mode Linux. It is skipped
-with a reason on a machine without it.
+A test with the marker `lab` needs private network namespaces, one with `docker` needs a Docker engine, and one with
+`uml` needs User Mode Linux. Without this requirement, the test is skipped with a reason.
 """
 
 import os

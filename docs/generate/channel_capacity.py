@@ -1,7 +1,8 @@
 """Measure how many vehicles a shared radio channel can serve: `python -m docs.generate.channel_capacity`.
 
-Each cell of the measurement is a mission with a radio, a number of agents and a spread of answers. All cells have the
-same seeds. This program draws the picture of the page and writes its tables. The text around them is written by hand.
+Each cell of the measurement is a mission with a radio, a number of agents, and a value of the channel's key
+`processing_s` (the spread). All cells use the same seeds. This program draws the picture for
+docs/explanation/channel-capacity.md and writes the tables of this page. The text around them is written by hand.
 """
 
 import math
@@ -31,7 +32,7 @@ MISSIONS: dict[Mission, tuple[int, ...]] = {
     "busy": (2, 5, 10, 20, 30),
     "split": (2, 5, 10, 20, 30),
 }
-"""Mission -> numbers of agents."""
+"""The numbers of agents with which each mission is measured."""
 RADIOS = ("wifi_1", "wifi_6", "rfd900", "lora_sf7")
 SPREADS_S = (0.0005, 0.005, 0.05, 0.5)
 DEFAULT_SPREAD_S = 0.005
@@ -40,7 +41,7 @@ SEEDS = 10
 DURATION_S = 300.0
 SETTLE_S = 600.0
 BLOCKS = 10
-"""Number of blocks of all agents together in the missions `steady` and `split`."""
+"""Total number of blocks that the agents complete in each of the missions `steady` and `split`."""
 BUSY_BLOCKS_PER_AGENT = 1.5
 EVENT_BYTES = 110
 """Each event completes a block, because `max_block_bytes` has room for one event of this size."""
@@ -48,17 +49,17 @@ MAX_BLOCK_BYTES = 128
 SPLIT_S, APART_S = 60.0, 120.0
 
 CARRIED = 0.95
-"""Minimum share of blocks in every chain for a radio to carry a swarm."""
+"""A radio can serve a swarm if, on average, every chain contains at least this share of the completed blocks."""
 
 SPREAD_SIZES: tuple[tuple[Mission, int], ...] = (("steady", 50), ("busy", 20))
-"""Missions and numbers of agents in the table over the spread."""
+"""Missions and numbers of agents in the table that compares the values of SPREADS_S."""
 ASKING_RADIOS, ASKING_AGENTS = ("wifi_1", "wifi_6", "rfd900"), (10, 20)
 ASKING_MISSIONS: tuple[Mission, ...] = ("busy", "split")
 LINES = ((5, 200.0), (10, 100.0))
-"""Number of vehicles in a line, and the metres between neighbours."""
+"""The number of vehicles in each line, and the metres between neighbours."""
 LINE_SPREADS_S = (0.0005, 0.005, 0.5)
 ANSWER_SPREADS_S = (0.0, 0.05, 0.5, 2.0)
-"""Values of the setting `answer_spread_s`."""
+"""Values of the setting `answer_spread_s` that the page compares."""
 ANSWERING: tuple[tuple[Mission, str, int, float | None], ...] = (
     ("steady", "wifi_1", 50, None),
     ("steady", "wifi_6", 50, None),
@@ -67,7 +68,10 @@ ANSWERING: tuple[tuple[Mission, str, int, float | None], ...] = (
     ("busy", "lora_sf7", 5, None),
     ("steady", "wifi_6", 10, 100.0),
 )
-"""Mission, radio, number of agents, and metres between neighbours in a line, in the table over `answer_spread_s`."""
+"""The rows of the table that compares values of `answer_spread_s`.
+
+Each row has a mission, a radio, a number of agents, and the metres between neighbours in a line (None for a field).
+"""
 
 HEAD, PANEL_HEIGHT, FOOT = 96, 210, 26
 DISTURBED = ("collision", "half_duplex")
@@ -75,7 +79,7 @@ OUT_OF_REACH = ("range", "fade")
 
 
 class Cell(NamedTuple):
-    """A mission with a radio. None means a network without loss."""
+    """A mission with a radio. If `radio` is None, the network loses nothing."""
 
     mission: Mission
     radio: str | None
@@ -83,24 +87,24 @@ class Cell(NamedTuple):
     spread_s: float = DEFAULT_SPREAD_S
     asks_after_commit: bool = False
     line_m: float | None = None
-    """Metres between neighbours in a line. None: the vehicles form a field with 5 m between them."""
+    """Metres between neighbours in a line. If the value is None, the vehicles form a field with 5 m between them."""
     answer_spread_s: float = 0.0
 
 
 class Run(NamedTuple):
-    """The figures of a run. None means that the run does not determine a figure."""
+    """The figures of a run. A figure is None if the run does not determine it."""
 
     finished: bool
     in_every_chain: float
-    """Share of the completed blocks."""
+    """Share of the completed blocks that every chain contains."""
     copies: float
-    """Share of the chains that have a completed block, on average over the blocks."""
+    """Share of the chains that contain a completed block, as the mean over all completed blocks."""
     messages_per_block: float
     airtime_per_block_s: float | None
     disturbed: float | None
-    """Share of the copies of all frames that a receiver lost to other frames or because it was sending."""
+    """Share of the copies of frames that a receiver lost because of a collision or because it was sending."""
     out_of_reach: float | None
-    """Share of the copies of all frames that a receiver lost because of distance or shadowing."""
+    """Share of the copies of frames that a receiver lost because of distance or shadowing."""
     collisions: int | None
     one_chain_after_s: float | None
     """Seconds from the last completed block until all chains are equal."""
@@ -110,7 +114,7 @@ Runs = Mapping[Cell, Sequence[Run]]
 
 
 def cells() -> list[Cell]:
-    """Return all missions of the page."""
+    """Return all cells that the page needs."""
     grid = [
         Cell(mission, radio, agents, spread_s)
         for mission, numbers in MISSIONS.items()
@@ -152,7 +156,7 @@ def scenario(cell: Cell, seed: int) -> Scenario:
 
 
 def play(task: tuple[Cell, int]) -> Run:
-    """Return the figures of the run of a mission with a seed."""
+    """Play a mission with a seed, and return the figures of the run."""
     cell, seed = task
     played = scenario(cell, seed)
     simulated = simulate(played, seed)
@@ -178,7 +182,7 @@ def play(task: tuple[Cell, int]) -> Run:
 
 
 def carried(runs: Runs, mission: Mission, radio: str | None, spread_s: float) -> int:
-    """Return the largest measured number of agents that the radio can serve, or 0."""
+    """Return the largest measured number of agents that the radio can serve, or 0 if it can serve none."""
     most = 0
     for agents in MISSIONS[mission]:
         those = runs[Cell(mission, radio, agents, spread_s)]
@@ -251,7 +255,7 @@ COLUMNS = (
 
 
 def size_row(cell: Cell, those: Sequence[Run]) -> list[str]:
-    """Return the table row of a mission."""
+    """Return the row of a mission in the table of swarm sizes."""
     return [_radio(cell), str(cell.agents), *_figures(those)]
 
 
@@ -363,11 +367,11 @@ SHOWN = {
     "copies disturbed": "disturbed",
     "airtime per block": "airtime_per_block_s",
 }
-"""Title of a panel -> figure of a run."""
+"""The figure that each panel shows, by the title of the panel."""
 
 
 def draw(runs: Runs) -> str:
-    """Draw the mission `busy`: a row of charts for each radio, with a line for each answer delay."""
+    """Draw the mission `busy`. Each radio has a row of charts, and each spread has a line."""
     areas = svg.grid(len(SHOWN) * len(RADIOS), len(SHOWN), HEAD, PANEL_HEIGHT)
     places = [(radio, shown) for radio in RADIOS for shown in SHOWN]
     return svg.document(
@@ -436,7 +440,7 @@ def _description(runs: Runs) -> str:
 
 
 def put(page: str, name: str, table: str) -> str:
-    """Replace the table with this name in the page."""
+    """Replace the table with this name in the text of the page."""
     begin, end = f"<!-- {name}: begin -->\n", f"<!-- {name}: end -->\n"
     before, rest = page.split(begin)
     _, after = rest.split(end)

@@ -33,7 +33,7 @@ from harness.compiled import DIRECTORY, MANIFEST, ROOT, TAG, digest_of, source_o
 
 GROUP = "ucp_harness"
 LIBRARY = f"{GROUP}__mypyc"
-"""The module in which mypyc puts the code of all modules of a group."""
+"""The name of the module in which mypyc stores the code of all modules of a group."""
 MODULES = (
     "harness.archive.vocabulary",
     "harness.checker._distributed",
@@ -72,7 +72,7 @@ MODULES = (
 
 
 def build() -> Path:
-    """Compile the modules. Return the directory with the result, which replaces an earlier one."""
+    """Compile the modules. Return the directory with the result, which replaces an earlier result."""
     digests = {name: digest_of(source_of(name)) for name in MODULES}  # a later edit makes the result obsolete
     suffix = sysconfig.get_config_var("EXT_SUFFIX")
     os.chdir(ROOT)  # mypy reads pyproject.toml there, and the names of modules begin there

@@ -1,6 +1,6 @@
 """Write the growth figures of a matrix into docs/appendix/growth.md: `python -m docs.generate.complexity RUN_DIR`.
 
-The tables and the picture come from RUN_DIR. The text around them is written by hand.
+The tables and the picture are computed from the matrix in RUN_DIR. The text around them is written by hand.
 """
 
 import sys
@@ -30,7 +30,9 @@ PICTURE = PAGE.with_name("growth.svg")
 
 
 def tables(record: MatrixRecord) -> str:
-    """Return Markdown tables: the means at the middle mission length, and the exponents of the laws of growth."""
+    """Return two Markdown tables: the mean figures of missions of the middle length, and the exponents of the laws of
+    growth.
+    """
     return f"{_sizes(record)}\n{_exponents(record)}"
 
 

@@ -1,7 +1,7 @@
 """Measure the cost and the effect of each protocol correction at many loss rates: `python -m docs.generate.cures`.
 
-Each cure uses the same seeds as the default settings. This program writes the tables of the page. The text around them
-is written by hand.
+Runs with a correction use the same seeds as runs with the default settings. This program writes the tables of the page.
+The text around them is written by hand.
 """
 
 import sys
@@ -29,9 +29,9 @@ ALL_IDLE = "All {runs:,} runs of each row became idle in time."
 UNIFORM_AT = Metric("uniform_at_s", "seconds until one chain, of runs that have one", figure("uniform_at_s"))
 TIMER_S = 0.5
 STAGGER: Stagger = {"vote_timeout_s": 0.3, "phase1_timeout_s": 0.15, "phase2_timeout_s": 0.15, "phase3_timeout_s": 0.15}
-"""Each agent's timers are longer than those of the agent before it, by 3 % of the default durations."""
+"""Each agent's timers are longer than those of the agent with the next lower ID, by 3 % of the default durations."""
 SEEDS = 50
-"""Number of seeds, from the start of the matrix's list."""
+"""Number of seeds. The program uses the first seeds of the matrix."""
 
 CURES: dict[str, dict[str, Any]] = {
     "none (thesis)": {},
@@ -49,7 +49,7 @@ CURES: dict[str, dict[str, Any]] = {
 
 
 class Task(NamedTuple):
-    """One run of a matrix."""
+    """A run of the matrix with a correction."""
 
     cure: str
     point: MatrixPoint
@@ -57,14 +57,16 @@ class Task(NamedTuple):
 
 
 def play(matrix: Matrix, task: Task) -> tuple[Figures, bool]:
-    """Return the figures of a run, and true if the swarm became idle."""
+    """Return the figures of a run, and whether the swarm became idle."""
     document = matrix.scenario_at(task.point).model_dump(exclude_unset=True) | CURES[task.cure]
     simulated = simulate(Scenario.model_validate(document), task.seed)
     return simulated.result.figures, simulated.played.settled
 
 
 def tables(jobs: int) -> str:
-    """Return Markdown: a table for each figure, with a row for each correction and a column for each loss rate."""
+    """Return Markdown with a table for each figure. A table has a row for each correction and a column for each loss
+    rate.
+    """
     matrix = load_matrix(MATRIX)
     tasks = [Task(cure, point, seed) for cure in CURES for point in matrix.points for seed in matrix.seed_list[:SEEDS]]
     figures: dict[tuple[str, float], list[Figures]] = defaultdict(list)

@@ -1,8 +1,8 @@
-"""Play field_test_logs.yaml, damage its records as on real flights, and write them into a new directory.
+"""Play field_test_logs.yaml, damage the records of the run as on real flights, and write them into a new directory.
 
     python docs/generate/field_test_logs.py logs
 
-The same scenario and seed give the same logs, to the last byte, for as long as runs in virtual time stay as they are.
+The same scenario and seed give the same bytes, until a change of the code changes runs in virtual time.
 """
 
 import gzip
@@ -21,7 +21,7 @@ NOTES = "Camp Roberts, 2nd UCP test. Wind 250/8. 122 landed first, batteries swa
 
 
 def broken() -> dict[str, bytes]:
-    """Return the files that were copied from six vehicles, by file name."""
+    """Return the damaged files of six vehicles, by file name."""
     with tempfile.TemporaryDirectory() as scratch:
         flight = _flown(load_scenario(SCENARIO), Path(scratch) / "flight")
         before = _flown(Scenario.model_validate(HOVER_TEST), Path(scratch) / "before")

@@ -3,8 +3,8 @@
 Run it with `python -m docs.generate.handlers`.
 
 Chapter 3 of the thesis has one figure for each of the 20 handlers (Figures 3.4-3.23, symbols in Figure 3.3) and an
-outline (Figure 3.2). This diagram in Mermaid combines them. Arrows lead from each handler to the handlers that it
-causes.
+outline (Figure 3.2). This diagram in Mermaid combines these figures. Arrows lead from each handler to the handlers that
+it causes.
 """
 
 from collections.abc import Iterator
@@ -96,7 +96,7 @@ def _row(handler: EventHandler[Any]) -> str:
 
 
 def _causes(handler: EventHandler[Any]) -> Iterator[str]:
-    """Yield the causes of the handler, including the handlers that trigger it."""
+    """Yield the causes of a run of the handler, such as the handlers that trigger it."""
     for message, receiver in ON_MESSAGE.items():
         if receiver is handler:
             yield f"{message.NAME} arrives"

@@ -1,8 +1,9 @@
 """Write the JSON schemas of all documents that other programs read and write.
 
 Pydantic generates the schemas of the harness from its models. `ucp.contract.schemas` builds the schemas of the agent
-contract. Git has neither, because both follow from the code. `tests/harness/schemas.sha256` has their digests. The
-wheel and the site contain the schemas as files. To write them into a folder:
+contract. The repository does not contain the schemas, because this program can generate them.
+`tests/harness/schemas.sha256` has their digests. The wheel and the site contain the schemas as files. To write them
+into a folder:
 
     python -m docs.generate.json_schemas FOLDER
 """
@@ -44,7 +45,7 @@ def generate(name: str) -> dict[str, object]:
 
 
 def texts() -> dict[str, str]:
-    """Return the text of each JSON schema by its path in the installed package."""
+    """Return the text of each JSON schema. The keys are the paths of the schemas in the installed package."""
     documents = {f"harness/schemas/{name}.schema.json": generate(name) for name in MODELS}
     documents |= {f"ucp/contract/schemas/{name}.schema.json": schemas.generate(name) for name in schemas.DOCUMENTS}
     return {path: json.dumps(document, indent=1) + "\n" for path, document in documents.items()}

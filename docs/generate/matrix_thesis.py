@@ -1,6 +1,6 @@
 """Compare a matrix with the observations in Section 4.3 of the thesis: `python -m docs.generate.matrix_thesis RUN_DIR`.
 
-The table and the picture come from RUN_DIR. The text around them is written by hand.
+The table and the picture are computed from the matrix in RUN_DIR. The text around them is written by hand.
 """
 
 import sys
@@ -31,7 +31,9 @@ OBSERVED = {
 
 
 def table(record: MatrixRecord) -> str:
-    """Return Markdown: for each loss rate, the observation of the thesis and the means with confidence intervals."""
+    """Return a Markdown table. Each row has a loss rate, the observation of the thesis, and the means with confidence
+    intervals.
+    """
     headers = ["loss", "Section 4.3", *(metric.label for metric in METRICS)]
     lines = [headers, ["--:", "---", *("--:" for _ in METRICS)], *map(_row, record.cells)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

@@ -1,4 +1,7 @@
-"""Write the table of settings in the agent contract from their declarations: `python -m docs.generate.settings`."""
+"""Write the table of settings in the agent contract: `python -m docs.generate.settings`.
+
+The table is generated from the declarations of the settings.
+"""
 
 import json
 from pathlib import Path

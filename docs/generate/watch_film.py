@@ -1,7 +1,8 @@
 """Record the animated picture of the live page in the README: `python -m docs.generate.watch_film`.
 
-The script plays a scenario in virtual time, opens its film in a headless Chromium, goes through the mission, and writes
-the screenshots as an animated WebP. It needs Chromium, and the packages aiohttp and Pillow.
+The script plays a scenario in virtual time, and opens the replay of the run in a headless Chromium. It takes
+screenshots at regular mission times, and writes them as an animated WebP. It needs Chromium, and the packages aiohttp
+and Pillow.
 """
 
 import re
@@ -18,11 +19,11 @@ from tests.harness.report.browser import Browser, open_browser
 PICTURE = Path(__file__).parents[1] / "watch.webp"
 SCENARIO, SEED = "partition_heal", 1
 WIDTH, HEIGHT = 1280, 800
-"""Size of the window."""
+"""Size of the browser window in pixels."""
 SCALE = 0.7
-"""Size of the picture relative to the window."""
+"""Size of the picture divided by the size of the window."""
 STEP_S = 10
-"""Mission seconds from one frame to the next."""
+"""Mission seconds between two frames of the picture."""
 FRAME_MS = 250
 QUALITY = 30
 MAX_BYTES = 1_000_000
@@ -30,7 +31,7 @@ HARNESS = [sys.executable, "-m", "harness.cli"]
 
 
 def main() -> None:
-    """Write the picture. Fail if it is too large for the README."""
+    """Write the picture. Fail if the file is too large for the README."""
     with TemporaryDirectory() as directory:
         run = Path(directory) / "run"
         play = ["run", SCENARIO, "--backend", "sim", "--seed", str(SEED), "--out", str(run)]
@@ -50,7 +51,7 @@ def main() -> None:
 
 
 def record(browser: Browser, address: str, shot: Path) -> list[Image.Image]:
-    """Return a picture of the page for every few seconds of the mission."""
+    """Return the animated picture, with a frame for every few seconds of the mission."""
     browser.show(address, width=WIDTH, height=HEIGHT, scheme="light")
     while not browser.evaluate("Boolean(window.watch && window.watch.story.end)"):
         pass

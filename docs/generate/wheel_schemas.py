@@ -1,4 +1,5 @@
-"""Add generated files when the Python package is built: JSON schemas, and compiled modules if UCP_COMPILE is 1.
+"""Add generated files when the Python package is built. These are the JSON schemas, and compiled modules if UCP_COMPILE
+is 1.
 
 An editable install has no schema files. The code generates a schema when it needs one. Without UCP_COMPILE, the wheel
 is pure Python, and a build needs no compiler. A wheel with compiled modules is for one version of Python and one

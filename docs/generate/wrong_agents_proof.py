@@ -1,9 +1,9 @@
 """Print a table of the deliberate errors that a proof detects: `python -m docs.generate.wrong_agents_proof [QUIRK
 ...]`.
 
-The page is docs/appendix/proof-bounds.md. Each quirk is examined twice. First, each step is compared with that of a
-correct agent, within small bounds. Second, the prover searches for a violation within bounds in which all properties
-hold for correct agents.
+The page is docs/appendix/proof-bounds.md. The program examines each quirk twice. First, it compares each step within
+small bounds with the step of a correct agent. Second, it searches for a violated property within bounds in which
+correct agents violate none.
 """
 
 import sys
@@ -24,7 +24,7 @@ from ucp.quirks import QUIRKS
 MOST_S = 60.0
 MOST_BYTES = 4e9
 SMALL = Bounds(2, 2, "lossy", reduced=False)
-"""All properties hold for correct agents (tests/harness/proof)."""
+"""Bounds within which correct agents violate no property (tests/harness/proof)."""
 TRIED = (
     SMALL,
     replace(SMALL, faults=("duplicate",)),
@@ -34,7 +34,7 @@ TRIED = (
     replace(SMALL, blocks=3),
     replace(SMALL, agents=4),
 )
-"""Bounds in which a wrong step is searched for, in this order."""
+"""Bounds within which the program searches for a wrong step, in this order."""
 
 
 class WrongStep(NamedTuple):
@@ -61,7 +61,7 @@ def wrong_step(quirk: str, most_s: float = MOST_S) -> WrongStep | str:
 
 
 def _first_flaw(bounds: Bounds, most_s: float) -> tuple[PropertyViolation | None, int, Ended]:
-    """Return the violation nearest to the initial state, and its distance."""
+    """Return the violation nearest to the initial state, its distance, and the end of the search."""
     if bounds.network == "any":
         collected = collect(bounds, most_bytes=MOST_BYTES, most_s=most_s)
         return collected.flaw, len(collected.way), collected.ended
@@ -71,7 +71,7 @@ def _first_flaw(bounds: Bounds, most_s: float) -> tuple[PropertyViolation | None
 
 
 def violation(quirk: str, most_s: float = MOST_S) -> str:
-    """Return the first property that does not hold within small bounds."""
+    """Return the first property that an agent with this error violates within small bounds."""
     graph = explore(ModelSwarm(_with(quirk, SMALL)), most_bytes=MOST_BYTES, most_s=most_s)
     if graph.flaw is not None:
         return f"characteristic {graph.flaw.kind}" if graph.flaw.kind.isdecimal() else graph.flaw.kind
@@ -92,7 +92,7 @@ def _with(quirk: str, bounds: Bounds) -> Bounds:
 
 
 def row(quirk: str) -> str:
-    """Return one row of the table."""
+    """Return the table row of an error."""
     algorithms = ", ".join(map(str, QUIRKS[quirk].algorithms))
     step = wrong_step(quirk)
     if isinstance(step, WrongStep):

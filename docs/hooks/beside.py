@@ -1,8 +1,9 @@
 """Add pages from outside the folder `docs/` to the documentation site.
 
-The README is the start page of the site. Each file that a page links to becomes part of the site, under its path in the
-repository. A link to a folder leads to the README of the folder. If the folder has no README, the link becomes plain
-text. The repository does not contain the JSON Schemas: this hook generates them at the paths that the pages link to.
+The README is the start page of the site. Each file to which a page links becomes part of the site. Its path on the site
+is its path in the repository. A link to a folder leads to the README of the folder. If the folder has no README, the
+link becomes plain text. The repository does not contain the JSON schemas. This hook generates them at the paths in the
+links.
 """
 
 import os
@@ -48,7 +49,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Return the page with links that work between pages of the site."""
+    """Return the text of the page with links that work on the site."""
     source = ROOT / "README.md" if page.file.src_uri == HOME else _source(page.file.src_uri)
     here = posixpath.dirname(page.file.src_uri) or "."
 
@@ -83,7 +84,7 @@ def _targets(page: Path) -> list[Path]:
 
 
 def _resolved(page: Path, target: str) -> Path | None:
-    """Return the file to which a link points, or None for a folder without a README.
+    """Return the file to which a link points. Return None if the link points to a folder without a README.
 
     Raises PluginError if the target does not exist.
     """

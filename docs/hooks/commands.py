@@ -23,7 +23,7 @@ GROUPS = {
     "prove": "Prove properties and test agents",
     "this machine": "Set up the machine",
 }
-"""Name of a panel of `ucp-harness --help` -> heading on the page."""
+"""The heading on the page for each panel of `ucp-harness --help`."""
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -69,7 +69,7 @@ def _command(call: str, command: Any) -> Iterator[str]:
 
 
 def _place(argument: Any) -> str:
-    """Return the argument as the usage shows it."""
+    """Return the argument in the form in which the usage line shows it."""
     name = argument.metavar or argument.name.upper()
     if not argument.required and not name.startswith("["):
         name = f"[{name}]"
@@ -83,7 +83,7 @@ def _names(option: Any, context: Any) -> str:
 
 
 def _described(option: Any, context: Any) -> str:
-    """Return the help text of an option with its default and range."""
+    """Return the help text of an option, with its default and its allowed range."""
     _, text = option.get_help_record(context)
     panel = option.rich_help_panel
     return f"{panel}: {text}" if panel and panel.startswith("With") else str(text)

@@ -23,7 +23,7 @@ DEFAULT_SEED = 1
 
 
 class Example(NamedTuple):
-    """A scenario with one run of it."""
+    """A scenario and a run of it."""
 
     name: str
     scenario: Scenario
@@ -32,14 +32,14 @@ class Example(NamedTuple):
 
     @property
     def picture(self) -> ChainTreePicture:
-        """The chains at the end of the mission, before any final reconcile."""
+        """The picture of the chains at the end of the mission, before any final reconcile."""
         exports = self.run.evidence.before_final_reconcile or self.run.evidence.exports
         return ChainTreePicture(exports, inks(self.scenario.roster), key=self.name)
 
 
 @cache
 def examples() -> tuple[Example, ...]:
-    """Play the first expected seed of each scenario."""
+    """Play each scenario with its first expected seed."""
     found = []
     for path in sorted(SCENARIOS.glob("*.yaml")):
         if not path.stem.endswith("_matrix"):

@@ -23,7 +23,7 @@ ABOUT = {
     "Offset": "A position relative to the first home: metres east, north and up, and a heading in degrees.",
     "Settings": "Settings of all agents. Durations are mission seconds, sizes are bytes.",
 }
-"""Name of a model -> introduction of its table, for models whose schema has no description."""
+"""The introduction of a model's table, for models without a description in the schema."""
 QUIRKS_SECTION = "Quirks"
 ABOUT_QUIRKS = """A quirk is a mistake that an agent makes on purpose. `crash_on_tie: true` applies to all agents, and
 `crash_on_tie: {agents: [2, 3]}` to agents 2 and 3. `ignore_commit: 0.2` sets the probability of the mistake for all
@@ -79,7 +79,7 @@ def _table(name: str, schema: dict[str, Any], models: dict[str, type[BaseModel]]
 
 
 def _type(schema: dict[str, Any]) -> str:
-    """Return a text about the allowed values."""
+    """Return a description of the values that a key allows."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
         return f"[{name}](#{name.lower()})"
@@ -112,7 +112,7 @@ def _type(schema: dict[str, Any]) -> str:
 
 
 def _models(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
-    """Return the model and all models that it contains, by name."""
+    """Return the model and all models that it contains, directly or indirectly. The keys are their names."""
     found: dict[str, type[BaseModel]] = {}
 
     def visit(annotation: Any) -> None:
@@ -128,7 +128,7 @@ def _models(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
 
 
 def _docstrings(model: type[BaseModel]) -> dict[str, str]:
-    """Return the docstring of each attribute of a model and its base classes, from the source."""
+    """Return the docstring of each attribute of a model and of its base classes. They are read from the source code."""
     documented: dict[str, str] = {}
     for base in reversed(model.__mro__):
         if base.__module__.startswith("harness."):

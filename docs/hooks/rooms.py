@@ -25,7 +25,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def uses(rooms: list[str]) -> Counter[tuple[str, str]]:
-    """Return, for each pair of packages, the number of files in the first that import the second."""
+    """Count, for each pair of packages, the files of the first package that import the second package."""
     counted: Counter[tuple[str, str]] = Counter()
     for room in rooms:
         for path in (ROOT / "harness" / room).rglob("*.py"):
@@ -41,7 +41,9 @@ def _imported(path: Path) -> Iterator[str]:
 
 
 def picture(rooms: list[str], counted: Counter[tuple[str, str]]) -> str:
-    """Return an SVG table with a row for each package. Darker marks mean that more files import the package."""
+    """Return an SVG table of imports with a row for each package. A darker cell means that more files import the
+    package.
+    """
     size = len(rooms) * CELL
     most = max(counted.values())
     parts = []

@@ -13,7 +13,9 @@ BOOSTS = {
     "reference/scenario-keys.md": 0.25,
     "CHANGELOG.md": 0.25,
 }
-"""Start of the path of a page -> factor of its score in a search. All other pages have the factor 1."""
+"""Factors of search scores. A page whose path begins with a key has the factor of this key. Other pages have the factor
+1.
+"""
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -1,6 +1,6 @@
 """`python -m tests.fuzz [TARGET ...] [--seconds 60] [--random] [--inputs N]`: give hostile input to all readers.
 
-`--seconds` is the time for each target, and `--inputs` is a number of inputs in place of a time. If `atheris` is
+`--seconds` is the time for each target. `--inputs` limits the number of inputs for each target instead. If `atheris` is
 installed (`pip install -e '.[test,fuzz]'`), coverage guides the mutations. Without it, or with `--random`, the stored
 inputs are mutated at random. New inputs that cover more code are stored in .fuzz for the next call. Failing inputs are
 stored in .fuzz/failures, and the exit status is then 1. Readers get their inputs as files in memory, because a disk
@@ -33,7 +33,7 @@ MOST_BYTES = 65536
 MOST_MIB = 1024
 MEMORY = Path("/dev/shm")  # noqa: S108
 PATIENCE_S = 900
-"""Additional seconds for the start and the last input of a target, on a busy machine."""
+"""Additional seconds for a target on a busy machine, for its start and its last input."""
 
 
 def main() -> int:
@@ -57,7 +57,7 @@ def main() -> int:
 
 
 def _guided(name: str, seconds: int, limit: int | None) -> bool:
-    """Fuzz a target with coverage guidance for some seconds, or with `limit` inputs. Return whether no input fails.
+    """Fuzz a target with coverage guidance for some seconds, or with `limit` inputs. Return false if an input fails.
 
     The target runs in a new process, because libFuzzer ends its process.
     """
@@ -91,7 +91,7 @@ def _guided(name: str, seconds: int, limit: int | None) -> bool:
 
 
 def _where_it_hangs(running: "subprocess.Popen[bytes]") -> None:
-    """Make a hanging process write its stack to its log, and its input to the failures. Then kill it."""
+    """Let a hanging process write its stack to its log. Store its input as a failure, and kill the process."""
     for number in (signal.SIGUSR1, signal.SIGABRT):
         running.send_signal(number)
         time.sleep(1)
@@ -100,7 +100,7 @@ def _where_it_hangs(running: "subprocess.Popen[bytes]") -> None:
 
 
 def _at_random(name: str, seconds: int, limit: int | None) -> bool:
-    """Fuzz a target with random mutations for some seconds, or with `limit` inputs. Return whether no input fails."""
+    """Fuzz a target with random mutations for some seconds, or with `limit` inputs. Return false if an input fails."""
     target, kept = named(name), [path.read_bytes() for path in files_of(name)]
     began, inputs, problem = time.monotonic(), 0, ""
     for data in mutated(kept, seed=time.time_ns()):

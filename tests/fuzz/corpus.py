@@ -1,4 +1,7 @@
-"""Find the stored inputs of each target: former failures (`regression-NAME`), and inputs with the most coverage."""
+"""Find the stored inputs of each target.
+
+These are inputs that once failed (`regression-NAME`), and the inputs that cover the most code.
+"""
 
 from pathlib import Path
 
@@ -9,6 +12,6 @@ MOST_BYTES = 500_000
 
 
 def files_of(name: str) -> list[Path]:
-    """Return the stored inputs of a target, or an empty list."""
+    """Return the stored inputs of a target. The list may be empty."""
     folder = FOLDER / name
     return sorted(path for path in folder.iterdir()) if folder.is_dir() else []

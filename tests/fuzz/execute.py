@@ -9,13 +9,15 @@ from tests.fuzz.targets import Target
 
 
 def executed(target: Target, data: bytes) -> None:
-    """Run the target with an input. Raises FailedError above the limits, and all exceptions of the target."""
+    """Run the target with the input. Raises FailedError if the run exceeds a limit, and all exceptions of the
+    target.
+    """
     with bounded():
         target.run(data)
 
 
 def mutated(inputs: Sequence[bytes], seed: int) -> Iterator[bytes]:
-    """Yield damaged copies of the inputs without end. The same seed always gives the same copies."""
+    """Yield damaged copies of the inputs, without end. The same seed always gives the same copies."""
     chance = random.Random(seed)
     while True:
         yield damaged(chance.choice(inputs), chance)

@@ -8,9 +8,9 @@ from types import FrameType
 from typing import Any
 
 MOST_S = 20.0
-"""Maximum processor time of an input in seconds. A busy machine does not affect it."""
+"""Maximum processor time for an input in seconds. The load of the machine does not affect it."""
 MOST_WALL_S = 300.0
-"""Maximum wall time of an input in seconds, for a reader that waits."""
+"""Maximum wall time for an input in seconds. It applies to readers that wait without computing."""
 MOST_GROWTH_BYTES = 512 * 1024 * 1024
 LONGEST_SENTENCE = 2000
 
@@ -21,8 +21,9 @@ class FailedError(AssertionError):
 
 @contextmanager
 def bounded() -> Iterator[None]:
-    """Raise FailedError if the code inside takes longer than MOST_S or MOST_WALL_S, or more memory than
-    MOST_GROWTH_BYTES.
+    """Raise FailedError if the code in the block exceeds a limit.
+
+    The limits are MOST_S for processor time, MOST_WALL_S for wall time, and MOST_GROWTH_BYTES for additional memory.
     """
 
     def too_long(signal_number: int, frame: FrameType | None) -> None:
@@ -45,7 +46,7 @@ def bounded() -> Iterator[None]:
 
 
 def sound(sentence: str) -> None:
-    """Raise FailedError unless an error message is one short line without a traceback."""
+    """Raise FailedError unless the error message is one short line without a traceback."""
     require(len(sentence) < LONGEST_SENTENCE, f"a sentence of {len(sentence)} characters: {sentence[:200]}")
     require("\n" not in sentence, f"more than a sentence: {sentence[:200]}")
     require("Traceback" not in sentence, f"a traceback: {sentence[:200]}")

@@ -1,7 +1,8 @@
 """Fuzz a target with coverage guidance: `python -m tests.fuzz.guided [--blind] TARGET [libFuzzer's options] FOLDER...`
 
-Half of the mutations are libFuzzer's, and half are those of `tests.fuzz.mutations`. For comparison, `--blind` mutates
-the stored inputs at random, and ignores the coverage. libFuzzer prints the path of a failing input last.
+libFuzzer makes half of the mutations, and `tests.fuzz.mutations` makes the other half. For comparison, `--blind`
+mutates the stored inputs at random and ignores the coverage. The last line that libFuzzer prints is the path of the
+failing input.
 """
 
 import faulthandler

@@ -1,7 +1,8 @@
 """Select the inputs in tests/corpus again: `python -m tests.fuzz.keep [TARGET ...]`.
 
-The candidates are the seeds, the inputs that `python -m tests.fuzz` left in .fuzz, and the stored inputs. The
-selection covers the most pairs of successive lines of the project. Smaller inputs are preferred. All regressions stay.
+The candidates are the seeds, the inputs that `python -m tests.fuzz` left in .fuzz, and the stored inputs. The program
+selects the inputs that cover the most pairs of successively executed lines of the project. It prefers small inputs, and
+keeps all regressions.
 """
 
 import hashlib
@@ -21,7 +22,7 @@ from tests.fuzz.targets.home import run_of_three
 MOST_FILES = 11
 MOST_BYTES = 45_000
 MOST_BYTES_EACH = 40_000
-"""Maximum number and sizes of the selected inputs of a target."""
+"""Maximum number and maximum sizes of the selected inputs of a target."""
 _PROJECT = tuple(str(Path(__file__).parents[2] / room) for room in ("ucp", "harness", "netem", "sitl"))
 
 Way = tuple[str, int, int]
@@ -51,7 +52,10 @@ def _keep(name: str, flown: Path) -> list[bytes]:
 
 
 def _best(ways: dict[bytes, frozenset[Way]]) -> Iterator[bytes]:
-    """Yield the inputs to keep: repeatedly the one that covers the most new pairs of lines, within the limits."""
+    """Yield the inputs to keep, within the limits.
+
+    Each is the input that covers the most pairs of lines that no earlier one covers.
+    """
     covered: set[Way] = set()
     left = MOST_BYTES
     for _ in range(MOST_FILES):

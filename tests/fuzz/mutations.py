@@ -1,4 +1,4 @@
-"""Damage files at random, as on real flights, by careless users or by attackers. A seed determines the damage."""
+"""Damage files at random, as real flights, careless users or attackers do. A seed determines the damage."""
 
 import json
 import random
@@ -17,7 +17,7 @@ _RAW = (
     *("NaN", "Infinity", "-Infinity", "1e999", "9" * 5000, "0" * 5000, "01", "1.", "'a'", "undefined", "\\", '"'),
     *("[" * _DEEP, '{"a":' * _DEEP, "[" * 200 + "]" * 200, '"\\ud800"', '"\\u0000"', "{", "}", ",", ",,", "\t", "\x00"),
 )
-"""Texts in place of a JSON value that Python's json module would not write."""
+"""Texts that replace a JSON value. Python's json module would not write them."""
 
 
 def flip_bits(content: bytes, chance: random.Random) -> bytes:
@@ -56,14 +56,14 @@ def repeat_a_part(content: bytes, chance: random.Random) -> bytes:
 
 
 def set_bytes(content: bytes, chance: random.Random) -> bytes:
-    """Return the file with some bytes replaced by extreme numbers, which may be lengths in a binary format."""
+    """Return the file with some bytes replaced by extreme numbers. In a binary format, these bytes may be a length."""
     place = chance.randrange(len(content) + 1)
     value = chance.choice((b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\0\x40", b"\1\0\0\0" * 2))
     return content[:place] + value + content[place + len(value) :]
 
 
 def move_lines(content: bytes, chance: random.Random) -> bytes:
-    """Return the file with some lines repeated, exchanged, removed or joined."""
+    """Return the file with some lines repeated, swapped, removed or joined."""
     lines = content.splitlines(keepends=True)
     if not lines:
         return content
@@ -87,7 +87,7 @@ def of_windows(content: bytes, chance: random.Random) -> bytes:
 
 
 def change_a_value(content: bytes, chance: random.Random) -> bytes:
-    """Return the file with a different value at one place of a JSON document."""
+    """Return the file with one value of its JSON document changed."""
     text = content.decode("utf-8", "surrogateescape")
     lines = [text] if text.startswith("{\n") else text.splitlines(keepends=True)
     number = chance.randrange(len(lines)) if lines else 0
@@ -104,7 +104,7 @@ def change_a_value(content: bytes, chance: random.Random) -> bytes:
 
 
 def _put(document: Any, chance: random.Random, value: Any) -> bool:
-    """Set a random key of the document to `value`, or remove it. Return true on success."""
+    """Set a random key of the document to `value`, or remove the key. Return true on success."""
     while True:
         if isinstance(document, dict) and document:
             key = chance.choice(list(document))

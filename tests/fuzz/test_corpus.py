@@ -1,4 +1,6 @@
-"""Run each fuzz target with its stored inputs and a few random ones. `make fuzz` tries millions."""
+"""Run each fuzz target with its stored inputs and a few random ones. `make fuzz` runs the targets with millions of
+inputs.
+"""
 
 from itertools import islice
 

@@ -1,4 +1,7 @@
-"""Write packet capture files for tests: with given packets, or from agents in a simulated network."""
+"""Write packet capture files for tests.
+
+The packets are given by the test, or come from agents in a simulated network.
+"""
 
 import json
 import struct
@@ -17,7 +20,7 @@ INBOUND, OUTBOUND = 1, 2
 
 
 def frame(sender: int, datagram: bytes, port: int = PORT) -> bytes:
-    """Return the Ethernet frame in which a vehicle broadcasts the datagram, with valid checksums."""
+    """Return the Ethernet frame of a vehicle that broadcasts the datagram, with valid checksums."""
     addresses = bytes(int(part) for part in f"{address(sender)}.{BROADCAST}".split("."))
     udp = struct.pack("!4H", PORT, port, 8 + len(datagram), 0)
     udp_sum = checksum(addresses + struct.pack("!2H", 17, 8 + len(datagram)) + udp + datagram)
@@ -69,7 +72,7 @@ class PcapNg:
 
 
 def pcap(packets: Iterable[tuple[int, bytes]], link_type: int = 1) -> bytes:
-    """Return a file in the older pcap format. A packet is a pair of microseconds and frame."""
+    """Return a file in the older pcap format. Each packet is given as its time in microseconds and its frame."""
     data = struct.pack("<I2H2i2I", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link_type)
     for time_us, packet in packets:
         data += struct.pack("<4I", *divmod(time_us, 1_000_000), len(packet), len(packet)) + packet
@@ -77,7 +80,7 @@ def pcap(packets: Iterable[tuple[int, bytes]], link_type: int = 1) -> bytes:
 
 
 class CaptureScript:
-    """Packet captures of scripted messages, with their sender, mission second, and the delay to each receiver."""
+    """Packet captures of scripted messages. A script gives the sender, mission second and delays of each message."""
 
     def __init__(self, *vehicles: int) -> None:
         self.files = {vehicle: PcapNg(vehicle) for vehicle in vehicles}
@@ -112,12 +115,12 @@ class CaptureScript:
                 self.record(receiver, at_s + delay, INBOUND, datagram)
 
     def record(self, vehicle: int, at_s: float, direction: int, datagram: bytes) -> None:
-        """Add a datagram to the capture of a vehicle. Its bytes 4 to 7 name the sender."""
+        """Add a datagram to the capture of a vehicle. Bytes 4 to 7 of the datagram contain its sender."""
         data = frame(int.from_bytes(datagram[4:8], "big"), datagram)
         self.files[vehicle].packet(wall_ns(at_s), direction, data)
 
     def finish(self, at_s: float, *vehicles: int) -> None:
-        """Complete the captures of `vehicles`, or of all vehicles, with statistics."""
+        """Add the statistics that end a capture to the captures of `vehicles`. By default, do this for all vehicles."""
         for vehicle in vehicles or self.files:
             self.files[vehicle].statistics(wall_ns(at_s))
 
@@ -126,7 +129,10 @@ class CaptureScript:
 
 
 class Captures:
-    """Packet captures of all vehicles in a simulated network. `sent` and `heard` are the expected deliveries."""
+    """Packet captures of all vehicles in a simulated network.
+
+    `sent` contains the sent datagrams. `heard` contains each received datagram with its receiver.
+    """
 
     def __init__(self, air: Air) -> None:
         self.air = air
@@ -159,7 +165,7 @@ class Captures:
         self.files[vehicle].packet(wall_ns(self.air.now), direction, data)
 
     def lost(self) -> set[tuple[bytes, int]]:
-        """Return a pair of datagram and vehicle for each vehicle that missed a datagram."""
+        """Return each datagram that a vehicle missed, as a pair of datagram and vehicle."""
         return {
             (datagram, listener)
             for datagram in self.sent
@@ -168,7 +174,7 @@ class Captures:
         }
 
     def write(self, run: Path, *without: int) -> Path:
-        """Write complete packet captures into a run directory, except for the vehicles in `without`."""
+        """Write complete packet captures into a run directory, without those of the vehicles in `without`."""
         for file in self.files.values():
             file.statistics(wall_ns(self.air.now))
         return write_files(run, self.files, without)

@@ -13,22 +13,25 @@ HEADER = "| attacker | attack | 1 | 2 | 3 | 4 | 5 | 6 | dropped because |\n|---|
 
 
 OTHERS, ITSELF, NONE = "\u2718", "(\u2718)", "\u00b7"
-"""The mark of a characteristic: violated by others or the swarm as a whole, by vehicle 3 alone, or not at all."""
+"""Symbols for the verdict on a characteristic.
+
+OTHERS: other vehicles or the swarm as a whole violate it. ITSELF: only vehicle 3 violates it. NONE: it is not violated.
+"""
 
 SWARM = 0
-"""Stands for the swarm as a whole if a violation has no agent."""
+"""The agent ID that stands for the swarm as a whole if a violation names no agent."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The verdict on each characteristic, and the reasons for dropped datagrams. The most frequent is first."""
+    """The symbol for each characteristic, and the reasons for dropped datagrams. The most frequent reason is first."""
 
     marks: dict[str, str]
     dropped: list[str]
 
 
 def outcome(row: Row) -> Outcome:
-    """Return the combined result of all seeds."""
+    """Play the attack with each seed, and return the combined result."""
     guilty: dict[str, set[int]] = {key: set() for key in CHARACTERISTICS}
     dropped = Counter[str]()
     for seed in SEEDS:

@@ -1,8 +1,9 @@
 """Find agents with deliberate errors by `replay` of their traces: `python -m docs.generate.wrong_agents.at_the_desk
 [QUIRK ...]`.
 
-The agents run as processes. The rows of these quirks, or of all, are written into docs/appendix/wrong-agents-field.md.
-The text of the page is written by hand.
+The agents run as processes. The program writes the table rows of the named quirks into
+docs/appendix/wrong-agents-field.md. Without an argument, it writes the rows of all quirks. The text of the page is
+written by hand.
 """
 
 import shutil
@@ -32,14 +33,14 @@ PAGE = Path(__file__).parents[2] / "appendix/wrong-agents-field.md"
 MISSION = Path(__file__).parent / "desk.yaml"
 JOBS = 2
 MOST_RUNS = 8
-"""Maximum number of runs per quirk. A mistake may need a situation that the first run does not have."""
+"""Maximum number of runs per quirk. The first run may lack the situation in which the error occurs."""
 SHOWN = 160
 HEADER = "| quirk | Algorithm | named first | correct | minutes | runs | difference |\n|---|--:|---|--:|--:|--:|---|\n"
 
 
 @dataclass(frozen=True)
 class Named:
-    """The first difference in a record. `handler` is None if the difference belongs to no handler."""
+    """The first difference in a record. `handler` is None if the difference cannot be assigned to a handler."""
 
     t: float
     handler: str | None
@@ -48,7 +49,7 @@ class Named:
 
 @dataclass(frozen=True)
 class AtTheDesk:
-    """The first difference in each record of the last run. Records without a difference are not included."""
+    """The first difference in each record of the last run. Records without a difference are left out."""
 
     runs: int
     records: int
@@ -56,7 +57,7 @@ class AtTheDesk:
 
 
 def at_the_desk(quirk: str) -> AtTheDesk:
-    """Play runs until a record differs, at most `MOST_RUNS` times."""
+    """Play runs with this error until a record differs from a correct agent, at most `MOST_RUNS` runs."""
     value = PROBABILITY if QUIRKS[quirk].chance else True
     scenario = load_scenario(MISSION).model_copy(update={"quirks": {quirk: value}})
     records, named = 0, list[Named]()
@@ -83,7 +84,7 @@ def _first_differences(traces: Sequence[Path]) -> Iterator[Named]:
 
 
 def row(quirk: str, brought: AtTheDesk) -> str:
-    """Return a line of the table."""
+    """Return the table row of an error."""
     about = QUIRKS[quirk]
     first = min(brought.named, key=lambda named: named.t, default=None)
     cells = [f"`{quirk}`", ", ".join(map(str, about.algorithms))]
@@ -106,7 +107,7 @@ def _is_of(handler: str | None, quirk: str) -> bool:
 
 
 def main(names: Sequence[str]) -> None:
-    """Test these deliberate errors, or all if none is named. Other table rows stay the same."""
+    """Test the named errors, or all errors if none is named. Keep the other rows of the table."""
     with sweep(list(names or QUIRKS), at_the_desk, JOBS, what="quirks", in_order=False) as outcomes:
         for quirk, brought in outcomes:
             if isinstance(brought, FailedTask):

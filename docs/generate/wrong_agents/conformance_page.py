@@ -1,9 +1,10 @@
 """Test agents with deliberate errors with the conformance test: `python -m docs.generate.wrong_agents.conformance_page
 [QUIRK ...]`.
 
-The vectors are played in virtual time. This compares the same outputs as UDP, and the expiry of the next timer. An
-agent that passes them also plays the handwritten cases over UDP. The rows of these quirks, or of all, are written into
-docs/appendix/wrong-agents-conformance.md. The text around them is written by hand.
+The vectors are played in virtual time. In virtual time, the test compares the same outputs as over UDP, and also the
+expiry of the next timer. An agent that passes the vectors also plays the handwritten cases over UDP. The program writes
+the table rows of the named quirks into docs/appendix/wrong-agents-conformance.md. Without an argument, it writes the
+rows of all quirks. The text around the table is written by hand.
 """
 
 import sys
@@ -31,11 +32,13 @@ NOTHING = "**nothing**"
 ALIKE = {
     "count_no_votes": "commit_whatever_the_vote",
 }
-"""Quirk -> quirk of another Algorithm with the same effect outside the agent."""
+"""For a quirk, another quirk that has the same effect outside the agent but belongs to another Algorithm."""
 
 
 def test(quirk: str) -> ConformanceResults:
-    """Run the conformance test for an agent with this error, and return the results. Raises HarnessError."""
+    """Run the conformance test for an agent with this error, and return the results. Raises HarnessError if the test
+    cannot run.
+    """
     command = (sys.executable, "-P", "-m", quirky.__name__, quirk)
     with TemporaryDirectory(prefix="ucp-conformance-") as place:
         results = conform(ConformanceRequest(command, None, None, virtual=True), Path(place), _no_progress, _vectors())
@@ -57,7 +60,7 @@ def _vectors() -> list[VectorSet]:
 
 
 def row(quirk: str, results: ConformanceResults) -> str:
-    """Return a line of the table: the accused Algorithms with their number of failures."""
+    """Return the table row of an error. It lists the accused Algorithms with the number of failures of each."""
     about = QUIRKS[quirk]
     named = Counter(case.algorithm for case in results.failures)
     words = ", ".join(f"{algorithm or 'program'} ({count})" for algorithm, count in named.most_common())
@@ -75,7 +78,7 @@ def row(quirk: str, results: ConformanceResults) -> str:
 
 
 def main(names: Sequence[str]) -> None:
-    """Test these deliberate errors, or all if none is named. Other table rows stay the same."""
+    """Test the named errors, or all errors if none is named. Keep the other rows of the table."""
     for quirk in names or QUIRKS:
         began = time.monotonic()
         try:

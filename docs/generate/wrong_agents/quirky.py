@@ -1,7 +1,7 @@
 """Run an agent with a deliberate error: `python -m docs.generate.wrong_agents.quirky QUIRK MISSION_FILE`, or `QUIRK
 --virtual`.
 
-It is `python -m ucp.node`, and adds this quirk to every mission.
+The program is the same as `python -m ucp.node`, except that it adds this quirk to every mission.
 """
 
 import json
@@ -14,11 +14,11 @@ from ucp import node, virtual
 from ucp.quirks import QUIRKS
 
 PROBABILITY = 0.2
-"""The probability of a quirk that has one."""
+"""The probability of the error, for quirks that need a probability."""
 
 
 def wrong(mission: dict[str, Any], quirk: str) -> dict[str, Any]:
-    """Return the mission file with this deliberate error."""
+    """Return the mission file with the deliberate error added."""
     quirks = {**mission.get("quirks", {}), quirk: PROBABILITY if QUIRKS[quirk].chance else True}
     features = list(dict.fromkeys([*mission.get("features", []), "quirks"]))
     return {**mission, "quirks": quirks, "features": features}

@@ -30,7 +30,7 @@ HEADER = (
 )
 
 Trials = dict[int, Trial]
-"""The right trial of each seed."""
+"""The trial of each seed."""
 
 
 def findings_of(wrong: Trial, right: Trial) -> dict[str, float | None]:
@@ -39,7 +39,9 @@ def findings_of(wrong: Trial, right: Trial) -> dict[str, float | None]:
 
 
 def row(quirk: str, wrong: Trials, right: Trials) -> str:
-    """Return a line of the table: the checks that detect the error, how often, and when."""
+    """Return the table row of an error: the checks that detect it, the number of seeds, and the time until
+    detection.
+    """
     about = QUIRKS[quirk]
     findings = {seed: findings_of(trial, right[seed]) for seed, trial in wrong.items()}
     counts = Counter(key for finding in findings.values() for key in finding)
@@ -64,7 +66,7 @@ def row(quirk: str, wrong: Trials, right: Trials) -> str:
 
 
 def first_found(seed: int, finding: dict[str, float | None]) -> str:
-    """Return the first seed that shows the error, and its checks, such as "seed 2: steps, 2"."""
+    """Return the first seed for which a check detects the error, and these checks, such as "seed 2: steps, 2"."""
     return f"seed {seed}: {', '.join(sorted(finding, reverse=True))}"
 
 
@@ -73,14 +75,14 @@ def _most_first(counted: tuple[str, int]) -> tuple[int, str]:
 
 
 def rows_of(page: str) -> dict[str, str]:
-    """Return the rows of the page's table by the name of the error."""
+    """Return the rows of the table on the page, by the name of the error."""
     table = page.split(BEGIN)[1].split(END)[0]
     lines = [line for line in table.splitlines(keepends=True) if line.startswith("| `")]
     return {line.split("`")[1]: line for line in lines}
 
 
 def main(names: Sequence[str]) -> None:
-    """Play these deliberate errors, or all if none is named. Other table rows stay the same."""
+    """Play the named errors, or all errors if none is named. Keep the other rows of the table."""
     played: dict[str | None, Trials] = {}
     tasks = list(product([None, *(names or QUIRKS)], SEEDS))
     with sweep(tasks, lambda task: play(*task), cores(), what="runs") as outcomes:

@@ -19,16 +19,17 @@ MISSIONS = (
     SCENARIOS / "partition_heal.yaml",
     Path(__file__).parent / "busy.yaml",
 )
-"""The seeds play these missions in turn."""
+"""The missions of the trials. Successive seeds play them in turn."""
 
 _MOMENT = re.compile(r"\bt=(\d+(?:\.\d+)?) s")
 
 
 @dataclass(frozen=True)
 class Trial:
-    """The bad verdicts of a run, each with the mission second of its earliest evidence.
+    """The bad verdicts of a run.
 
-    The second is None if the evidence has no time. `named` is the handler that the step check names first.
+    Each verdict has the mission second of its earliest evidence, or None if no evidence has a time. `named` is the
+    first handler that the check of steps names.
     """
 
     bad: dict[str, float | None]
@@ -41,7 +42,7 @@ def mission(seed: int) -> Scenario:
 
 
 def play(quirk: str | None, seed: int) -> Trial:
-    """Play and judge a run with this deliberate error, or with correct agents if it is None."""
+    """Play and judge a run whose agents have this deliberate error. If `quirk` is None, the agents are correct."""
     value = {quirk: PROBABILITY if QUIRKS[quirk].chance else True} if quirk else {}
     return judged(simulate(mission(seed).model_copy(update={"quirks": value}), seed, tracing=True).result)
 
@@ -54,6 +55,6 @@ def judged(result: Result) -> Trial:
 
 
 def first_s(judgement: Judgement) -> float | None:
-    """Return the mission second of the earliest evidence, or None if no evidence has a time."""
+    """Return the mission second of the earliest evidence of a judgement, or None if no evidence has a time."""
     moments = [float(moment) for finding in judgement.evidence for moment in _MOMENT.findall(finding.detail)[:1]]
     return min(moments, default=None)

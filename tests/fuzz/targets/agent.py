@@ -1,4 +1,5 @@
-"""Fuzz target: an agent. The input is a sequence of operations, each of which is a byte with its arguments.
+"""Fuzz target: an agent. The input is a sequence of operations. Each operation is a byte that is followed by its
+arguments.
 
 For any sequence of operations, these conditions hold. The agent raises no exception. Dropped datagrams, and messages
 that cannot have an effect (`ucp.interest`), change nothing. The trace contains every change. The reference
@@ -52,7 +53,7 @@ _TIMES_US = (0, 1, 2_000_000, 2**32, 2**63, 2**64 - 1)
 
 
 class _Program:
-    """The bytes of an input, one after another. Zeros follow its end."""
+    """Reads the bytes of an input one after another. After the end of the input, it reads zeros."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._position = data, 0
@@ -71,7 +72,7 @@ class _Program:
 
 
 class _Driven:
-    """An agent that executes the operations, and its trace so far."""
+    """An agent that executes the operations, and the trace that it has written so far."""
 
     def __init__(self, settings: Settings) -> None:
         self.now = 0.0
@@ -102,7 +103,7 @@ class _Driven:
             self._reboot()
 
     def _wait(self, seconds: float | None) -> None:
-        """Wait for this number of seconds, or until the next timer expires."""
+        """Advance the time by `seconds`. If `seconds` is None, advance it until the next timer expires."""
         ends = self.agent.next_timer()
         until = self.now + seconds if seconds is not None else self.now if ends is None else ends
         while ends is not None and ends <= until:
@@ -113,8 +114,9 @@ class _Driven:
         self.now = until
 
     def _hear(self, sender: int, message: Message) -> None:
-        """Give the agent a message, mostly of another agent of the mission. A message that cannot matter must change
-        nothing.
+        """Give the agent a message, mostly from another agent of the mission.
+
+        A message that cannot have an effect must not change the agent.
         """
         sender = sender or 1 if sender < 6 else 2 + sender % 3
         matters = sender in ROSTER[1:] and MATTERS[type(message)](self.agent.state, sender, message)
@@ -158,7 +160,7 @@ class _Driven:
                 return BlockResponse(block)
 
     def _chain_hash(self, choice: int) -> bytes:
-        """Return a chain hash: one of the agent's chain, or the hash after another block on it."""
+        """Return the hash of a part of the agent's chain, or the hash of such a part with another block on top."""
         chain = self.agent.state.chain
         hashes = [chain_hash for _, chain_hash in chain.with_chain_hashes()][::-1]
         hashes += [chain.inception.chain_hash, self.agent.state.top_chain_hash_at_initiation or bytes(32)]
@@ -166,7 +168,7 @@ class _Driven:
         return hashes[choice % len(hashes)]
 
     def _block(self, choice: int) -> Block:
-        """Return a block that the agent holds, or a new block of another agent."""
+        """Return a block that the agent holds, or a new block from another agent."""
         state = self.agent.state
         blocks = [*self.strangers, *state.blocks_to_be_committed, *state.reconcile_stack[::-1], *state.chain]
         return blocks[choice % len(blocks)]
@@ -185,7 +187,7 @@ class _Driven:
         )
 
     def look(self) -> None:
-        """Check that the sent messages can be decoded, and that the trace describes the held blocks."""
+        """Check that the sent messages can be decoded, and that the trace describes all blocks that the agent holds."""
         for datagram in self.agent.datagrams_to_send():
             require(len(datagram) <= MAX_DATAGRAM_BYTES, "it sends what no datagram holds")
             require(decode(datagram).encode() == datagram, "it sends what is read otherwise")
@@ -201,7 +203,7 @@ class _Driven:
         require(set(self.held.completed) == {done.hex() for done in self.agent.state.completed}, "completed otherwise")
 
     def judge(self) -> None:
-        """Check that the agent's trace follows the reference implementation."""
+        """Check that the agent's trace agrees with the reference implementation."""
         header, parts = checked(self.trace.header), OptionalTraceFields.of(self.trace)
         for life in self.trace.incarnations():
             follower = StepComparer(header, parts, BlockIndex(()), lambda since, until: False)
@@ -217,7 +219,7 @@ class _Driven:
 
 
 def _of(agent: Agent) -> bytes:
-    """Return all data that determine the agent's later behaviour."""
+    """Return all data of the agent that determine its later behaviour."""
     state = {name: value for name, value in vars(agent.state).items() if name not in ("now", "running", "changes")}
     return pickle.dumps({**state, "chain": vars(agent.state.chain)})
 
@@ -234,7 +236,7 @@ def run(data: bytes) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """Yield sequences of operations: a commit, a lost vote, and a reconcile with all its phases."""
+    """Yield sequences of operations that lead to a commit, a lost vote, and a reconcile with all its phases."""
     block = bytes([12, 1, 255, 12, 1, 255, 12, 1, 255, 12, 1, 255])
     for settings in range(len(SETTINGS)):
         yes = bytes([1, 2, 0, 3, 1, 1, 3, 0, 3, 1])

@@ -1,4 +1,6 @@
-"""Fuzz target: an agent's answer on its control socket. It must be accepted as a status, or refused in one sentence."""
+"""Fuzz target: an agent's answer on its control socket. The reader must accept it as a status, or refuse it in one
+sentence.
+"""
 
 import asyncio
 import json

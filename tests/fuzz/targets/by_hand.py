@@ -1,6 +1,7 @@
-"""Fuzz target: requests to an active run. Each line gets an answer, and the recorded scenario repeats the events.
+"""Fuzz target: requests of a user to an active run.
 
-The mission is in virtual time. It pauses between the requests, and then continues to its end.
+Each line gets an answer, and the recorded scenario repeats the events. The mission is in virtual time. Mission time
+stops during the requests, and then continues to the end of the mission.
 """
 
 import asyncio
@@ -23,7 +24,7 @@ from tests.fuzz.finding import require, sound
 
 MOST_LINES = 20
 LONGEST_LINE = 60_000
-"""A longer line ends the connection."""
+"""Maximum length of a line. A longer line ends the connection."""
 ASKED = Scenario.model_validate({"name": "asked", "agents": 3, "duration_s": 60, "network": {"loss": 0.1}})
 
 

@@ -1,4 +1,6 @@
-"""Fuzz target: a packet capture (pcapng or pcap). It is read, joined with another, and printed."""
+"""Fuzz target: a packet capture (pcapng or pcap). The target reads the capture, joins it with another capture, and
+prints the result.
+"""
 
 import struct
 from collections.abc import Iterator

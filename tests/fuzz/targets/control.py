@@ -46,7 +46,7 @@ def run(data: bytes) -> None:
 
 @contextmanager
 def _own_signal_handlers() -> Iterator[None]:
-    """Restore the handlers of this process, which the agent replaces."""
+    """Restore the signal handlers of this process, which the agent replaces."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield

@@ -1,4 +1,4 @@
-"""Fuzz target: a received datagram. If it is accepted, the encoder reproduces it."""
+"""Fuzz target: a received datagram. If the decoder accepts the datagram, the encoder reproduces the same bytes."""
 
 from collections.abc import Iterator
 from contextlib import suppress

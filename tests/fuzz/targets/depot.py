@@ -1,4 +1,6 @@
-"""Fuzz target: a chain export, mission file or manifest. It is merged with others and compared."""
+"""Fuzz target: a chain export, mission file or manifest. The target merges the file with other files and compares
+them.
+"""
 
 import json
 from collections.abc import Iterator

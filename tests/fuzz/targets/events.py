@@ -1,4 +1,4 @@
-"""Fuzz target: a log of events that a separate recorder wrote (`ucp-events/1`)."""
+"""Fuzz target: a log of events (`ucp-events/1`) from a recorder that runs next to the agent."""
 
 import json
 from collections.abc import Iterator

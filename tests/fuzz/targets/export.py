@@ -1,4 +1,6 @@
-"""Fuzz target: a chain export. It is refused in one sentence, or reproduced by the writer and merged with others."""
+"""Fuzz target: a chain export. The reader refuses it in one sentence, or the writer reproduces it and it can be merged
+with other exports.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,5 +1,5 @@
-"""Fuzz target: flight logs of vehicles. The first byte selects the file name suffix, which matters if the beginning is
-damaged.
+"""Fuzz target: flight logs of vehicles. The first byte of the input selects the suffix of the file name. The suffix
+matters if the beginning of the log is damaged.
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,8 @@
 """Fuzz target: the answers of a foreign agent (a separate program) in a simulated swarm. The run must always end.
 
-The program is ours, in this process, but for some answers. An input is lines `{"n":5,"answer":{...}}`: its answer
-number 5, counted from 0 through all its lives, is this, whatever it is.
+The foreign agent is the harness's own agent in this process, with some answers replaced. Each line of an input, such as
+`{"n":5,"answer":{...}}`, replaces one answer by any JSON value. `n` is the index of the answer. It counts from 0 and
+continues after a restart of the agent.
 """
 
 import json
@@ -35,7 +36,7 @@ SCENARIO: Scenario = scenario(
 
 
 class _OwnAgentProgram(LineProgram):
-    """The harness's own agent without a process. Some of its answers are replaced."""
+    """The harness's own agent without its own process. Some of its answers are replaced."""
 
     _agent: VirtualAgent
     answers: list[bytes]
@@ -85,7 +86,9 @@ def run(data: bytes) -> None:
 
 
 def _play(replaced: dict[int, bytes]) -> list[bytes]:
-    """Play the scenario with some answers replaced. Return the original answers."""
+    """Play the scenario with some answers replaced. Return the answers that the agent gave before they were
+    replaced.
+    """
     ours = type("Replaced", (_OwnAgentProgram,), {"answers": [], "replaced": replaced})
     with (
         patch.object(_program_pool, "LineProgram", ours),

@@ -57,12 +57,12 @@ def _place() -> TemporaryDirectory[str]:
 
 @cache
 def sound_run() -> Path:
-    """Return the run of this process. A target replaces one of its files and restores it afterwards."""
+    """Return the undamaged run of this process. A target replaces one of its files and restores the file afterwards."""
     return run_of_three(Path(_place().name) / "run")
 
 
 def came_home(name: str, data: bytes) -> None:
-    """Read and import a file with this name and content."""
+    """Ingest and import a file with this name and content."""
     lot = zlib.crc32(data)
     with TemporaryDirectory() as directory:
         path = Path(directory) / name
@@ -77,7 +77,7 @@ def came_home(name: str, data: bytes) -> None:
 
 
 def in_its_run(place: str, data: bytes) -> None:
-    """Read a run in which the file at `place` has this content."""
+    """Read a run in which the file at the path `place` has this content."""
     run = sound_run()
     path = run / place
     whole = path.read_bytes() if path.exists() else None
@@ -92,7 +92,7 @@ def in_its_run(place: str, data: bytes) -> None:
 
 
 def _named(path: Path, result: IngestResult) -> None:
-    """Check that there is a sentence for each unused file or line."""
+    """Check that the report has a sentence for each unused file or line."""
     for sentence in result.sentences():
         sound(sentence)
     dropped = bool(result.left_out)
@@ -119,7 +119,7 @@ def _among_others(path: Path) -> None:
 
 
 def _check(out: Path) -> None:
-    """Check that the imported records can be judged, or are refused in one sentence."""
+    """Check that the imported records can be judged, or that the harness refuses them in one sentence."""
     try:
         result = checker.check(checker.gather(RunArchive(out)))
     except HarnessError as error:  # captures alone are not judged
@@ -159,7 +159,7 @@ def _replay(path: Path) -> None:
 
 
 def _archive(run: Path) -> None:
-    """Read the run with the archive, on which all other commands depend."""
+    """Read the run with the archive, which all other commands use."""
     archive = RunArchive(run)
     sentences = [*archive.problems, *archive.gaps]
     list(archive.injected(RogueInjection))

@@ -1,4 +1,6 @@
-"""Fuzz target: a computer that joins a lab, and a harness that welcomes it. The first byte chooses the reader."""
+"""Fuzz target: a computer that joins a lab, and a harness that welcomes it. The first byte of the input selects the
+reader.
+"""
 
 import asyncio
 import json
@@ -30,12 +32,12 @@ def run(data: bytes) -> None:
 
 
 def _far_end(data: bytes) -> None:
-    """An attacker without the secret says hello."""
+    """Give the harness a hello of an attacker without the secret."""
     _refused(data, lambda connection: receive_hello(connection, SECRET))
 
 
 def _harness(data: bytes) -> None:
-    """An attacker without the secret imitates the harness."""
+    """Give the far end a welcome of an attacker who imitates the harness without the secret."""
     _refused(data, lambda connection: introduce(connection, SECRET, {"agent": 2}))
 
 
@@ -56,7 +58,7 @@ def _refused(data: bytes, read: Callable[[socket.socket], Awaitable[object]]) ->
 
 
 def _hello(data: bytes) -> None:
-    """A far end with the secret asks for a vehicle."""
+    """Give the harness a request for a vehicle from a far end with the secret."""
     try:
         words = parse_json(data)
     except ValueError:
@@ -71,7 +73,7 @@ def _hello(data: bytes) -> None:
 
 
 def _messages(data: bytes) -> None:
-    """Authentic messages arrive, or are refused for their kind."""
+    """Give a receiver authentic messages. It receives them or refuses their kind."""
     sender, receiver = Channel(b"a", b"b"), Channel(b"b", b"a")
     clock = FarClock()
     for part in data.split(b"\n"):
@@ -87,7 +89,7 @@ def _messages(data: bytes) -> None:
 
 
 def _raw(data: bytes) -> None:
-    """Bytes of a sender without the keys arrive."""
+    """Give a receiver bytes from a sender without the keys."""
     with suppress(WireError):
         require(Channel(b"a", b"b").decode(data) == [], "it accepts a message without a tag")
 

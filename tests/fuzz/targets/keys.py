@@ -42,13 +42,13 @@ def run(data: bytes) -> None:
 
 
 def _name(data: bytes) -> str:
-    """Return the name of the file that an input replaces."""
+    """Return the name of the file that the input replaces."""
     names = [name for name in NAMES if json.loads((_home() / name).read_bytes())["schema"].encode() in data] or NAMES
     return names[zlib.crc32(data) % len(names)]
 
 
 def _read(home: Path, path: Path) -> None:
-    """Read a key file in the same way as all commands."""
+    """Read a key file in the same way as every command."""
     kept = KeyDirectory(home)
     for read in (lambda: inspect(path), lambda: kept.bundles(), lambda: kept.revoke([1]), lambda: load_depot_key(home)):
         try:
@@ -69,7 +69,7 @@ def _read(home: Path, path: Path) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """Yield a key file of each kind, and one with a later epoch."""
+    """Yield a key file of each kind, and also one of a later epoch."""
     for name in NAMES:
         yield (_home() / name).read_bytes()
     document = json.loads((_home() / NAMES[0]).read_bytes())

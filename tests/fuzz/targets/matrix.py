@@ -1,4 +1,4 @@
-"""Fuzz target: a matrix file in YAML. JSON inputs are earlier results, with which a command continues."""
+"""Fuzz target: a matrix file in YAML. An input in JSON is a file of earlier results, with which a command continues."""
 
 from collections.abc import Iterator
 from pathlib import Path

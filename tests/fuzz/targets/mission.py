@@ -1,4 +1,6 @@
-"""Fuzz target: a mission file. It is refused in one sentence, or reproduced by the writer, and an agent can play it."""
+"""Fuzz target: a mission file. The reader refuses it in one sentence, or the writer reproduces it and an agent can
+execute the mission.
+"""
 
 import base64
 import dataclasses

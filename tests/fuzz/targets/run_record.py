@@ -1,4 +1,6 @@
-"""Fuzz target: run.json, complete, truncated or foreign. Its valid part is reproduced by the writer."""
+"""Fuzz target: run.json, which may be complete, truncated, or another document. The writer reproduces its valid
+part.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -79,7 +79,7 @@ def run(data: bytes) -> None:
 
 
 def _short(scenario: Scenario) -> bool:
-    """Return true if a run of the scenario is fast, and starts no program that the input names."""
+    """Return whether the scenario takes little time and starts no program that the input names."""
     entries = len(scenario.events.script) + len(scenario.timeline) + len(scenario.datagrams) + len(scenario.fates)
     injects = any(entry.injection for entry in scenario.timeline)
     return (
@@ -95,7 +95,7 @@ def _short(scenario: Scenario) -> bool:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """Yield the included scenarios, and a short one that uses every list."""
+    """Yield the included scenarios, and a short scenario that uses every list."""
     for scenario in sorted(LIBRARY.glob("*.yaml")):
         if scenario.stat().st_size < LARGEST_SEED:
             yield scenario.read_bytes()

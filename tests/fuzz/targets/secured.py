@@ -45,7 +45,7 @@ KEYS = KeySet.derived(b"fuzz".ljust(32, b"\0"), ROSTER, epoch_s=60.0)
 SETTINGS = Settings(max_block_bytes=64, max_event_bytes=64)
 MOST_OPERATIONS = 120
 KEPT = 32
-"""Datagrams that may come again."""
+"""Maximum number of sent datagrams that are kept, so that operations can repeat them."""
 BLOCKS = [Block(2, 1_000_000, b"of two"), Block(3, 1_000_000, b"of three"), Block(9, 7, b"of nobody")]
 BEFORE_ITS_SIGNATURE = {
     *("truncated", "oversized", "wrong magic", "not secured", "wrong version", "impossible sender", "unknown type"),
@@ -56,7 +56,7 @@ BEFORE_ITS_SIGNATURE = {
 
 
 class _Program:
-    """The bytes of an input, one after another. Zeros follow its end."""
+    """Reads the bytes of an input one after another. After the end of the input, it reads zeros."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._position = data, 0
@@ -74,7 +74,7 @@ class _Program:
 
 
 class _Driven:
-    """The agent, and the messages that other agents have sent to it."""
+    """The agent, and the last datagrams that other agents have sent to it."""
 
     def __init__(self, crypto: CryptoFunctions) -> None:
         self.now = 0.0
@@ -118,7 +118,9 @@ class _Driven:
             self._reboot()
 
     def _sealed(self, program: _Program, said: tuple[int, bytes] | bytes) -> bytes:
-        """Return an encrypted datagram of another agent, correctly signed or not, of any epoch and any restart."""
+        """Return an encrypted datagram of another agent, of any epoch and any incarnation. Its signature may be
+        wrong.
+        """
         who, lies = program.byte(), program.byte()
         sender, signer = 2 + who % 3, 2 + (who if lies % 8 else who + 1) % 3
         epoch = min(len(self._secrets) - 1, max(0, int(self.now // KEYS.public.epoch_s) + lies // 8 % 16 - 3))
@@ -136,7 +138,7 @@ class _Driven:
         return datagram
 
     def _body(self, program: _Program) -> tuple[int, bytes]:
-        """Return a correct message, which may answer any request."""
+        """Return the type and body of a correct message. The message may answer any request."""
         code, choice = 1 + program.byte() % 9, program.byte()
         state = self.agent.state
         blocks = [*BLOCKS, *state.blocks_to_be_committed, *state.chain]
@@ -210,7 +212,7 @@ class _Driven:
         self.agent.boot(stored, self.now)
 
     def look(self) -> None:
-        """Check that other agents can decrypt the sent messages, that memory is limited, and that the trace can be
+        """Check the agent: other agents can decrypt the sent messages, memory is limited, and the trace can be
         written.
         """
         agent, session = self.agent, self.agent.session
@@ -232,14 +234,17 @@ class _Driven:
 
 
 def _is_accepted(session: Session, sealed_by: tuple[int, int, bytes]) -> bool:
-    """Return whether the session accepts this boot. It keeps the keys of such a boot before a datagram is authentic."""
+    """Return whether the session accepts this incarnation.
+
+    The session keeps the keys of such an incarnation before it has received an authentic datagram.
+    """
     _, sender, boot = sealed_by
     incarnation = session._incarnations.get(sender)
     return incarnation is not None and incarnation.boot == boot
 
 
 def _of(agent: SecuredAgent) -> dict[str, Any]:
-    """Return all data that a datagram might change."""
+    """Return all data of the agent that a datagram might change."""
     state, session = agent.state, agent.session
     return {
         "received": agent.received.copy(),
@@ -275,8 +280,8 @@ def run(data: bytes) -> None:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """Yield operations: a vote, commits with and without signatures, a reconcile, epochs, restarts, exclusions, and a
-    power loss.
+    """Yield sequences of operations: a vote, commits with and without signatures, a reconcile, epochs, restarts,
+    exclusions, and a power loss.
     """
     block = bytes([13, 1, 40, 13, 1, 40, 13, 1, 40])
     commit, unsigned = bytes([1, 2, 128, 0, 24 + 1]), bytes([1, 2, 0, 0, 24 + 1])

@@ -56,7 +56,7 @@ def _agent() -> Agent:
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """Yield a store with blocks in all places, with and without its checksums."""
+    """Yield a store with blocks in the chain and in all other lists, with and without its checksums."""
     with TemporaryDirectory() as directory:
         path = Path(directory) / "1.store"
         agent = _agent()

@@ -1,4 +1,6 @@
-"""Fuzz target: a story file. It is refused in one sentence, or its text without reactions gives the same story."""
+"""Fuzz target: a story file. The reader refuses it in one sentence, or the text of the story without the agents'
+reactions gives the same story.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,5 +1,5 @@
-"""Fuzz target: a trace of either version. Its readable part is reproduced by the writer, and all users of traces accept
-it.
+"""Fuzz target: a trace of either version. The writer reproduces its readable part, and all code that uses traces
+accepts this part.
 """
 
 import json
@@ -32,7 +32,7 @@ def run(data: bytes) -> None:
 
 
 def _lines(trace: Trace) -> list[str]:
-    """Return the skimmed trace as lines, because a time that is no number equals nothing."""
+    """Return the skimmed trace as lines. Tests compare these, because a time that is NaN is not equal to itself."""
     return [run.to_line() for run in trace.skimmed().runs]
 
 

@@ -1,4 +1,4 @@
-"""Fuzz target: an agent in virtual time. Each input line gets one JSON line as answer, and the same one each time.
+"""Fuzz target: an agent in virtual time. Each input line gets one JSON line as its answer, which is the same each time.
 
 The reference implementation takes the same steps, and the agent can restart from its stored data.
 """
@@ -71,7 +71,7 @@ _MISSION = _mission()
 
 
 def seeds(flown: Path) -> Iterator[bytes]:
-    """Yield input lines: a commit, a block of another agent, a reconcile, and every command."""
+    """Yield input lines for a commit, a block of another agent, a reconcile, and every command."""
     block = Block(2, 5, b"of two")
     chain_hash = next_chain_hash(InceptionBlock(b"fuzz").chain_hash, block.block_hash)
     commit = in_base64(encode(2, 0, CommitBlock(block, chain_hash)))

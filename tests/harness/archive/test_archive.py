@@ -29,7 +29,7 @@ FILES = [
 
 @pytest.fixture(scope="module")
 def intact_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Play a run of three agents in virtual time."""
+    """Play a run of three agents in virtual time, without damage."""
     asked = scenario(agents=3, duration_s=300, network={"loss": 0.3})
     return run(asked, 3, tmp_path_factory.mktemp("whole") / "run", SilentProgress(), backend="sim").directory
 
@@ -93,7 +93,7 @@ def test_all_commands_report_the_same_problems_of_a_damaged_run(
 
 
 def reported(directory: Path) -> set[str] | None:
-    """Return the damaged or missing files that the report names, or None if it rejects the record."""
+    """Return the damaged or missing files that the report names. Return None if the report rejects run.json."""
     try:
         remains = read_source(RunArchive(directory, skim=True))
     except RunDirectoryError as error:
@@ -178,7 +178,7 @@ def test_skimmed_archive_reports_the_same_problems(intact_run: Path, tmp_path: P
 
 
 def recording(reader: Callable[..., Any], read: list[object]) -> Callable[..., Any]:
-    """Return a wrapper around the reader that records each path it reads."""
+    """Return a wrapper around the reader that records each path that it reads."""
 
     def recorded(what: Any, **options: Any) -> Any:
         what = what if isinstance(what, Path) else tuple(what)

@@ -1,4 +1,4 @@
-"""Test which vehicles are connected, as it follows from the recorded changes of the network."""
+"""Test which vehicles are connected, according to the recorded changes of the network."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Test chain exports of real flights: each unusable file gives one sentence, and the others are read."""
+"""Test the chain exports of real flights: each unusable file causes one sentence, and the other files are read."""
 
 import json
 from pathlib import Path

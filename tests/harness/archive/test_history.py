@@ -1,4 +1,6 @@
-"""Test the history of known runs: votes, reconciles, messages, and the number of copies over time."""
+"""Test the computed history of known runs: votes, reconciles, messages, and the number of copies of blocks over
+time.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -204,7 +206,7 @@ def test_replication_equals_the_replayed_chains_at_every_moment() -> None:
 
 
 def changes(at_s: float, *operations: str) -> HandlerRun:
-    """Return a handler run with changes such as "chain+ aa"."""
+    """Return a handler run with these changes, which are texts such as "chain+ aa"."""
     return handler_run(at_s, "", changes=[(one.split()[0], one.split()[1]) for one in operations])
 
 

@@ -152,9 +152,8 @@ def test_each_type_of_request_matches_its_response(tmp_path: Path) -> None:
 
 
 def test_response_answers_the_last_received_request(tmp_path: Path) -> None:
-    """Let agents 1 and 3 send equal requests.
-
-    Agent 2 does not answer the first one, and only receives the second one of 3.
+    """Let agents 1 and 3 send equal requests. Agent 2 does not answer the first request, and receives only the second
+    request of agent 3.
     """
     scene = CaptureScript(1, 2, 3)
     scene.send(1, 3, QUERY)
@@ -300,7 +299,9 @@ def test_incomplete_capture_proves_no_forgery(tmp_path: Path) -> None:
 
 
 def test_field_captures_count_time_from_the_first_packet(tmp_path: Path) -> None:
-    """Captures named after a vehicle contain its own datagrams as outbound. Other files are other observers."""
+    """A capture that is named after a vehicle contains the vehicle's own datagrams as outbound. Any other file counts
+    as the capture of a separate observer.
+    """
     query, answer = frame(1, encode(1, 0, QUERY)), frame(2, encode(2, 0, ChainContainResponse(CHAIN, True)))
     (tmp_path / "1.pcap").write_bytes(pcap([(1_000_000, query), (1_500_000, answer)]))
     (tmp_path / "2.pcap").write_bytes(pcap([(1_250_000, query), (1_250_000, answer)]))

@@ -134,7 +134,7 @@ def test_unwrap_accepts_ucp_on_another_port() -> None:
 
 
 def test_unwrap_detects_every_flipped_bit() -> None:
-    """Compare with the Linux kernel of a receiver, which drops a damaged frame."""
+    """Flip each bit of a frame in turn. The Linux kernel of a receiver also drops such a frame."""
     ethernet = frame(7, QUERY)
     for bit in range(8 * 14, 8 * len(ethernet)):
         flipped = bytearray(ethernet)

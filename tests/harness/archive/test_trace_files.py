@@ -1,4 +1,6 @@
-"""Large traces are packed during and after the run. All readers take packed traces, and none judges a damaged one."""
+"""Test packed traces: large traces are packed during and after the run, all readers accept packed traces, and no reader
+judges a damaged one.
+"""
 
 import gzip
 import os
@@ -60,7 +62,7 @@ def test_run_packs_only_large_traces(plain: Path, tmp_path: Path, monkeypatch: p
 
 @pytest.fixture
 def partly_packed(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a run of which the harness was killed. Its traces are packed except for their ends."""
+    """Return a run whose harness was killed. All but the end of each trace is packed."""
     monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 0)
     monkeypatch.setattr(packed_parts, "PART_BYTES", 65536)
     monkeypatch.setattr(packed_parts, "KEPT_BYTES", 1)
@@ -79,7 +81,7 @@ def partly_packed(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.fixture
 def copied(partly_packed: Path, tmp_path: Path) -> Path:
-    """Return a copy of that run in which the freed parts are bytes again."""
+    """Return a copy of the run `partly_packed`. In the copied files, the parts that the harness freed contain zeros."""
     return shutil.copytree(partly_packed, tmp_path / "copied")
 
 
@@ -138,7 +140,7 @@ def test_traces_that_are_partly_packed_are_packed_completely(plain: Path, partly
 
 
 def test_agent_and_reader_notice_nothing_of_packed_parts(plain: Path, partly_packed: Path) -> None:
-    """The agent appends between two packings. A reader that is open meanwhile reads each line once."""
+    """Let the agent append lines between two packings. A reader that is open at the same time reads each line once."""
     path, whole = partly_packed / "agents" / NAMES[0], (plain / "agents" / NAMES[0]).read_bytes()
     read = b""
     with open_trace(path) as early, path.open("ab", buffering=0) as agent:
@@ -168,7 +170,7 @@ def test_run_packs_its_traces_while_it_plays(tmp_path: Path, monkeypatch: pytest
 def test_programs_are_judged_alike_if_their_traces_are_packed_meanwhile(
     backend: BackendName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One agent restarts, so the harness appends to a trace of which it has packed parts."""
+    """Restart an agent, so that the harness appends to a trace of which some parts are already packed."""
     monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 1)
     monkeypatch.setattr(packed_parts, "PART_BYTES", 4096)
     monkeypatch.setattr(packed_parts, "KEPT_BYTES", 4096)
@@ -193,7 +195,7 @@ def test_programs_are_judged_alike_if_their_traces_are_packed_meanwhile(
 
 
 def test_link_of_an_agent_never_frees_parts_of_another_file(tmp_path: Path) -> None:
-    """A link of the harness leads to the file of the agent in a container, and the agent can replace this file."""
+    """The harness uses a link to the trace of an agent in a container. The agent can replace this file."""
     own, other = tmp_path / "1-1" / NAMES[0], tmp_path / "other"
     own.parent.mkdir()
     other.write_bytes(b"x" * 4_000_000)

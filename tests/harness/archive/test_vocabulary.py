@@ -1,4 +1,4 @@
-"""Test undefined names in traces: they cause no violation, but a wrong Algorithm number is found."""
+"""Test undefined names in traces: they cause no violation, but a wrong Algorithm number does."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -39,9 +39,8 @@ Rename = Callable[[HandlerRun], HandlerRun]
 
 @pytest.fixture(scope="module")
 def honest() -> Evidence:
-    """Return the evidence of a correct run.
-
-    Its record lacks the agents' counters, so the checker takes them from traces.
+    """Return the evidence of a correct run without the agents' counters. The checker then takes them from the
+    traces.
     """
     evidence = simulate(scenario(**EVENTFUL), 3, tracing=True).evidence
     assert evidence.record is not None
@@ -55,7 +54,7 @@ def unknown_name(name: str) -> str:
 
 
 def renamings() -> Iterator[tuple[str, Rename]]:
-    """Yield each defined name with a function that replaces it in a handler run."""
+    """Yield each kind of defined name with a function that replaces such a name in a handler run."""
     for name, handler in HANDLERS.items():
         yield f"handler {name}", handler_renamed(name)
         for branch in handler.branches:
@@ -135,7 +134,7 @@ def tally_renamed(vote: str) -> Rename:
 
 
 def with_renamed_steps(evidence: Evidence, rename: Rename, agents: set[int]) -> Evidence:
-    """Return the evidence with the names of these agents' handler runs replaced."""
+    """Return the evidence with replaced names in the handler runs of these agents."""
     traces: dict[int, Trace] = {}
     for agent_id, trace in evidence.traces.items():
         runs = [rename(run) for run in trace.runs] if agent_id in agents else trace.runs
@@ -213,7 +212,7 @@ def test_losses_are_unknown_if_completed_blocks_are_unknown(honest: Evidence) ->
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a run in which agent 1 uses undefined names for its voting timer, a branch, and a completed block."""
+    """Write a run in which agent 1 uses undefined names for its vote timer, a branch, and a completed block."""
     path = tmp_path_factory.mktemp("run") / "run"
     assert not run(scenario(**EVENTFUL), 3, path, SilentProgress(), "sim").result.bad
     for agent, old, new in (

@@ -1,4 +1,4 @@
-"""Test the comparison of a shared channel's log with the traces and run.json."""
+"""Test that the checker compares the log of a shared channel with the traces and run.json."""
 
 import json
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def details(run: Path, edit: Callable[[Lines], Lines] | None = None) -> list[str]:
-    """Return the findings of the check of records after an edit of the channel's log."""
+    """Return the findings of the check of records after the channel's log is edited."""
     journal = run / "channel.jsonl"
     original = journal.read_text()
     if edit is not None:

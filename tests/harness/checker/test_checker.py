@@ -1,5 +1,6 @@
-"""Test each characteristic: it holds for a good run, is violated by a manipulated one, and never holds without
-evidence.
+"""Test the checks of all characteristics.
+
+Each characteristic holds for a good run and is violated by a manipulated run. None holds without evidence.
 """
 
 import re
@@ -17,7 +18,7 @@ from ucp.messages import CommitBlock
 
 
 def verdicts(result: Result) -> str:
-    """Return one letter for the verdict on each characteristic: h(olds), v(iolated), n(ot applicable)."""
+    """Return one letter for the verdict on each characteristic: h (holds), v (violated), or n (not applicable)."""
     return "".join(result.characteristics[number].verdict[0] for number in "123456")
 
 
@@ -67,7 +68,9 @@ def test_different_chains_after_loss_make_5_and_6_not_applicable(tmp_path: Path)
 
 
 def missed_last_block(reconcile_before: bool = False) -> Air:
-    """Return a swarm that loses one commit and never votes afterwards. The chain of agent 2 stays different."""
+    """Return a swarm that loses one commit and never votes afterwards. The chain of agent 2 therefore stays
+    different.
+    """
     air = Air([1, 2, 3])
     air.fill_block(1)
     air.settle()

@@ -1,4 +1,4 @@
-"""Test that counters of the kernel reveal agents that discard datagrams without a record, or read none."""
+"""Test that the kernel's counters reveal agents that discard datagrams without recording them, or read none."""
 
 import json
 import shutil
@@ -51,7 +51,7 @@ OFTEN = {"source": "random", "mean_s": 2}
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Play a run of three agents in virtual time. One of them is killed and restarted."""
+    """Play a run of three agents in virtual time. One agent is killed and restarted."""
     asked = scenario(
         agents=3,
         duration_s=120,
@@ -64,7 +64,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judged(directory: Path, tmp_path: Path, agent: int, more: int, unread: int = 0, others: int = 0) -> Result:
-    """Judge the run as if the kernel had counted the recorded datagrams of an agent and some more."""
+    """Judge the run with counters of the kernel. They show the datagrams that an agent recorded, and `more` others."""
     shutil.copytree(directory, tmp_path / "run")
     lines = [json.loads(line) for line in (directory / f"agents/{agent}.trace.jsonl").read_text().splitlines()]
     received = sum("message" in line.get("trigger", {}) for line in lines)

@@ -36,7 +36,9 @@ sys.exit(node.main(sys.argv[1:]))
 
 @pytest.fixture(scope="module")
 def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Play a run whose headers state a voting timer of 10 s, while agents vote for half a second longer."""
+    """Play a run in which agents vote half a second longer than the vote timer of 10 s in the headers of their
+    traces.
+    """
     asked = scenario(agents=3, duration_s=150, events=OFTEN, settings={"vote_timeout_s": 10 + LATE_S})
     directory = run(asked, 1, tmp_path_factory.mktemp("late") / "run", SilentProgress(), backend="sim").directory
 
@@ -52,7 +54,9 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judged(late: Path, tmp_path: Path, *, speedup: float = 1.0, lag: list[dict[str, Any]] | None = None) -> Judgement:
-    """Judge the steps as if mission time ran at this speed, and as if these machine delays were measured."""
+    """Judge the steps as if mission time had this speedup, and as if the harness had measured these delays of the
+    machine.
+    """
     directory = tmp_path / "run"
     if not directory.exists():
         shutil.copytree(late, directory)
@@ -64,7 +68,7 @@ def judged(late: Path, tmp_path: Path, *, speedup: float = 1.0, lag: list[dict[s
 
 
 def measured(machine_s: float = 0.0, *, busy_s: float = 0.0, agents: str = "123") -> list[dict[str, Any]]:
-    """Return lines with the same measured delays for the whole run, two mission seconds each."""
+    """Return lines of the lag file with the same delays for the whole run. Each line covers two mission seconds."""
     figures = {"machine_s": machine_s, "busy_s": dict.fromkeys(agents, busy_s)}
     return [{"from_s": at, "until_s": at + 2, **figures} for at in range(0, 2000, 2)]
 
@@ -99,7 +103,7 @@ def test_timer_that_the_scenario_delays_is_no_deviation(tmp_path: Path) -> None:
 
 
 def test_delay_of_seconds_that_the_lag_explains_is_no_deviation(late: Path, tmp_path: Path) -> None:
-    """A delay of 2.5 s of wall time is more than a handler may be late without a measured lag."""
+    """A handler is late by 2.5 s of wall time. Without a measured lag of this length, the delay is a deviation."""
     found = judged(late, tmp_path, speedup=0.2, lag=measured(0.1))
     assert found.verdict == "deviates"
     assert any("it did not run, although the voting timer expired" in each.detail for each in found.evidence)

@@ -28,7 +28,7 @@ def liveness(simulated: Simulated) -> Judgement:
 
 
 def judged(evidence: Evidence, **record: Any) -> dict[str, Judgement]:
-    """Return the judgements after a change of the record."""
+    """Return the judgements of a run whose record was changed."""
     assert evidence.record is not None
     changed = replace(evidence, record=evidence.record.model_copy(update=record))
     return check(changed).judgements
@@ -95,7 +95,7 @@ def test_traces_alone_show_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", LIVELOCKS)
 def test_traces_show_a_cycle_at_any_end_of_the_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cycle is found even if some of its agents are idle at the end of the run."""
+    """Find the cycle even if some of its agents are idle at the end of the run."""
     disable_search(monkeypatch)
     document = load_scenario(SCENARIOS / f"{name}.yaml").model_dump(exclude={"expect"}, exclude_unset=True)
     idle, in_cycle = set(), set()
@@ -187,7 +187,9 @@ def test_agent_paused_to_the_end_is_not_judged() -> None:
 
 
 def test_reconcile_beside_a_paused_agent_is_no_chance_to_agree() -> None:
-    """Agent 3 alone has a block. It is paused to the end, so it answers no query of the final reconcile."""
+    """Agent 3 alone has a block. The agent is paused until the end of the run, so it answers no query of the final
+    reconcile.
+    """
     run = simulate(
         scenario(
             agents=3,
@@ -207,7 +209,7 @@ def test_reconcile_beside_a_paused_agent_is_no_chance_to_agree() -> None:
 
 
 def test_uniform_time_is_known_if_all_chains_are_equal() -> None:
-    """The time is that of the last change of a chain, with or without traces."""
+    """The time is that of the last change of a chain. It is known with and without traces."""
     for seed in range(5):
         play = scenario(agents=5, duration_s=600, network={"loss": 0.15}, final_reconcile=True)
         plain, traced = (simulate(play, seed, tracing=tracing) for tracing in (False, True))
@@ -220,7 +222,7 @@ def test_uniform_time_is_known_if_all_chains_are_equal() -> None:
 @pytest.mark.lab
 @pytest.mark.any_user
 def test_cycle_of_processes_is_found_in_traces(tmp_path: Path) -> None:
-    """All agents reject every block. Each vote of the one agent with a block therefore ends in a reconcile."""
+    """All agents reject every block. Each vote of the only agent with a block therefore ends in a reconcile."""
     refusing = write_scenario(
         tmp_path,
         agents=2,

@@ -1,4 +1,6 @@
-"""Test the comparison of lost messages with the loss rate, for runs in memory and for networks that duplicate."""
+"""Test that the checker compares lost messages with the loss rate, for runs in memory and for networks that duplicate
+packets.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,14 +20,16 @@ CONDITIONS = [{"loss": 0.3}, {"loss": 0.3, "duplicate": 0.1}, {"loss": 0.9, "dup
 
 @pytest.fixture(scope="module", params=CONDITIONS, ids=str)
 def honest(request: pytest.FixtureRequest) -> Evidence:
-    """Return the evidence of a run in memory in which agents receive every message that is not lost."""
+    """Return the evidence of a run in memory in which the agents receive every message that the network does not
+    lose.
+    """
     asked = scenario(network=request.param, duration_s=1200, final_reconcile=True)
     evidence = simulate(asked, 1, tracing=True, deliver_all=True).evidence
     return replace(evidence, delivers_all=True)
 
 
 def kept(trace: Trace, which: Iterator[bool]) -> Trace:
-    """Return the trace with only these of its received messages."""
+    """Return the trace with only these received messages."""
     runs = [run for run in trace.runs if not isinstance(run.trigger, MessageTrigger) or next(which)]
     return replace(trace, runs=runs)
 

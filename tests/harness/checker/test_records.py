@@ -1,4 +1,4 @@
-"""Test that edited, cut or mixed records never get a good verdict, and that unchanged records never contradict each
+"""Test the check of records: edited, cut or mixed records never get a good verdict, and unchanged ones contradict no
 other.
 """
 
@@ -27,7 +27,7 @@ Document = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Play a run of three agents with loss, a kill with a restart, a reboot, and a final reconcile."""
+    """Play a run of three agents with loss, a kill and a restart, a reboot, and a final reconcile."""
     asked = scenario(
         agents=3,
         duration_s=240,
@@ -74,7 +74,7 @@ def export(directory: Path, agent: int) -> Path:
 
 
 def contradicted(result: Result) -> list[str]:
-    """Check that records contradict each other. Return the characteristics that this violates."""
+    """Check that the records contradict each other. Return the characteristics that are violated."""
     assert result.beside["records"].verdict == "contradict"
     return [number for number, judgement in result.characteristics.items() if judgement.verdict == "violated"]
 
@@ -253,7 +253,7 @@ def test_appended_trace_of_another_run_is_not_read(directory: Path, tmp_path: Pa
 
 @pytest.mark.parametrize(("recorded_us", "verdict"), [(7, "agree"), (8, "contradict")])
 def test_clock_of_another_computer_is_compared_with_run_json(directory: Path, recorded_us: int, verdict: str) -> None:
-    """Mission second 0 is at 7 us of the clock of agent 2, and at 0 us of all other clocks."""
+    """The clock of agent 2 shows 7 us at mission second 0. All other clocks show 0 us."""
     edit_lines(
         trace(directory, 2), lambda lines: [line["clock"].update(epoch_us=7) for line in lines if "clock" in line]
     )
@@ -312,7 +312,7 @@ LISTS = st.sampled_from(["take one out", "double one", "swap two"])
 def test_no_block_can_be_moved_in_any_record(
     whole: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
-    """No block, line or change can be removed, doubled or swapped without a bad verdict."""
+    """Remove, double or swap a block, a line or a change. The run then has a bad verdict or an error."""
     directory = tmp_path_factory.mktemp("edited") / "run"
     shutil.copytree(whole, directory)
     agent = data.draw(st.sampled_from([1, 2, 3]))
@@ -343,7 +343,7 @@ def test_no_block_can_be_moved_in_any_record(
 
 
 def disorder(data: st.DataObject, entries: list[Any]) -> list[Any]:
-    """Return the entries with one removed, one doubled, or two different ones swapped."""
+    """Return the entries with one entry removed, one entry doubled, or two different entries swapped."""
     how = data.draw(LISTS)
     number = data.draw(st.integers(0, len(entries) - 1))
     if how == "double one":
@@ -372,7 +372,7 @@ def test_interrupted_run_has_traces_of_unknown_length(directory: Path) -> None:
 def test_report_before_the_last_handler_run_may_differ_from_the_export(
     directory: Path, runs_later: int, agrees: bool
 ) -> None:
-    """An agent in real time reports that it is not idle, although its later export states that it is."""
+    """Let an agent in real time report that it is not idle, although its later export states that it is idle."""
 
     def in_real_time(document: list[Document]) -> None:
         for header in document:
@@ -408,7 +408,9 @@ def test_counters_of_the_kernel_are_compared_with_traces(
     sent = {agent: sum(len(step.get("sent", ())) for step in lines(trace(directory, agent))) for agent in (1, 2, 3)}
 
     def count(document: Document) -> None:
-        """Add the counters of the kernel. Those of agent 2 differ by `passed` and `lost`."""
+        """Add the kernel's counters to run.json. The counters of agent 2 differ from the traces by `passed` and
+        `lost`.
+        """
         others = {agent: sum(sent.values()) - sent[agent] for agent in sent}
         receivers = {str(agent): {"passed": others[agent], "lost": 0, "cut": 0} for agent in sent}
         receivers["2"] |= {"passed": max(0, others[2] + passed), "lost": min(lost, others[2])}

@@ -1,4 +1,4 @@
-"""Test that records which contradict the scenario, the faults, the network or the end of a run are found."""
+"""Test that the check finds records that contradict the scenario, the faults, the network or the end of the run."""
 
 import base64
 import json
@@ -72,7 +72,7 @@ def edit_scenario(change: Callable[[Document], Any]) -> Edit:
 
 
 def without_change(what: str) -> Edit:
-    """Remove a change from run.json and from network.jsonl."""
+    """Remove a recorded change from run.json and from network.jsonl."""
 
     def remove(directory: Path) -> None:
         edit(
@@ -90,7 +90,7 @@ def without_change(what: str) -> Edit:
 
 
 def with_loss(loss: float) -> Edit:
-    """Change the loss rate consistently in the scenario, run.json and network.jsonl."""
+    """Change the loss rate in the same way in the scenario, run.json and network.jsonl."""
 
     def change(entry: Document) -> None:
         entry["detail"] = entry["detail"].replace("loss 20 %", f"loss {loss * 100:g} %")
@@ -110,7 +110,7 @@ def with_loss(loss: float) -> Edit:
 
 
 def with_message_at(agent_id: int, at_s: float) -> Edit:
-    """Move the last message that the agent handled before this time to this time."""
+    """Change the time of the last message that the agent handled before `at_s` to `at_s`."""
 
     def move(lines: list[Document]) -> None:
         before = [line for line in lines if line.get("handler", "").startswith("receive_") and line["t"] < at_s]
@@ -163,7 +163,7 @@ def test_altered_record_contradicts_others(directory: Path, altered: Edit, expec
 
 
 def test_message_over_partition_is_found(directory: Path) -> None:
-    """Change the sender of a message that agent 1 handled during the partition to an agent on the other side."""
+    """Change the sender of a message that agent 1 handled during the partition. The new sender is on the other side."""
 
     def swap(lines: list[Document]) -> None:
         theirs = {line["t"]: sent for line in lines for sent in line.get("sent", ()) if 105 < line["t"] < 150}
@@ -213,7 +213,9 @@ def test_event_before_the_epoch_of_its_clock_agrees(tmp_path: Path) -> None:
 
 
 def test_message_that_a_restarted_agent_cannot_confirm_is_not_lost(tmp_path: Path) -> None:
-    """A restarted agent of a secured mission drops the first messages of each other agent, and asks for a proof."""
+    """A restarted agent of a secured mission drops the first messages of each other agent, and requests a proof that
+    they are new.
+    """
     timeline = [{"at_s": 60, "kill": [3]}, {"at_s": 90, "restart": [3]}]
     often = {"source": "random", "mean_s": 6}
     asked = scenario(agents=3, duration_s=150, security={}, events=often, timeline=timeline)

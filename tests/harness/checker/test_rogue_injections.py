@@ -1,4 +1,4 @@
-"""Test which handler runs are assigned to the messages of a rogue node."""
+"""Test which handler runs the checker assigns to the messages of a rogue node."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,9 @@ FLOOD = scenario(timeline=[{"at_s": 20, "flood": {"for_s": 10, "per_s": 1}}])
 
 
 def trace(agent: int, *runs: tuple[float, int, str], changes: bool = False) -> Trace:
-    """Return a trace of runs that Commit Blocks of agent 1 triggered. Each run is (time, sequence number, branch)."""
+    """Return a trace of handler runs that Commit Blocks of agent 1 triggered. Each item is (time, sequence number,
+    branch).
+    """
     triggered = [
         HandlerRun(
             t,

@@ -1,4 +1,4 @@
-"""Test which modules of `ucp` the judge uses, and that they follow the test vectors of the agent contract."""
+"""Test which modules of `ucp` the checker uses, and that these modules pass the test vectors of the agent contract."""
 
 from collections.abc import Iterator
 
@@ -15,7 +15,7 @@ from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER
 from ucp.quirks import CRASHED, QUIRKS
 
 LANGUAGE = {"ucp.block", "ucp.events", "ucp.messages", "ucp.plain_file", "ucp.sealed", "ucp.trace", "ucp.trigger"}
-"""The modules of `ucp` that the judge may import: the language in which agents speak."""
+"""The modules of `ucp` that the checker may import. They define the messages and files of agents."""
 NOT_THE_JUDGE = {
     "harness.checker.steps.core_in_use": "it plays the installed core for a debugger, and judges no agent",
     "harness.checker.steps._shared_code": "it checks the settings, and the judge does not use them",
@@ -24,7 +24,9 @@ READS_FOR_THE_JUDGE = {"harness.archive.traces", "harness.archive.vocabulary", "
 
 
 def judge() -> Iterator[str]:
-    """Yield the modules of the reference, of the comparison, and those that read records for them."""
+    """Yield the modules of the reference implementation, of the comparison of steps, and of the readers of its
+    records.
+    """
     rooms = ("harness.checker.reference", "harness.checker.steps")
     yield from (name for name in modules() if name.startswith(rooms) and name not in NOT_THE_JUDGE)
     yield from READS_FOR_THE_JUDGE

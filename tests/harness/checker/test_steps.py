@@ -39,7 +39,7 @@ def with_traces(evidence: Evidence, traces: dict[int, Trace]) -> Evidence:
 
 
 def edited(evidence: Evidence, agent: int, change: Callable[[list[HandlerRun]], Any]) -> Evidence:
-    """Return the evidence with a changed trace of one agent."""
+    """Return the evidence with the trace of one agent changed."""
     runs = [HANDLER_RUN.validate_json(run.to_line()) for run in evidence.traces[agent].runs]
     change(runs)
     return with_traces(evidence, {**evidence.traces, agent: dataclasses.replace(evidence.traces[agent], runs=runs)})
@@ -66,7 +66,7 @@ def commit(runs: list[HandlerRun]) -> HandlerRun:
 
 
 def without_expiry(runs: list[HandlerRun]) -> None:
-    """Remove the first expiry of a voting timer, and all handler runs that it triggered."""
+    """Remove the first expiry of a vote timer, and all handler runs that this expiry triggered."""
     position = runs.index(expiry(runs))
     del runs[position]
     while runs[position].trigger.kind == "local":
@@ -136,7 +136,9 @@ def test_one_mistake_is_one_finding(honest: Evidence) -> None:
 
 
 def test_agent_is_followed_from_its_own_state_after_a_deviation(honest: Evidence) -> None:
-    """An agent that ignores a commit has a shorter chain from then on. Each ignored commit counts as one difference."""
+    """Let an agent ignore commits, so that its chain is shorter from then on. Each ignored commit counts as one
+    difference.
+    """
     simulated = simulate(scenario(**LOSSY, quirks={"ignore_commit": 0.1}), 1, tracing=True)
     ignored = sum(
         run.branch == "ignored by quirk" for trace in simulated.evidence.traces.values() for run in trace.runs
@@ -347,11 +349,11 @@ def done_twice(good: Any, core: Core, *inputs: object) -> str:
 
 
 def nothing(good: Any, core: Core, *arguments: object) -> None:
-    """Do nothing, in place of an operation of the agent."""
+    """Do nothing. The function replaces an operation of the agent."""
 
 
 def mistakes(handler: EventHandler[Any]) -> Iterator[Quirk]:
-    """Yield the simplest errors of this handler: it does nothing, it runs twice, or it omits one kind of action."""
+    """Yield simple errors of this handler: it does nothing, it runs twice, or it omits one kind of action."""
     wrong = {f"takes {branch}": partial(left_out, branch=branch) for branch in handler.branches}
     for name, run in {**wrong, "twice": done_twice}.items():
         yield mistake(handler, name, run, None)
@@ -381,7 +383,7 @@ def right() -> list[str]:
 def test_omitted_or_doubled_actions_of_a_handler_are_found(
     handler: EventHandler[Any], right: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Errors that do not change this mission are skipped."""
+    """Skip errors that do not change this mission."""
     different = 0
     for quirk in mistakes(handler):
         monkeypatch.setitem(QUIRKS, quirk.name, quirk)

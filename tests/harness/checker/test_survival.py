@@ -1,5 +1,6 @@
-"""Test which blocks survive a loss of vehicles, and which further loss a swarm can bear, in runs with a known
-answer.
+"""Test the computation of survival in runs with known results.
+
+It computes which blocks survive the loss of vehicles, and which further losses a swarm can bear.
 """
 
 from pathlib import Path
@@ -23,7 +24,9 @@ ATTRITION = Path(__file__).parents[3] / "scenarios" / "attrition.yaml"
 
 
 def evidence(timeline: list[dict[str, Any]], *, tracing: bool = True, **keys: Any) -> Evidence:
-    """Play a run in which agent 1 completes a block at 10 s, and agent 3 at 15 s. Receivers commit them 10 s later."""
+    """Play a run in which agent 1 completes a block at 10 s, and agent 3 at 15 s. Receivers commit each block 10 s
+    later.
+    """
     script = [{"at_s": 10, "agent": 1}, {"at_s": 15, "agent": 3}]
     one = scenario(
         agents=4,

@@ -15,7 +15,7 @@ def _run(t: float, handler: str, branch: str, reconciling: bool = False) -> Hand
 
 
 def _votes(*late_s: float, reconciling: bool = False) -> Trace:
-    """Return the trace of an agent whose voting timers of 10 s expired late by these times."""
+    """Return the trace of an agent whose vote timers of 10 s expired late by these numbers of seconds."""
     header = TraceHeader(agent_id=1, roster=[1], settings={"vote_timeout_s": 10.0}, clock={})
     runs = [
         run

@@ -1,4 +1,4 @@
-"""Bring an agent of the reference implementation into a state, for the tests of its handlers.
+"""Bring an agent of the reference implementation into a state in which a test can call its handlers.
 
 The agent under test has ID 1. Agents 2 to 5 exist only as senders of messages.
 """
@@ -43,12 +43,12 @@ def top(agent: Agent) -> bytes:
 
 
 def complete(agent: Agent, timestamp_us: int = 100, now: float = 0.0) -> list[Step]:
-    """Log one event that completes a block, and return the resulting steps."""
+    """Log one event that completes a block, and return the handler runs that this causes."""
     return agent.log(LoggableEvent(timestamp_us, 1, bytes(800)), now)
 
 
 def receive_commit(agent: Agent, block: Block, now: float = 0.0) -> list[Step]:
-    """Deliver a Commit Block message whose block follows the agent's top block."""
+    """Deliver a Commit Block message with a block that extends the agent's chain."""
     return agent.receive(2, CommitBlock(block, next_chain_hash(top(agent), block.block_hash)), now)
 
 
@@ -93,7 +93,7 @@ def agent_in_phase_3(block: Block, **settings: Any) -> Agent:
 
 
 def pop_top(agent: Agent, now: float = 0.0) -> list[Step]:
-    """Run one round of reconcile phase 1 in which the only answer is "no"."""
+    """Run one round of reconcile phase 1. The only answer in it is "no", so the agent removes its top block."""
     answer_phase_1(agent, 2, contained=False)
     return agent.expire("phase one", now)
 
@@ -108,7 +108,10 @@ def agent_with_stack(chain_count: int, stack_count: int, **settings: Any) -> Age
 
 
 def agent_in_phase_3_with_stack(stack_count: int, chosen: bytes, **settings: Any) -> tuple[Agent, list[Step]]:
-    """Return an agent whose reconcile phase 2 chose `chosen` after it removed its whole chain, and the steps."""
+    """Return an agent whose reconcile phase 2 has chosen the block `chosen`, and the last handler runs.
+
+    The agent has removed its whole chain before.
+    """
     agent = agent_with_stack(0, stack_count, **settings)
     answer_phase_1(agent, 2, contained=True)
     agent.expire("phase one", 5.0)

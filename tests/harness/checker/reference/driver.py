@@ -1,4 +1,4 @@
-"""Call the reference implementation in tests: each method gives it one input and returns the resulting handler runs."""
+"""Call the reference implementation in tests. Each method gives it one input and returns the resulting handler runs."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from ucp.trace import Tally
 
 
 class Step(NamedTuple):
-    """A run of a handler. `sent` pairs each message with its sequence number."""
+    """A run of a handler. `sent` contains each sent message with its sequence number."""
 
     handler: Handler
     branch: str
@@ -25,7 +25,9 @@ class Step(NamedTuple):
 
 
 class Agent:
-    """The reference implementation as an agent among the agents of `roster`. `now` is in mission seconds."""
+    """The reference implementation of one agent of the mission with this `roster`. `now` is the time in mission
+    seconds.
+    """
 
     def __init__(
         self, agent_id: int, roster: Iterable[int], initial_data: bytes, settings: Settings | None = None
@@ -42,7 +44,7 @@ class Agent:
         return self._steps()
 
     def expire(self, timer: Timer | str, now: float) -> list[Step]:
-        """Let a timer expire, given as an object or by its name. A stopped timer does not expire."""
+        """Let a timer expire. The timer is given as an object or by its name. A stopped timer does not expire."""
         name = timer if isinstance(timer, str) else timer.name
         expired = next(each for each in self.state.timers if each.name == name)
         if expired.active:

@@ -24,15 +24,15 @@ from ucp.trace import RecordedBytes
 
 ROSTER = range(1, 6)
 LIFE = 250
-"""Inputs until the agent reboots with its store, or starts again with another agent's settings."""
+"""Number of inputs until the agent reboots with its store, or a new agent with other settings takes its place."""
 
 Give = Callable[[Agent | ReferenceAgent], None]
 
 
 class Inputs:
-    """Creates inputs that fit the state of an agent, nearly fit it, or do not fit it at all.
+    """Creates inputs that fit the state of an agent, nearly fit the state, or do not fit it at all.
 
-    Timestamps of blocks are below `newest_us`. If it is small, some are equal.
+    Timestamps of blocks are below `newest_us`. If `newest_us` is small, some timestamps are equal.
     """
 
     def __init__(self, rng: Random, newest_us: int = 1_000) -> None:
@@ -42,7 +42,7 @@ class Inputs:
         self.heard: list[Message] = []
 
     def draw(self, core: Agent, number: int, now: float) -> tuple[float, Give]:
-        """Return the time of input `number`, and a function that gives the input to an agent."""
+        """Return the time of the input with this number, and a function that gives the input to an agent."""
         rng, ends = self.rng, core.next_timer()
         draw = rng.random()
         if draw < 0.08 and ends is not None:

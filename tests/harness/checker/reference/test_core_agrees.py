@@ -1,6 +1,6 @@
 """Test that the agent and the independent reference take the same steps in the same state, for random inputs.
 
-`prove` compares them in every state within bounds. Here both get random inputs in random states beyond all bounds.
+`prove` compares them in every state within bounds. Here both get random inputs in random states outside any bounds.
 """
 
 from dataclasses import replace
@@ -24,7 +24,7 @@ from ucp.trace import HandlerRun
 
 HANDLER_OF = {timer: handler for handler, timer in TIMER_OF.items()}
 INPUTS = 2_500
-"""Random inputs for each of 40 seeds."""
+"""Number of random inputs for each of the 40 seeds."""
 
 
 def settings_for(rng: Random) -> Settings:
@@ -39,12 +39,14 @@ def test_reference_has_each_setting_of_the_core_with_its_default() -> None:
 
 
 def runs_of(agent: Agent | ReferenceAgent) -> list[HandlerRun]:
-    """Return the handler runs since the last call without their inputs, which only the agent records."""
+    """Return the handler runs since the last call, without the inputs that triggered them. Only the agent records
+    inputs.
+    """
     return [replace(entry, input=None) for entry in agent.trace() if isinstance(entry, HandlerRun)]
 
 
 def first_difference(did: list[HandlerRun], should: list[HandlerRun]) -> str | None:
-    """Return a sentence about the first handler run that differs. Return None if all runs are equal."""
+    """Return a sentence about the first handler run that differs. Return None if all handler runs are equal."""
     for before, (mine, theirs) in zip([None, *did], zip_longest(did, should), strict=False):
         if mine is None or theirs is None or mine.handler != theirs.handler:
             after = f"after {before.handler} of Algorithm {before.algorithm}: " if before else ""
@@ -55,7 +57,7 @@ def first_difference(did: list[HandlerRun], should: list[HandlerRun]) -> str | N
 
 
 def next_handler(agent: Agent) -> str:
-    """Return the handler of the timer that expires next."""
+    """Return the handler for the timer that expires next."""
     running = {timer.deadline: timer.name for timer in agent.state.timers if timer.deadline is not None}
     return HANDLER_OF[running[min(running)]] if running else "no timer"
 

@@ -237,7 +237,7 @@ def test_tally_of_phase_2_is_in_hex_and_a_copy() -> None:
 
 
 def choose(answers: list[tuple[bytes | None, int]], **settings: Any) -> Step:
-    """Answer reconcile phase 2 as agents 2, 3, 4 and so on. Return the step of Algorithm 15."""
+    """Deliver answers of reconcile phase 2 from agents 2, 3, 4 and so on. Return the run of Algorithm 15."""
     agent = agent_in_phase_2(**settings)
     for sender, (block_hash, timestamp_us) in enumerate(answers, 2):
         answer_phase_2(agent, sender, block_hash, timestamp_us)

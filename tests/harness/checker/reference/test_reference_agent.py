@@ -1,4 +1,4 @@
-"""Test how the reference implementation drives its handlers, as one agent and as a swarm."""
+"""Test how the reference implementation calls its handlers, with one agent and with a swarm."""
 
 import random
 from hashlib import sha256
@@ -97,7 +97,7 @@ def test_restored_agent_is_in_a_reconcile() -> None:
 
 
 def run_swarm(seed: int, loss: float, **settings: Any) -> list[Agent]:
-    """Run five agents until all are idle, with delays of 2-50 ms, and check invariants after each input."""
+    """Run five agents with delays of 2 to 50 ms until all are idle. Check invariants after each input."""
     rng = random.Random(seed)
     agents = {agent_id: new_agent(agent_id, **settings) for agent_id in ROSTER}
     inputs: list[tuple[float, int, int, int, Message | LoggableEvent]] = []
