@@ -25,7 +25,7 @@ def harness(
 ) -> subprocess.CompletedProcess[str]:
     """Run the command to its end, and return its output.
 
-    By default, COLUMNS is not set: a worker of pytest-xdist has it, and output in a pipe has no width.
+    By default, COLUMNS is not set. A worker of pytest-xdist sets it, but output in a pipe has no width.
     """
     if env is None:
         env = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
@@ -44,7 +44,7 @@ def sentences(stderr: str) -> list[str]:
 
 
 def write_scenario(directory: Path, **keys: Any) -> Path:
-    """Write a scenario with a short mission. By default it takes two seconds of wall time."""
+    """Write a scenario with a short mission. By default, the mission takes two seconds of wall time."""
     scenario = {"name": "test", "agents": 3, "duration_s": 200, "speedup": 100, **keys}
     path = directory / "scenario.yaml"
     path.write_text(json.dumps(scenario))  # JSON is YAML
@@ -74,7 +74,7 @@ class Running:
             time.sleep(0.02)
 
     def wait_for_mission(self, *agents: int) -> None:
-        """Wait until each of these agents has traced a handler run."""
+        """Wait until each of these agents has written a handler run into its trace."""
 
         def traced() -> bool:
             paths = [self.out / "agents" / f"{agent}.trace.jsonl" for agent in agents]
@@ -97,7 +97,7 @@ class Running:
 
 
 def processes(directory: Path) -> dict[int, str]:
-    """Return the command line of every process that uses a run directory, by process ID."""
+    """Return the command line of every process whose command names this run directory, by process ID."""
     found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdigit() or int(entry.name) == os.getpid():

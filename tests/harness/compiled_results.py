@@ -1,7 +1,7 @@
 """Print digests of results of the harness as JSON, with the modules in use: `python -m tests.harness.compiled_results`.
 
-`test_compiled.py` runs this program with compiled modules and with their sources, and compares the digests. An argument
-limits the program to some kinds of results.
+`test_compiled.py` runs this program with compiled modules and with their sources, and compares the digests. Arguments
+limit the program to some kinds of results.
 """
 
 import hashlib

@@ -20,7 +20,9 @@ class Cluster:
         self._file = directory / "scheduler.json"
 
     def start_scheduler(self, **env: str) -> str:
-        """Start the scheduler and return its address. It waits two seconds for a lost worker instead of 30."""
+        """Start the scheduler and return its address. The scheduler waits two seconds for a lost worker instead of
+        30.
+        """
         env["DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT"] = "2s"
         self.scheduler = self._start("scheduler", "scheduler", "--port", "0", "--scheduler-file", self._file, **env)
         until(lambda: self._file.exists() and self._file.stat().st_size > 0)

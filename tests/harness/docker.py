@@ -13,7 +13,7 @@ from harness.play.containers.docker_engine import DEFAULT_HOST, DockerEngine
 
 
 def containers(run: Path) -> list[str]:
-    """Return the names of all containers of the run in this directory, including stopped ones."""
+    """Return the names of all containers of the run in this directory. Stopped containers are included."""
     engine = DockerEngine.connect()
     found = engine.api.containers(all=True, filters={"label": f"{ownership.RUN}={ownership.run_name(run)}"})
     engine.close()
@@ -36,7 +36,7 @@ def foreign_container(name: str) -> Iterator[DockerEngine]:
 
 
 class BreakableConnection:
-    """A socket that forwards everything to Docker, until a test calls `silent` or `cut`."""
+    """A socket that forwards everything to Docker until a test calls `silent` or `cut`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -50,7 +50,7 @@ class BreakableConnection:
         threading.Thread(target=self._serve, daemon=True).start()
 
     def silent(self) -> None:
-        """Accept connections from now on, but forward nothing."""
+        """From now on, accept connections but forward nothing."""
         self._open.clear()
 
     def cut(self) -> None:

@@ -1,4 +1,5 @@
-"""Call `ucp-harness` fast, by forking a server process that has already imported all commands.
+"""Call `ucp-harness` without the time for its imports. A server process that has already imported all commands forks
+for each call.
 
 Each call is a process with its own arguments, working directory, environment and standard streams. A fork saves the
 import of the modules, 0.4 s of processor time. `python -m tests.harness.forks FD` is the server process. It ends when
@@ -24,11 +25,13 @@ from pathlib import Path
 REPOSITORY = Path(__file__).parents[2]
 MAX_REQUEST_BYTES = 1 << 17
 READ_AT_START = ("PYTHON", "LANG", "LC_")
-"""First letters of environment variables that an interpreter reads only at its start. A fork would ignore changes."""
+"""Prefixes of environment variables that an interpreter reads only at its start. A forked process would ignore changes
+of them.
+"""
 
 
 def same_interpreter(environ: Mapping[str, str]) -> bool:
-    """Return true if a new interpreter with this environment would behave like the present one."""
+    """Return whether a new interpreter with this environment would behave like the present one."""
     names = {name for name in (*environ, *os.environ) if name.startswith(READ_AT_START)}
     return all(environ.get(name) == os.environ.get(name) for name in names)
 
@@ -102,7 +105,9 @@ def _server(packages: Path | None) -> socket.socket:
 
 
 class _FastExit:
-    """The last exit function of a forked process. It skips the release of memory, which would take long."""
+    """The last exit function of a forked process. It ends the process without releasing memory, which would take
+    long.
+    """
 
     status = 1  # the status after an exception
 

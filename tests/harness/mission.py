@@ -1,4 +1,4 @@
-"""Play missions for tests of the checker: real agents in a simulated network, with the usual export files."""
+"""Play missions for tests of the checker. Real agents run in a simulated network and write the usual exports."""
 
 import json
 from pathlib import Path

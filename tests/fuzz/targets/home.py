@@ -1,8 +1,8 @@
-"""Fuzz target: files of a real flight, and all code that reads them. It raises no traceback and reports each unused
-file.
+"""Fuzz target: files of a real flight, and all code that reads them.
 
-A file is ingested alone and together with undamaged files. It is imported, replayed if it is a trace, and read from the
-archive of its run. Slow steps are done for a part of the inputs, which depends on the input alone.
+The code raises no unexpected exception, and reports each unused file. The target ingests a file alone and together with
+undamaged files. It imports the file, replays the file if it is a trace, and reads it from the archive of its run. Only
+some inputs take the slow steps. The bytes of an input determine whether it takes them.
 """
 
 import zlib

@@ -1,8 +1,7 @@
-"""Fuzz target: key files (bundles, public keys, private keys, lists of excluded vehicles). They are refused, or
-reproduced by the writer.
+"""Fuzz target: key files (bundles, public keys, private keys, lists of excluded vehicles).
 
-An input replaces a file in a directory with valid keys. The schema in the input selects the file. An input without a
-known schema replaces any file.
+The reader refuses a file, or the writer reproduces it. The input replaces a file in a directory with valid keys. The
+schema in the input selects the file. An input without a known schema can replace any file.
 """
 
 import json

@@ -1,7 +1,7 @@
-"""Fuzz target: a scenario in YAML. It is refused in one sentence, or reproduced by the writer. A short one is also
-played.
+"""Fuzz target: a scenario in YAML. The reader refuses it in one sentence, or the writer reproduces it.
 
-So scripted fates, lateness, datagrams and events are not only read but done.
+The target also plays short scenarios, so that scripted fates, delays, datagrams and events are not only read but take
+effect.
 """
 
 import json

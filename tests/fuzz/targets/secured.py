@@ -1,9 +1,12 @@
-"""Fuzz target: an agent with keys. The input is a sequence of operations, each of which is a byte with its arguments.
+"""Fuzz target: an agent with keys.
 
-Other agents send any message: correctly encrypted and signed, with keys that they do not have, damaged, repeated, of
-any epoch and any restart. The authority excludes any agent. These conditions hold. The agent raises no exception. Its
-memory is limited by the numbers of vehicles and blocks. A datagram that is dropped before its signature is verified
-changes nothing. The agent behaves like one that shares cached cryptography with others in virtual time.
+The input is a sequence of operations. Each operation is a byte that is followed by its arguments. Other agents send any
+messages, of any epoch and any incarnation. The messages may be correct, damaged, repeated, or signed with the keys of
+another agent. The authority may exclude any agent.
+
+These conditions hold for any input. The agent raises no exception. Its memory is limited by the numbers of vehicles and
+blocks. A datagram that is dropped before its signature is verified changes nothing. The agent behaves like one that
+shares cached cryptography with other agents in virtual time.
 """
 
 from collections.abc import Iterator

@@ -1,6 +1,7 @@
-"""Fuzz target: the signed export of a secured run, or its public keys. Both are judged without a traceback.
+"""Fuzz target: the signed export of a secured run, or its public keys.
 
-The first byte of an input says which file the rest is put in the place of.
+The checker judges both without an unexpected exception. The first byte of the input selects the file that the rest of
+the input replaces.
 """
 
 from collections.abc import Iterator

@@ -1,6 +1,7 @@
 """Fuzz target: the stored data of an agent. An input that begins with a brace gets correct checksums.
 
-It is refused in a sentence or it is a state that an agent boots from, and that is written and read again the same.
+The agent refuses the stored data in one sentence, or boots from the stored state. In the second case, the state is the
+same after it is written and read again.
 """
 
 import zlib

@@ -54,7 +54,7 @@ def unknown_name(name: str) -> str:
 
 
 def renamings() -> Iterator[tuple[str, Rename]]:
-    """Yield each kind of defined name with a function that replaces such a name in a handler run."""
+    """Yield a description of each defined name, and a function that replaces this name in a handler run."""
     for name, handler in HANDLERS.items():
         yield f"handler {name}", handler_renamed(name)
         for branch in handler.branches:

@@ -251,7 +251,9 @@ def test_chains_are_read_without_a_valid_record(run_dir: Path, record: str) -> N
 
 @pytest.mark.parametrize("option", ["--decode", "--json"])
 def test_closed_standard_output_ends_the_command_quietly(tmp_path: Path, option: str) -> None:
-    """The output is longer than the buffer of a pipe, so the command notices that the reader is gone."""
+    """The output is longer than the buffer of a pipe. Therefore the command notices that the reader has closed the
+    pipe.
+    """
     run = write_run(fly(agents=5, duration_s=12_000), tmp_path / "run", CONNECTED)
     with subprocess.Popen(
         [*COMMAND, "chain", str(run), option], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -313,7 +315,7 @@ def test_any_block_is_printed_and_mapped(flown: Air, blocks: list[tuple[int, int
 
 
 def fixes(book: Logbook) -> list[list[tuple[int, bytes]]]:
-    """Return the positions of each track as bytes, because unknown angles are NaN, which equals nothing."""
+    """Return the positions of each track as bytes. Unknown angles are NaN, which is not equal to itself."""
     return [[(timestamp_us, position.pack()) for timestamp_us, position in track.fixes] for track in tracks(book)]
 
 

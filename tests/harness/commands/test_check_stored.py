@@ -1,4 +1,6 @@
-"""Test that `check` compares stored verdicts and versions with its own. A swarm that needs more time gives status 4."""
+"""Test that `check` compares its verdicts and versions with the stored ones. The status is 4 for a swarm that needs
+more time.
+"""
 
 import json
 import os
@@ -54,7 +56,9 @@ def test_check_reports_another_stored_verdict(
 
 
 def test_run_edited_after_its_end_is_status_1(tmp_path: Path) -> None:
-    """Outside a clone the commit is unknown, so package version and reference identify the checker."""
+    """Outside a clone, the commit is unknown. The versions of the package and of the reference then identify the
+    checker.
+    """
     installed = tmp_path / "installed"
     installed.mkdir()
     for package in ("harness", "netem", "sitl", "ucp"):

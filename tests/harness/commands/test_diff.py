@@ -94,7 +94,7 @@ def test_json_holds_the_first_difference(a: Path, b: Path) -> None:
 
 
 def test_times_and_hashes_of_the_same_blocks_are_not_compared(a: Path, b: Path) -> None:
-    """Two runs with real processes always differ in this way."""
+    """Times and hashes always differ between two runs with real processes."""
     for path in (b / "agents").glob("*.json*"):
         text = re.sub(
             r"\b[0-9a-f]{64}\b", lambda found: hashlib.sha256(found[0].encode()).hexdigest(), path.read_text()

@@ -56,7 +56,7 @@ def test_summary_of_a_command_is_the_start_of_its_help(name: str) -> None:
 
 
 def panels(*command: str) -> dict[str, str]:
-    """Return the panels of a command's help at 80 columns, as title and text."""
+    """Return the title and text of each panel of a command's help at a width of 80 columns."""
     shown = harness(*command, "--help", env={**os.environ, "COLUMNS": "80"}).stdout
     return dict(re.findall(r"╭─ ([^─]+) ─+╮\n(.*?)╰─", shown, re.DOTALL))
 
@@ -79,7 +79,7 @@ def commands_of(command: Any, *names: str) -> Iterator[tuple[str, Any]]:
 
 
 OPTIONS_IN_A_PANEL = 11
-"""One more than the options of `run` in its first panel that are not rare."""
+"""Maximum number of options in a panel. The first panel of `run` has one less, without the rare options."""
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -20,7 +20,7 @@ SWARM = scenario(agents=3, duration_s=100)
 
 
 class Judged(SilentProgress):
-    """A display that records the steps of the checker. It can press Ctrl-C at one of them."""
+    """A display that records the steps of the checker. At one of the steps, it can act like Ctrl-C."""
 
     def __init__(self, interrupted_at: str | None = None) -> None:
         self.steps: list[str] = []

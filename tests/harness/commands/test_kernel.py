@@ -29,7 +29,9 @@ beats = "while echo; do sleep {beat_s}; done"
 assert beats in uml._COMMAND
 uml._COMMAND = uml._COMMAND.replace(beats, "while sleep {beat_s}; do echo; done")
 """
-"""Make the guest beat only BEAT_S seconds after the command has started."""
+"""Code that makes the guest send its first sign of life BEAT_S seconds after the start of the command, and not at
+once.
+"""
 
 
 @pytest.mark.uml
@@ -146,7 +148,7 @@ def _run(script: str) -> int:
 
 
 class _UmlProgram:
-    """A program that starts User Mode Linux. At its end, it must remove all files in `temporary`."""
+    """A program that starts User Mode Linux. When it ends, it must remove all files in the directory `temporary`."""
 
     def __init__(self, folder: Path, *command: str) -> None:
         self.temporary = folder / "tmp"
@@ -167,7 +169,9 @@ class _UmlProgram:
         pytest.fail(f"it ended before it said {word}: {self.process.communicate()}")
 
     def remaining_processes(self) -> list[str]:
-        """Return the command lines of its User Mode Linux processes. They contain the name of its directory."""
+        """Return the command lines of the program's User Mode Linux processes. They contain the name of its
+        directory.
+        """
         found = []
         for entry in Path("/proc").iterdir():
             try:

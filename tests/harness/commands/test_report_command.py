@@ -61,7 +61,7 @@ def test_damaged_export_is_reported_and_the_rest_is_drawn(run_dir: Path) -> None
 
 
 def cut(path: Path) -> None:
-    """Cut off the end of a file, as if its writer had been stopped within a line."""
+    """Cut off the end of a file within a line, as if the program that writes it had been stopped."""
     path.write_bytes(path.read_bytes()[:-40])
 
 

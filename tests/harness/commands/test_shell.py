@@ -15,7 +15,7 @@ DEADLINE_S = 60.0
 
 @contextmanager
 def active_run(tmp_path: Path, kind: str) -> Iterator[Path]:
-    """Start a run, and yield its directory when all agents run. Afterwards end the run."""
+    """Start a run, and yield its directory as soon as all agents are running. End the run afterwards."""
     out = tmp_path / "run"
     scenario = write_scenario(tmp_path, duration_s=100_000, vehicles={"kind": kind})
     with subprocess.Popen(

@@ -26,7 +26,7 @@ def server() -> Iterator[FirmwareServer]:
 
 @pytest.fixture
 def environ(server: FirmwareServer, tmp_path: Path) -> dict[str, str]:
-    """Return environment variables with an empty cache and this server as the mirror."""
+    """Return environment variables that set an empty cache, and this server as the mirror."""
     python_environment = {name: value for name, value in os.environ.items() if name.startswith(forks.READ_AT_START)}
     cache = str(tmp_path / "cache")
     place = {"XDG_CACHE_HOME": cache, "PATH": "/usr/bin:/bin", "UCP_SITL_URL": server.url, "no_proxy": "127.0.0.1"}

@@ -50,7 +50,9 @@ def test_wrong_request_is_refused_in_one_sentence(arguments: list[str], says: st
 
 @pytest.mark.lab
 def test_missing_program_of_a_script_is_no_missing_feature(tmp_path: Path) -> None:
-    """A shell ends with status 127 if it does not find a program, as an agent does that lacks a feature."""
+    """A shell ends with status 127 if it does not find a program. An agent without a required feature ends with the
+    same status.
+    """
     script = tmp_path / "agent"
     script.write_text('#!/bin/sh\nexec no-such-interpreter agent.py "$1"\n')
     script.chmod(0o755)

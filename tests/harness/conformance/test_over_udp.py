@@ -26,7 +26,7 @@ LIMIT_S = 60.0
 
 @pytest.fixture(scope="module")
 def idle() -> list[VectorSet]:
-    """Return the generated tests of an idle agent with at most one block in its chain."""
+    """Return the generated tests of an agent that is idle with at most one block in its chain."""
     steps = list(explore(VARIANTS["default"]))
     wanted = {step.key: step for step in steps if step.before.activity == "idle" and len(step.path) <= 1}
     assert len(wanted) > 30
@@ -74,9 +74,11 @@ def test_vectors_that_need_a_missing_feature_are_not_applicable(tmp_path: Path, 
 
 
 async def _late(place: Path) -> tuple[TestedStep | None, bool, TestedStep | None]:
-    """Suspend an agent while its vote ends, and give it two inputs.
+    """Suspend an agent until its vote should have ended, and give it an input. After it continues, give it another
+    input.
 
-    Return the first observation, whether the reference follows the agent, and the second observation.
+    Return the result of the first input, whether the reference still follows the agent, and the result of the second
+    input.
     """
     async with UdpLab(place, OURS, 1) as lab:
         agent = await UdpAgent.start(lab, VARIANTS["default"], TIMING_IN_PARALLEL)

@@ -52,7 +52,7 @@ def joined(secret: Path, *command: str) -> Iterator[None]:
 
 
 def vectors(longest: int) -> list[VectorSet]:
-    """Return the generated tests of an idle agent after at most `longest` inputs."""
+    """Return the generated tests of an idle agent that have at most `longest` inputs."""
     steps = list(explore(VARIANTS["default"]))
     wanted = {step.key: step for step in steps if step.before.activity == "idle" and len(step.path) <= longest}
     return [VectorSet(VARIANTS["default"], steps, wanted)]

@@ -1,4 +1,6 @@
-"""Test how an agent plays many generated tests, including tests for which the machine was too late."""
+"""Test how the conformance test plays many generated tests in sequence, including tests for which the machine was too
+late.
+"""
 
 import asyncio
 import time
@@ -13,7 +15,7 @@ from harness.conformance.vectors import VectorSet
 
 
 def test_impossible_vector_is_not_tried_again_in_the_same_state() -> None:
-    """A vote is impossible if all other agents have voted. The next tests are then played."""
+    """A vote is impossible if all other agents have voted. The conformance test then continues with the next tests."""
     variant = VARIANTS["default"]
     steps = list(explore(variant))
     wanted = next(step for step in steps if step.key.input == "vote no" and not step.key.counted)
@@ -25,7 +27,7 @@ def test_impossible_vector_is_not_tried_again_in_the_same_state() -> None:
 
 
 class AgentOnLateMachine(AgentUnderTest):
-    """A correct agent on a machine that is always too late, unless the agent runs alone."""
+    """A correct agent on a machine that is always late, except while the agent runs alone."""
 
     def __init__(self, variant: SettingsVariant, alone: bool) -> None:
         super().__init__(variant)

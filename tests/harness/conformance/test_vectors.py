@@ -1,4 +1,6 @@
-"""Test the generated tests: they are always the same, cover all branches, and agree with the agent in virtual time."""
+"""Test the generated test vectors: they are always the same, cover all branches, and agree with the agent in virtual
+time.
+"""
 
 import json
 from collections import Counter

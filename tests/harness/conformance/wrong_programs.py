@@ -1,7 +1,8 @@
 """Run agents with programming errors: `python -m tests.harness.conformance.wrong_programs MISTAKE MISSION_FILE`, or
 `--virtual`.
 
-Each is `python -m ucp.node` with one mistake outside the 20 algorithms. `ucp/quirks` has mistakes inside them.
+Each agent is `python -m ucp.node` with one mistake outside the 20 algorithms. `ucp/quirks` has mistakes inside the
+algorithms.
 """
 
 import json
@@ -34,7 +35,7 @@ def mistake(make: Callable[[], object]) -> Callable[[], object]:
 
 
 def _patch(owner: Any, name: str, replacement: Callable[..., Any]) -> None:
-    """Replace a method. The replacement receives the old method as its first argument."""
+    """Replace a method. The replacement gets the original method as its first argument."""
     old = getattr(owner, name)
     setattr(owner, name, lambda *arguments, **keys: replacement(old, *arguments, **keys))
 
@@ -328,7 +329,9 @@ def dies_of_a_second_sigterm() -> None:
 
 @mistake
 def ends_with_status_3_without_a_mission() -> None:
-    """It does so at a signal before the command `start`, and at the end of its input in virtual time."""
+    """The agent ends with status 3 at a signal before the command `start`. In virtual time, it does so at the end of
+    its input.
+    """
 
     def run(old: Callable[..., Any], self: Node) -> int:
         status: int = old(self)
@@ -382,7 +385,7 @@ def reads_times_as_doubles() -> None:
 
 @mistake
 def answers_requests_only_one_by_one() -> None:
-    """Lose a request that arrives together with another one."""
+    """Lose a request that arrives together with another request."""
     from ucp.control import _ControlClient
 
     def go_on(old: Callable[..., Any], self: Any) -> None:

@@ -1,4 +1,4 @@
-"""A client for the Debug Adapter Protocol, which reads the state of a debugged program like an IDE."""
+"""Control a debugger with the Debug Adapter Protocol, and read the state of the debugged program, like an IDE."""
 
 import json
 import socket
@@ -23,7 +23,7 @@ class Ide:
         self._connection.close()
 
     def attach(self, breakpoints: dict[Path, int]) -> None:
-        """Connect to the program, and set one breakpoint per file at the given line."""
+        """Connect to the program. In each file, set one breakpoint at the given line."""
         self.ask("initialize", adapterID="test", pathFormat="path", linesStartAt1=True)
         attaching = self._send("attach", {"justMyCode": False})
         self.event("initialized")

@@ -1,4 +1,4 @@
-"""Write flight logs for tests: DataFlash files with own message definitions, and telemetry with pymavlink."""
+"""Write flight logs for tests. The module writes DataFlash files itself, and telemetry logs with pymavlink."""
 
 import struct
 from collections.abc import Iterable, Iterator
@@ -19,20 +19,20 @@ DEFINITIONS: dict[str, tuple[int, str, str]] = {
     "RAD": (72, "QBBBBBHH", "TimeUS,RSSI,RemRSSI,TxBuf,Noise,RemNoise,RxErrors,Fixed"),
     "IMU": (73, "QBfff", "TimeUS,I,GyrX,GyrY,GyrZ"),
 }
-"""Name -> number, types and columns, as in ArduPilot 4.7."""
+"""The number, the types and the columns of each DataFlash message by its name, as in ArduPilot 4.7."""
 _STRUCT = {
     **{code: code for code in "BbHIfQ"},
     **{"c": "h", "e": "i", "L": "i", "M": "B", "n": "4s", "N": "16s", "Z": "64s"},
 }
 _FACTOR = {"c": 100, "e": 100, "L": 10_000_000}
 WEEK, WEEK_MS = 2446, 10_000_000
-"""GPS time at boot."""
+"""GPS time at the vehicle's boot."""
 BOOT_UTC_US = (315_964_800 - 18) * 1_000_000 + WEEK * 604_800_000_000 + WEEK_MS * 1000
 LAT_DEG, LON_DEG = 48.0, 2.0
 
 
 def dataflash(name: str, *values: Any) -> bytes:
-    """Return one DataFlash message."""
+    """Return the bytes of one DataFlash message."""
     number, types, _ = DEFINITIONS[name]
     raw = [
         round(value * _FACTOR[code]) if code in _FACTOR else value for code, value in zip(types, values, strict=True)
@@ -75,14 +75,14 @@ def dataflash_file(messages: Iterable[bytes] | None = None) -> bytes:
 
 
 def stamped(at_us: int, frame: bytes) -> bytes:
-    """Return a MAVLink frame in the form of a telemetry log."""
+    """Return a MAVLink frame with its timestamp, as in a telemetry log."""
     return struct.pack(">Q", at_us) + frame
 
 
 def telemetry_messages(
     *, vehicle: int = 7, seconds: int = 60, first_us: int = 1_700_000_000_000_000, ahead_us: int = 0
 ) -> Iterator[bytes]:
-    """Yield the stamped frames of a plane that flies north at 10 m/s.
+    """Yield the frames of a plane that flies north at 10 m/s, each with its timestamp.
 
     The vehicle's GPS time is `ahead_us` ahead of the computer's clock.
     """

@@ -1,4 +1,4 @@
-"""Play runs in virtual time whose records other tests read."""
+"""Play runs in virtual time and write their records, which tests read."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from tests.harness.virtual import scenario
 
 
 def flown(directory: Path, seed: int = 1, **keys: Any) -> Path:
-    """Write the directory of a run of a few minutes. `keys` are additional keys of the scenario."""
+    """Play a run of a few minutes and write its directory. `keys` are additional keys of the scenario."""
     mission = {"agents": 3, "duration_s": 400, "network": {"loss": 0.2}, **keys}
     return run(scenario(**mission), seed, directory, SilentProgress(), "sim").directory
 

@@ -19,7 +19,7 @@ EPOCH_NS = 1_790_000_000_000_000_000
 
 
 class RecordedItem(NamedTuple):
-    """One record of an agent. `kind` is the value of the CSV column of that name."""
+    """One record of an agent. `kind` is the value of the column `kind` in a CSV file."""
 
     time_ns: int
     agent: int

@@ -16,7 +16,7 @@ from tests.harness.field.flights import flown, trace_of
 PAGE = (Path(__file__).parents[3] / "docs/how-to/import-other-logs.md").read_text()
 TEXTS = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
 LOG = "".join(line for line in TEXTS[0].splitlines(keepends=True) if " STEP " not in line)
-"""The log without its step, which is abridged on the page."""
+"""A log without the entry `step`, which the page abridges."""
 PROGRAMS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 

@@ -1,4 +1,4 @@
-"""Test that the table of wrong agents in replays is complete and correct."""
+"""Test that the table in docs/appendix/wrong-agents-field.md is complete and correct."""
 
 from docs.generate.wrong_agents.at_the_desk import PAGE, AtTheDesk, Named, row
 from docs.generate.wrong_agents.trials_page import rows_of

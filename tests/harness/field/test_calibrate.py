@@ -27,7 +27,7 @@ EPOCH_US = 1_790_000_000_000_000
 def attempts(
     seed: int, number: int = 1500, truth: DeliveryModel = TRUTH, lasting: int = 1
 ) -> list[TransmissionAttempt]:
-    """Draw random transmissions over six links. `lasting` messages of a link share their shadowing."""
+    """Draw random transmissions over six links. On each link, `lasting` successive messages have the same shadowing."""
     rng, drawn = Random(seed), []
     for block in range(number // lasting):
         deviation, link = rng.gauss(0, 1), rng.randrange(6)
@@ -131,7 +131,9 @@ def test_simulated_flight_is_fitted(flown: tuple[Path, CalibrationResult, Delive
 
 
 def _taken_home(run: Path, directory: Path, vehicles: tuple[int, ...]) -> Path:
-    """Copy the traces in the form of real records, and write flight logs of `vehicles` in place of `tracks.jsonl`."""
+    """Copy the traces in the form that real flights record. Write flight logs of `vehicles` in place of
+    `tracks.jsonl`.
+    """
     directory.mkdir()
     for trace in (run / "agents").glob("*.trace.jsonl"):
         text = trace.read_text().replace('"epoch_us":0', f'"epoch_us":{EPOCH_US}')

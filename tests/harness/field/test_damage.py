@@ -50,7 +50,7 @@ KINDS = (
     "lines of two traces interleaved",
     "clock set back",
 )
-"""Some of the kinds of damage. The benchmark has all of them."""
+"""The kinds of damage that this test uses. The benchmark `field_damage` has all kinds."""
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,9 @@ def test_boot_from_disk_proves_an_earlier_incarnation(tmp_path: Path) -> None:
 def test_forged_block_during_a_recorded_incarnation_is_not_genuine(
     whole: tuple[Path, Undamaged], tmp_path: Path
 ) -> None:
-    """The trace of agent 1 covers the time of the block, so no missing part of it can have completed the block."""
+    """The trace of agent 1 covers the time of the block. Therefore no missing part of the trace can have completed the
+    block.
+    """
     evidence = field_evidence(gather(RunArchive(whole[0])), ingest_files([whole[0]]).largest())
     trace, export = evidence.traces[1], evidence.exports[2]
     held = next(block for block in export.chain if block.agent_id == 1)
@@ -120,7 +122,9 @@ def test_forged_block_during_a_recorded_incarnation_is_not_genuine(
 
 
 def _without(path: Path, *numbers: int) -> Path:
-    """Remove lines from a trace, counted from 1, and move it away from its run."""
+    """Remove the lines with these numbers from a trace, and move the trace away from its run. Line numbers count from
+    1.
+    """
     lines = path.read_bytes().splitlines(keepends=True)
     moved = path.parent.parent.parent / path.name
     moved.write_bytes(b"".join(line for number, line in enumerate(lines, 1) if number not in numbers))
@@ -157,7 +161,7 @@ ANSWER, VOTE = "receive_response_next_in_sequence", "receive_vote_add_block"
 
 @pytest.fixture(scope="module")
 def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with the records of five agents that often reconcile."""
+    """Return a directory with the records of five agents that often reconcile."""
     home = tmp_path_factory.mktemp("five") / "home"
     flight = scenario(agents=5, duration_s=300, network={"loss": 0.2}, events={"source": "random", "mean_s": 8})
     bring_home(flight, 1, "sim", home.parent / "run", home)
@@ -202,7 +206,7 @@ def test_ingest_reads_swapped_and_repeated_lines_once_and_in_order(run: Path, tm
 
 
 def test_lost_timer_callback_is_named_before_its_effects(run: Path, tmp_path: Path) -> None:
-    """The voting timer of an agent stops without a handler run. The next event finds the agent idle."""
+    """The vote timer of an agent stops without a handler run. When the next event occurs, the agent is idle."""
     trace = read_trace(trace_of(run, 1))
     assert trace is not None
     header = checked(trace.header)
@@ -242,7 +246,7 @@ def test_lost_message_excuses_no_difference_if_records_exclude_it(
 
 
 def test_wrong_core_is_named_although_its_trace_has_unknown_parts(tmp_path: Path) -> None:
-    """The block that agent 2 holds twice makes its state unknown, so the line of the mistake lies before a gap."""
+    """Agent 2 holds one block twice, so its state is unknown. The line with the mistake therefore lies before a gap."""
     wrong = scenario(**FLIGHT, quirks={"commit_others_twice": {"agents": [2]}})
     bring_home(wrong, 1, "sim", tmp_path / "run", tmp_path / "home")
     made = reconstruct(ingest_files([tmp_path / "home"]).largest(), "again")
@@ -250,7 +254,7 @@ def test_wrong_core_is_named_although_its_trace_has_unknown_parts(tmp_path: Path
 
 
 def test_reconstruct_prints_both_explanations_of_a_doubtful_step(tmp_path: Path) -> None:
-    """Without the traces of the others, a lost vote explains the step as well as the wrong core."""
+    """Without the traces of other agents, a lost vote explains the step as well as the wrong core does."""
     flight = FLIGHT | {"timeline": [], "capture": False, "quirks": {"tie_is_majority": {"agents": [2]}}}
     bring_home(scenario(**flight), 2, "sim", tmp_path / "run", tmp_path / "home")
     for other in (1, 3):
@@ -262,7 +266,9 @@ def test_reconstruct_prints_both_explanations_of_a_doubtful_step(tmp_path: Path)
 
 
 def test_damaged_name_of_a_sent_block_is_no_deviation(whole: tuple[Path, Undamaged], tmp_path: Path) -> None:
-    """The datagram on the same line is intact, and another agent received it."""
+    """The name of the block is damaged, but the datagram on the same line is intact. Another agent received this
+    datagram.
+    """
     shutil.copytree(whole[0], tmp_path / "home")
     path = tmp_path / "home" / "1.trace.jsonl"
     header, *lines = path.read_text().splitlines(keepends=True)

@@ -19,7 +19,7 @@ LINE = next(
     for number, text in enumerate(SOURCE.read_text().splitlines(), 1)
     if "core.majority_response_block_hash = majority_response" in text
 )
-"""A line of Algorithm 15 at which phase 2 has chosen a block."""
+"""A line of Algorithm 15. When it runs, phase 2 has chosen a block."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def expected(record: Path) -> tuple[float, int]:
-    """Return the mission second at which the agent first reaches the line, and the length of its chain then."""
+    """Return the mission second at which the agent first reaches the line, and the length of its chain at this time."""
     player = RecordPlayer(open_record(record))
     while not player.at_end:
         entry = player.forward()

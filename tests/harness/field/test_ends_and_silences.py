@@ -1,4 +1,6 @@
-"""The end of a record whose agent died in a handler, and messages that an agent ignored silently."""
+"""Test the end of the record of an agent that died in a handler, and messages that an agent ignored without a
+record.
+"""
 
 import dataclasses
 import json
@@ -25,7 +27,7 @@ DEAD = 3
 
 
 def _break_algorithm_3(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the handler of Algorithm 3 raise an error in one agent, as an edited core does."""
+    """Let the handler of Algorithm 3 raise an exception in one agent, as an edited core may do."""
     right = ON_MESSAGE[BlockAddRequest]
 
     def dying(core: Core, sender: int, message: BlockAddRequest) -> str:
@@ -38,7 +40,9 @@ def _break_algorithm_3(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def crashed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A directory with the run of an agent that dies in Algorithm 3, and its files from the field in `home`."""
+    """Return a directory with the run of an agent that dies in Algorithm 3. Its subdirectory `home` has the files from
+    the field.
+    """
     _break_algorithm_3(monkeypatch)
     bring_home(scenario(**FLIGHT), 1, "sim", tmp_path / "run", tmp_path / "home")
     return tmp_path
@@ -72,7 +76,7 @@ def test_messages_to_a_dead_agent_are_not_lost(monkeypatch: pytest.MonkeyPatch, 
 
 @pytest.mark.parametrize("tracing", [True, False])
 def test_agent_that_died_reboots_with_its_disk(monkeypatch: pytest.MonkeyPatch, tracing: bool) -> None:
-    """The handler of Algorithm 1 completes a block and then raises an error. This block is not on the disk."""
+    """The handler of Algorithm 1 completes a block and then raises an exception. The disk does not have this block."""
     right, dead = ON_LOCAL_EVENT["Build Data Block"], []
 
     def dying(core: Core, event: LoggableEvent) -> str:
@@ -121,7 +125,7 @@ def test_replay_names_the_message_at_which_the_record_ends(crashed: Path) -> Non
 
 
 def test_replay_names_the_timer_at_which_the_record_ends(crashed: Path) -> None:
-    """The record of agent 1 ends while its voting timer runs, and the lines of others at that time are lost."""
+    """The record of agent 1 ends while its vote timer runs. Other agents' records lack the lines of this time."""
     home = crashed / "home"
     (home / "3.trace.jsonl").unlink()
     (home / "1.chain.json").unlink()

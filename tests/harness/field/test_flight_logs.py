@@ -1,4 +1,4 @@
-"""Test the reading of ArduPilot's flight logs: all records, GPS time, jumps of the clock, and damaged files."""
+"""Test the reader of ArduPilot's flight logs: all records, GPS time, jumps of the clock, and damaged files."""
 
 import gzip
 from collections.abc import Callable
@@ -263,7 +263,7 @@ def test_other_files_are_no_flight_logs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("beginning", [b"", b"{}", b'{"schema": "ucp-trace/2"}\n', b"Notes of \xfd5 November\n"])
 def test_other_files_need_no_message_definitions(monkeypatch: pytest.MonkeyPatch, beginning: bytes) -> None:
-    """The message definitions of pymavlink take 110 MiB of memory."""
+    """Loading the message definitions of pymavlink takes 110 MiB of memory."""
     monkeypatch.setattr(_reading, "_begins_with_frame", lambda beginning: pytest.fail("pymavlink is imported"))
     assert flight_log_kind(Path("10.trace.jsonl"), beginning) is None
 

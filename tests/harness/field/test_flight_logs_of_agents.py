@@ -1,4 +1,4 @@
-"""Test that flight logs are assigned to the agents that flew on the vehicles, in each command that uses them."""
+"""Test that each command assigns flight logs to the agents that flew on the same vehicles."""
 
 import json
 import re
@@ -38,7 +38,7 @@ AHEAD_S = 2.5
 def fixes(
     *, ahead_s: float = AHEAD_S, east_deg: float = 0.0, start_us: int = START_US, speed_ms: float = 10.0
 ) -> Fixes:
-    """Return the positions that an agent logs on the flight of `flight_messages`, by its own clock."""
+    """Return the positions that an agent logs on the flight of `flight_messages`, with times of its own clock."""
     return [
         (
             start_us + round((second + ahead_s) * 1e6),
@@ -126,7 +126,9 @@ def test_failsafe_that_changed_the_mode_is_named(reason: int, name: str, tmp_pat
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Create exports of agents 7 and 8, a flight log of agent 7's vehicle, and files of other programs."""
+    """Create a directory with exports of agents 7 and 8, a flight log of agent 7's vehicle, and files of other
+    programs.
+    """
     directory = tmp_path_factory.mktemp("home")
     air = Air([7, 8])
     for agent_id in (7, 8):

@@ -1,4 +1,4 @@
-"""Test the import of records of other programs: nothing is invented, and each omission is reported."""
+"""Test the import of records of other programs: the import invents nothing, and reports each omission."""
 
 import csv
 import json
@@ -139,7 +139,7 @@ def test_truncated_sqlite_bag_has_every_message_up_to_its_end(tmp_path: Path, sh
 
 
 def test_missing_quote_in_csv_damages_only_its_row(run: Path, tmp_path: Path) -> None:
-    """Each cell is quoted, and the JSON in a cell extends over several lines."""
+    """All cells are quoted, and the JSON text in a cell extends over several lines."""
     path = tmp_path / "records.csv"
     items = [*of_run(run, ("trace",))]
     with path.open("w", newline="") as file:

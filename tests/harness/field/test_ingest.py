@@ -1,4 +1,4 @@
-"""Test the reading of many files: records are grouped by content, and every usable part is used."""
+"""Test the function that reads the files of a flight: it groups records by their content, and uses every usable part."""
 
 import base64
 import gzip

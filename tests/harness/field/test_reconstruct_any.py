@@ -1,4 +1,4 @@
-"""Test that any flight of correct agents with complete records is reproduced to the last block."""
+"""Test that `reconstruct` reproduces any flight of correct agents with complete records to the last block."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -38,7 +38,7 @@ def wrong_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def state_of(player: RecordPlayer) -> Any:
-    """Return the state of the reference and the result so far, for comparison."""
+    """Return the state of the reference and the result so far. Tests compare them."""
     state = {name: value for name, value in vars(player.state).items() if "timer" not in name and name != "running"}
     state["chain"] = (player.state.chain.top_chain_hash, list(player.state.chain))
     state.pop("_moved")
@@ -116,7 +116,9 @@ def test_json_output_agrees_with_the_text(wrong_run: Path) -> None:
 
 
 def test_source_line_of_each_handler_is_its_first_statement() -> None:
-    """Compare the first statement of each handler. A breakpoint at `def` would stop when the module is imported."""
+    """Compare the source line with the first statement of each handler. A breakpoint at the line of `def` would stop
+    during the import.
+    """
     for name in HANDLERS:
         path, _, line = source_of(name).rpartition(":")
         lines = (Path.cwd() / path).read_text().splitlines()

@@ -1,4 +1,4 @@
-"""Test the replay of damaged records: the remaining parts are played, and missing parts are no deviations."""
+"""Test the replay of damaged records: it plays the remaining parts, and missing parts are no deviations."""
 
 import base64
 import gzip
@@ -148,7 +148,9 @@ def test_unplayable_record_does_not_prevent_the_others(traces_only: Path) -> Non
 
 @pytest.mark.parametrize("by_s", [30.0, -30.0, 5000.0])
 def test_changed_clock_causes_no_deviation(by_s: float, traces_only: Path) -> None:
-    """Change the clock during a vote. The timer expires correctly, although the recorded times contradict that."""
+    """The clock of the agent was set during a vote. The timer expires correctly, although the recorded times contradict
+    this.
+    """
     path = traces_only / "2.trace.jsonl"
     lines = path.read_text().splitlines()
     votes = [number for number, line in enumerate(lines) if '"branch":"proposed"' in line]

@@ -40,7 +40,9 @@ FAULTS: list[list[dict[str, Any]]] = [
 
 
 def assert_no_difference(directory: Path) -> None:
-    """Replay each record twice: in the directory of its run, and alone. Alone, the end of the agent is unknown."""
+    """Replay each record twice: in its run directory, and without the other files. In the second case, the end of the
+    agent is unknown.
+    """
     traces = sorted((directory / "agents").glob("*.trace.jsonl"))
     assert traces
     for trace in traces:

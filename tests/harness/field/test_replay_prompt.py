@@ -22,7 +22,7 @@ def wrong_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def output_of(wrong_run: Path, *commands: str, options: tuple[str, ...] = ("--step",)) -> dict[str, list[str]]:
-    """Return the output after each command. All commands must be different."""
+    """Return the output lines after each command. The commands must be different from each other."""
     ended = harness("replay", wrong_run, "--agent", 2, *options, input="".join(f"{command}\n" for command in commands))
     assert sentences(ended.stderr) == []
     said: dict[str, list[str]] = {"": []}

@@ -1,4 +1,4 @@
-"""Test the messages about programs that ended with status 127: an agent without a feature, or a shell."""
+"""Test the error messages about programs that ended with status 127. These are agents without a feature, or shells."""
 
 from pathlib import Path
 

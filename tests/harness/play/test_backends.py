@@ -74,7 +74,7 @@ class PerfectSwarm(Swarm):
 
 
 class PerfectAir(Backend):
-    """A new backend under the name of an existing one, because scenarios accept only known names."""
+    """A new backend. It takes the name of an existing backend, because scenarios accept only known names."""
 
     name = "docker"
 

@@ -1,4 +1,4 @@
-"""Test the counts of losses by receiver on a shared radio channel."""
+"""Test how a shared radio channel counts the losses of each receiver."""
 
 from collections import Counter
 from random import Random

@@ -28,7 +28,7 @@ STUDY = NetworkStudy(NetworkConditions(), (MeasuredQuantity(1, 4, "loss 0.15", "
 
 
 def losing(*shares: float) -> Observer:
-    """Return a measuring function that reports these loss rates, one after another."""
+    """Return a function in place of a measurement. At each call, it reports the next one of these loss rates."""
     streams = iter(shares)
 
     def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
@@ -40,7 +40,7 @@ def losing(*shares: float) -> Observer:
 
 
 def fake(monkeypatch: pytest.MonkeyPatch, observer: Observer, findings: list[MachineRequirement] = WORKS) -> None:
-    """Replace the machine by one with these properties and this measuring function."""
+    """Replace the machine by a machine with these properties, and the measurement by this function."""
     monkeypatch.setattr(doctor_module, "examine", lambda: findings)
     monkeypatch.setattr(capabilities, "studies", lambda engine: (STUDY,))
     monkeypatch.setattr(capabilities, "in_lab", lambda engine: observer)

@@ -50,7 +50,7 @@ def record(out: Path) -> dict[str, Any]:
 
 
 def files(out: Path) -> dict[str, bytes]:
-    """Return the files of a run that a packet capture must not change."""
+    """Return the files of a run that must be the same with and without a packet capture."""
     kept = ("agents/*", "before-final-reconcile/*", "network.jsonl")
     return {str(path.relative_to(out)): path.read_bytes() for pattern in kept for path in out.glob(pattern)}
 

@@ -39,7 +39,7 @@ network: {channel: {preset: lora_sf7, duty: 1.0, largest_bytes: 1472, processing
 
 
 def play(scenario: str, folder: Path, backend: str = "process") -> tuple[RunRecord, list[dict[str, Any]]]:
-    """Play the scenario, and return the record and the lines of channel.jsonl."""
+    """Play the scenario. Return the content of run.json, and the lines of channel.jsonl."""
     require(None)
     file, run = folder / f"{backend}.yaml", folder / backend
     file.write_text(scenario)
@@ -64,7 +64,7 @@ def test_processes_share_a_channel_and_no_record_contradicts(tmp_path: Path) -> 
 
 
 def shares(channels: list[ChannelRecord], receivers: int) -> dict[str, float]:
-    """Return the share of copies that these radio channels lost, by reason."""
+    """Return the share of copies that these radio channels lost, for each reason."""
     copies = receivers * sum(channel.frames for channel in channels)
     return {
         reason: sum(channel.total(reason) for channel in channels) / copies for reason in ("collision", "half_duplex")

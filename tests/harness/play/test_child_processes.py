@@ -1,4 +1,4 @@
-"""Test processes that an agent leaves running at its end."""
+"""Test processes that an agent has started and that still run when the agent ends."""
 
 import json
 import os

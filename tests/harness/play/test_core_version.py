@@ -43,7 +43,7 @@ def test_core_is_all_that_an_agent_imports() -> None:
 
 @pytest.fixture
 def released_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Record the digests of the core in use, whether or not it is the released one."""
+    """Record the digests of the installed agent core as those of the released core."""
     recorded = tmp_path / "released_core.sha256"
     monkeypatch.setattr(core_version, "RELEASED", recorded)
     core_version.record()
@@ -53,7 +53,7 @@ def released_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[P
 
 
 def edit(recorded: Path) -> None:
-    """Record another digest of `ucp/commit.py`, as if the file had been edited."""
+    """Record a wrong digest of `ucp/commit.py`, as if the file had been edited since."""
     lines = recorded.read_text("ascii").splitlines()
     edited = [f"{'0' * 64}  ucp/commit.py" if line.endswith(" ucp/commit.py") else line for line in lines]
     recorded.write_text("\n".join(edited), "ascii")

@@ -127,7 +127,7 @@ def test_full_cache_drops_entries_and_stays_correct(monkeypatch: pytest.MonkeyPa
 
 
 def played(monkeypatch: pytest.MonkeyPatch, agent_id: int, spoil: Callable[[SecuredAgent], None]) -> Simulated:
-    """Play a mission in which `spoil` has changed this agent."""
+    """Play a mission with one agent that the function `spoil` has changed."""
     init = SecuredAgent.__init__
 
     def spoiled(agent: SecuredAgent, *arguments: Any, **options: Any) -> None:

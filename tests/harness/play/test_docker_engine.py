@@ -29,7 +29,7 @@ from tests.harness.secure.secrets import secrets as secrets_of
 
 
 def listening(path: Path) -> socket.socket:
-    """Return a server socket that accepts connections and never answers."""
+    """Return a server socket that accepts connections but never answers."""
     server = socket.socket(socket.AF_UNIX)
     server.bind(str(path))
     server.listen()

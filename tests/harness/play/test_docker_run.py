@@ -1,4 +1,6 @@
-"""Test the Docker backend with real containers: same verdicts as with processes, faults, and no leftovers."""
+"""Test the Docker backend with real containers: it has the same verdicts as processes, supports faults, and leaves
+nothing behind.
+"""
 
 import json
 import os
@@ -24,7 +26,7 @@ NO_VEHICLES = {"vehicles": {"kind": "none"}}
 IMPATIENT = (
     "import harness.play.containers.docker_engine as it; it.ANSWER_LIMIT_S = 6; import harness.cli as c; c.main()"
 )
-"""The command line with an engine that has 6 s to answer, which is enough for one that is not hurt."""
+"""Code that runs `ucp-harness` with 6 s for each answer of the Docker engine. An undisturbed engine needs less."""
 
 
 def on_docker(tmp_path: Path, *options: object, **keys: Any) -> subprocess.CompletedProcess[str]:
@@ -251,7 +253,7 @@ def test_output_of_a_program_is_in_its_log(tmp_path: Path) -> None:
 
 
 def test_container_cannot_change_its_network(tmp_path: Path) -> None:
-    """A container has no privileges, and its root directory cannot be written."""
+    """The container has no privileges, and its root directory is read-only."""
     agent = tmp_path / "agent.sh"
     agent.write_text("#!/bin/sh\ngrep Cap /proc/self/status\ngrep NoNewPrivs /proc/self/status\ntouch /x\nexit 4\n")
     agent.chmod(0o755)

@@ -21,7 +21,9 @@ DEADLINE_S = 60.0
 
 
 class GroundStation(threading.Thread):
-    """A ground station on a free port. It records the vehicles, and sends vehicle 2 home when it flies."""
+    """A ground station on a free port. It records which vehicles it sees, and sends vehicle 2 home when the vehicle
+    flies.
+    """
 
     def __init__(self, deadline_s: float = DEADLINE_S) -> None:
         super().__init__(daemon=True)
@@ -77,7 +79,7 @@ def test_operator_sees_all_vehicles_and_commands_one(tmp_path: Path) -> None:
     ],
 )
 def test_operator_flies_a_real_copter_under_a_debugger(backend: tuple[str, ...], tmp_path: Path) -> None:
-    """The test takes two minutes, because a copter needs 46 s until it can be armed."""
+    """The test takes two minutes, because a copter cannot be armed in its first 46 s."""
     if "ARDUPILOT_SITL" not in os.environ:
         pytest.skip("no ArduPilot: set ARDUPILOT_SITL to the directory that holds an arducopter")
     ground = GroundStation(deadline_s=200)

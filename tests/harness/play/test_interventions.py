@@ -26,7 +26,9 @@ pytestmark = pytest.mark.any_user
 
 
 def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> Run:
-    """Play a simulated run that is paused at mission second 0. `do` sends requests, and then time continues."""
+    """Play a simulated run that is paused at mission second 0. The function `do` sends requests, and then time
+    continues.
+    """
     interventions = Interventions(asked, virtual_time=True, paused=True)
     over = threading.Event()
 

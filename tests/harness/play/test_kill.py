@@ -20,13 +20,13 @@ pytestmark = pytest.mark.lab
 
 MOMENTS = 20
 LAST_MOMENT_S = 3.5
-"""The run below takes about four seconds: start, two seconds of mission, settling, export, check, report."""
+"""Maximum time of a kill in seconds. The run takes about four seconds, of which the mission takes two."""
 GONE_WITHIN_S = 10.0
 MARK = "UCP_TEST_MARK"
 
 
 def marked(mark: str) -> dict[int, str]:
-    """Return the network namespace of each process that inherited the mark of this run, by process ID."""
+    """Return the network namespace of each process whose environment has the mark of this run, by process ID."""
     wanted = f"{MARK}={mark}".encode()
     found = {}
     for entry in Path("/proc").iterdir():
@@ -52,7 +52,7 @@ def network_namespaces() -> set[str]:
 
 
 def rules() -> str:
-    """Return the firewall rules of this network, or an empty text if this user cannot read them."""
+    """Return the firewall rules of this network namespace. Return an empty text if the user cannot read them."""
     nft = shutil.which("nft", path="/usr/sbin:/sbin:/usr/bin")
     if nft is None or os.geteuid() != 0:
         return ""

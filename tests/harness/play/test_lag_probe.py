@@ -11,7 +11,9 @@ STALL_S = 0.3
 
 
 class StallingCounters:
-    """Counters whose second reading takes long without computing, as if the machine stopped the program."""
+    """Counters whose second reading takes long without using the processor, as if the machine had stopped the
+    program.
+    """
 
     def __init__(self) -> None:
         self.readings = 0

@@ -1,4 +1,4 @@
-"""Test the shared radio channel in real time, with times that the tests choose."""
+"""Test the shared radio channel in real time. The tests set the time."""
 
 from dataclasses import replace
 from typing import Any
@@ -22,7 +22,7 @@ FAR = Place(5000.0, 0.0, 10.0)
 
 
 class Played:
-    """A radio channel of vehicles 1, 2 and 3, and its log."""
+    """A radio channel between vehicles 1, 2 and 3, and the log of the channel."""
 
     def __init__(self, processing_s: float = 0.0) -> None:
         self.journal: list[dict[str, Any]] = []
@@ -132,7 +132,7 @@ def test_lateness_has_quantiles_and_intervals() -> None:
 
 
 def heard(vehicle: int, message: Message) -> tuple[ReceivedBroadcast, bytes]:
-    """Return a broadcast with this message, and its data."""
+    """Return a broadcast that contains this message, and its data."""
     data = encode(vehicle, 7, message)
     return ReceivedBroadcast(vehicle, 0, bytes(10) + udp_broadcast(vehicle, PORT, data)), data
 

@@ -1,4 +1,4 @@
-"""A directory in memory is removed even if all processes of its run are killed."""
+"""Test that a directory in memory is removed even if all processes of its run are killed."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ with memory_directory(sys.argv[1]) as directory:
 
 @pytest.fixture
 def killed() -> Iterator[Path]:
-    """Return the directory of a process that was killed together with its guard."""
+    """Return the directory of a process that was killed together with the guard of the directory."""
     run = subprocess.Popen([sys.executable, "-c", PROGRAM, PREFIX], stdout=subprocess.PIPE, text=True)
     assert run.stdout is not None
     directory = Path(run.stdout.readline().strip())
@@ -39,7 +39,9 @@ def killed() -> Iterator[Path]:
 
 
 def guard_of(directory: Path) -> int:
-    """Return the process ID of the guard of a directory. Its arguments are visible shortly after its start."""
+    """Return the process ID of the guard of a directory. The arguments of the guard become visible shortly after its
+    start.
+    """
     deadline = time.monotonic() + DEADLINE_S
     while time.monotonic() < deadline:
         for entry in Path("/proc").glob("[0-9]*"):

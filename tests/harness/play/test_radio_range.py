@@ -1,4 +1,6 @@
-"""Test that the network follows the flight: radio losses are added to the conditions in the timeline."""
+"""Test that the network depends on the positions of vehicles: radio losses are added to the conditions in the
+timeline.
+"""
 
 from pathlib import Path
 

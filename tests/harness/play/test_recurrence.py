@@ -1,4 +1,4 @@
-"""Test that a simulated run stops when its swarm repeats a cycle forever."""
+"""Test that a simulated run ends when its swarm repeats a cycle that never ends."""
 
 from typing import Any
 
@@ -98,7 +98,7 @@ def test_idle_swarm_is_in_no_cycle() -> None:
 
 
 def test_hanging_agent_is_reported_without_a_period() -> None:
-    """An agent with the error `crash_on_tie` stays in a reconcile forever after a tie."""
+    """After a tie, an agent with the error `crash_on_tie` stays in its reconcile forever."""
     hanging = [
         run
         for seed in range(20)
@@ -117,7 +117,7 @@ def test_hanging_agent_is_reported_without_a_period() -> None:
 
 
 def test_two_checks_at_the_same_time_are_no_cycle() -> None:
-    """A random search found this run: a cycle of 0 s was reported, although the swarm was idle 15 s later."""
+    """A random search found this run. The harness reported a cycle of 0 s, although the swarm was idle 15 s later."""
     script = [(1, 1), (1, 3), (7, 2), (11, 3), (12, 1), (27, 2), (32, 3)]
     run = simulate(
         scenario(

@@ -1,4 +1,4 @@
-"""Test the rogue node (a sender of forged messages) alone."""
+"""Test the rogue node (a sender of forged messages) without other agents."""
 
 from random import Random
 from typing import Any
@@ -48,7 +48,7 @@ def receive(one: RogueLogic, datagram: bytes, now: float) -> list[RogueDatagram]
 
 
 def wait(one: RogueLogic, until: float) -> list[tuple[float, RogueDatagram]]:
-    """Return the datagrams that the rogue node sends until this time, with their times."""
+    """Return the datagrams that the rogue node sends until this time, each with the time at which it is sent."""
     sent = []
     while (at := one.next_timer()) is not None and at <= until:
         one.handle_timer(at)

@@ -1,4 +1,4 @@
-"""Test injected messages in whole runs: the reactions of the agents, and the verdicts."""
+"""Test whole runs with injected messages: the reactions of the agents, and the verdicts."""
 
 import json
 import os
@@ -45,7 +45,7 @@ def violated(finished: Run) -> set[str]:
 
 
 def only(finished: Run) -> InjectedMessages:
-    """Return the record of the only message type in the run's only injection."""
+    """Return the record of the injected messages. The run has one injection, with messages of one type."""
     (injection,) = finished.rogue
     (messages,) = injection.messages
     return messages
@@ -115,7 +115,7 @@ def test_forged_votes_delay_the_commit_of_a_block(tmp_path: Path) -> None:
 
 
 def check_forgery(finished: Run) -> None:
-    """Check that all other agents commit the forged block, and that characteristic 4 reports it."""
+    """Check that all other agents commit the forged block, and that the check of characteristic 4 reports the block."""
     assert finished.exit_status == 1
     assert only(finished).handled == {"committed": 4}
     assert violated(finished) == {"1", "4"}

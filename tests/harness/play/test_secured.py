@@ -1,4 +1,4 @@
-"""Test that a secured mission in virtual time has the same verdicts as a plain one, and drops forged messages."""
+"""Test that a secured mission in virtual time drops forged messages, and has the same verdicts as a plain mission."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
 
 
 def dropped(run: Simulated) -> set[str]:
-    """Return the reasons why agents dropped datagrams."""
+    """Return the reasons for which agents dropped datagrams."""
     return {reason for agent in run.played.agents.values() for reason in agent.dropped or ()}
 
 

@@ -1,4 +1,4 @@
-"""Test that the simulation always gives the same result. Traces and omitted deliveries do not change a run."""
+"""Test that a simulation always gives the same result, and that traces and omitted deliveries do not change a run."""
 
 import hashlib
 import json
@@ -45,11 +45,13 @@ WITHOUT_EFFECT = {
     "another chain",
     "not held",
 }
-"""Branches of messages that change no agent."""
+"""Branches in which a received message does not change the agent."""
 
 
 def results_of(simulated: Simulated) -> dict[str, Any]:
-    """Return the results of a run except its traces and their numbers of handler runs."""
+    """Return the results of a run without its traces, and without the numbers of handler runs, which depend on
+    traces.
+    """
     exports = {agent_id: export.model_dump() for agent_id, export in simulated.evidence.exports.items()}
     agents = {
         agent_id: agent.model_copy(update={"handler_runs": []}) for agent_id, agent in simulated.played.agents.items()
@@ -134,7 +136,9 @@ def test_omitted_deliveries_change_no_agent(
     final_reconcile: bool,
     seed: int,
 ) -> None:
-    """A simulation that delivers every message gives exactly the same exports, figures and effective handler runs."""
+    """Compare with a simulation that delivers every message: exports, figures and effective handler runs must be
+    equal.
+    """
     one = scenario(
         agents=agents,
         duration_s=300,
@@ -154,7 +158,9 @@ def test_omitted_deliveries_change_no_agent(
 
 @pytest.mark.parametrize("quirk", ["vote_while_reconciling", "count_phase1_of_others"])
 def test_wrong_agents_receive_all_messages(quirk: str) -> None:
-    """One agent answers during a reconcile, and another counts answers to queries of other agents."""
+    """One wrong agent sends answers during a reconcile. The other wrong agent counts answers to queries of other
+    agents.
+    """
     right = scenario(network={"loss": 0.2})
     wrong = scenario(network={"loss": 0.2}, quirks={quirk: True})
     default = results_of(simulate(wrong, 1))
@@ -165,7 +171,7 @@ def test_wrong_agents_receive_all_messages(quirk: str) -> None:
 
 
 def test_quirk_affects_only_the_named_agents() -> None:
-    """Agents without the deliberate error are correct. An error with the value false has no effect."""
+    """All agents without the deliberate error are correct. A deliberate error with the value false has no effect."""
     some = scenario(network={"loss": 0.2}, quirks={"vote_while_reconciling": {"agents": [2, 3]}})
     assert some.quirks_of(2) == {"vote_while_reconciling": True} and some.quirks_of(1) == {}
     steps = simulate(some, 1, tracing=True).result.beside["steps"]
@@ -179,7 +185,7 @@ def test_quirk_affects_only_the_named_agents() -> None:
 
 
 def test_agent_that_changes_a_received_message_damages_no_other_agent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Receivers share one object for each message, except if an agent may be wrong."""
+    """All receivers share one object for each message, unless an agent may be wrong."""
     right = HANDLERS["receive_request_add_block"]
 
     def run(core: Any, sender: int, message: BlockAddRequest) -> str:
@@ -210,7 +216,7 @@ def version_1(run: HandlerRun) -> str:
 
 
 def digest(simulated: Simulated) -> str:
-    """Return a digest of exports, figures and traces. It covers the keys of version 1 of the trace format."""
+    """Return a digest of exports, figures and traces. Traces are reduced to the keys of version 1 of the format."""
     document = results_of(simulated)
     del document["played"]
     traces = [version_1(run) for _, trace in sorted(simulated.evidence.traces.items()) for run in trace.runs]
@@ -277,7 +283,7 @@ def test_added_loss_does_not_change_the_events() -> None:
 
 
 def test_random_event_that_is_too_large_is_not_logged() -> None:
-    """Agents that run as processes do not log it either. The data of a random event has 32 to 256 bytes."""
+    """Agents that run as processes do not log such an event either. The data of a random event has 32 to 256 bytes."""
     sizes = {"max_block_bytes": 150, "max_event_bytes": 100}
     small = scenario(duration_s=200, settings=sizes, events={"source": "random", "mean_s": 20})
     done = simulate(small, 1, tracing=True)

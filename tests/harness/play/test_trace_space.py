@@ -1,4 +1,4 @@
-"""Traces end at a quota. The record counts the missing lines, and no check says that it holds."""
+"""Test traces that end at a quota: the record counts the missing lines, and no check reports that a property holds."""
 
 import json
 from pathlib import Path

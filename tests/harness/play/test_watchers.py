@@ -1,4 +1,4 @@
-"""Test tasks that run beside a mission: they end with it, and the first error is reported."""
+"""Test tasks that run during a mission: they end with the mission, and the first error of a task is reported."""
 
 import asyncio
 import gc
@@ -11,7 +11,7 @@ from harness.play.process._watchers import MissionTasks
 
 
 class LostError(HarnessError):
-    """The error of a watched task."""
+    """The error of a task that runs during a mission."""
 
 
 async def fail() -> None:

@@ -1,4 +1,4 @@
-"""Create copies of the agent core with one planted error each, and run proofs with them."""
+"""Create copies of the agent core with one planted error in each copy, and run proofs with them."""
 
 import os
 import shutil
@@ -23,7 +23,7 @@ class Bug(NamedTuple):
 
 
 def edited(directory: Path, *bugs: Bug) -> Path:
-    """Copy the agent core to `directory/ucp` with these errors. Return `directory`."""
+    """Copy the agent core to `directory/ucp` and make these edits in the copy. Return `directory`."""
     copy = directory / "ucp"
     shutil.copytree(Path(ucp.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))
     for bug in bugs:
@@ -35,12 +35,12 @@ def edited(directory: Path, *bugs: Bug) -> Path:
 
 
 def environment(core: Path) -> dict[str, str]:
-    """Return the environment variables of a process that imports the agent core in the directory `core`."""
+    """Return environment variables with which a process imports the agent core in the directory `core`."""
     return {**os.environ, "PYTHONPATH": f"{core}{os.pathsep}{ROOT}", "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def with_core(core: Path, *arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run `ucp-harness` with the agent core in the directory `core`."""
+    """Run `ucp-harness` with the agent core in the directory `core` in place of the installed one."""
     return subprocess.run(
         [sys.executable, "-P", "-m", "harness.cli", *map(str, arguments)],
         cwd=cwd,

@@ -1,4 +1,4 @@
-"""Explore a swarm from a state in which some agents are idle with different chains."""
+"""Create a swarm for explorations that begin with idle agents and diverged chains."""
 
 from collections.abc import Sequence
 
@@ -8,11 +8,10 @@ from harness.proof.model._zones import NOTHING_RUNS
 
 
 def forked(bounds: Bounds, holders: Sequence[int]) -> ModelSwarm:
-    """Return a swarm whose initial state has diverged chains of one block each.
+    """Return a swarm whose initial state has several chains of one block each.
 
-    `holders` has the number of agents that hold each chain. The other agents hold no block.
-
-    The agents could not reach each other until now. The blocks of these chains are the first of `bounds.blocks`.
+    `holders` has the number of agents that hold each chain. The other agents hold no block. The agents could not reach
+    each other until now. The blocks of these chains are the first blocks of `bounds.blocks`.
     """
     swarm = ModelSwarm(bounds)
     agents = list(swarm.initial[AGENTS:])

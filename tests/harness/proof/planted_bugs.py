@@ -1,7 +1,7 @@
-"""Bugs for copies of the agent core, each with the smallest bounds in which `prove` finds it.
+"""List bugs for copies of the agent core, and the smallest bounds within which `prove` finds each bug.
 
-Most of them break an assumption of a state reduction: that IDs make no difference, that a tally without its timer is
-never read, that the order of answers makes no difference, or that no block disappears.
+Most bugs break an assumption of a state reduction. These assumptions are that IDs make no difference, that no agent
+reads a tally whose timer does not run, that the order of answers makes no difference, and that no block disappears.
 """
 
 from typing import NamedTuple
@@ -11,10 +11,10 @@ from tests.harness.proof.edited_core import Bug
 
 
 class PlantedBug(NamedTuple):
-    """A bug as edits of `ucp/`, the bounds in which the prover finds it, and the kinds of the findings.
+    """A bug as edits of `ucp/`, the bounds within which the prover finds the bug, and the kinds of the findings.
 
-    The kind "refused" means that the prover refuses the agent, because its steps depend on something that is no part of
-    a state.
+    The kind "refused" means that the prover refuses the agent, because the agent's steps depend on data that are not
+    part of a state.
     """
 
     name: str

@@ -1,6 +1,6 @@
 """Test proofs with an attacker who has the keys of a vehicle.
 
-All its possible messages are explored, and simulated runs confirm the results.
+The prover explores all possible messages of the attacker, and simulated runs confirm the results.
 """
 
 from collections.abc import Iterator
@@ -62,7 +62,7 @@ def explored(agents: int = 3, blocks: int = 1, lies: int = 1) -> StateGraph:
 
 
 def lied_to(graph: StateGraph) -> Iterator[tuple[Agent, ForgeryMaterial]]:
-    """Yield each agent in each state in which the attacker can send it one more message."""
+    """Yield each agent in each state in which the attacker can send another message to it."""
     bounds, local = graph.swarm.bounds, graph.swarm.local
     attacker = Attacker(replace(bounds, lies=bounds.lies + 1), local)
     pairs = {
@@ -78,7 +78,7 @@ def lied_to(graph: StateGraph) -> Iterator[tuple[Agent, ForgeryMaterial]]:
 
 
 def random_message(lots: Random, agent: Agent, material: ForgeryMaterial) -> Message:
-    """Return a random message of an attacker who knows these blocks and can create others."""
+    """Return a random message of an attacker who knows the blocks in `material` and can create other blocks."""
     made = Block(CAPTURED, lots.randrange(2_000_000), lots.randbytes(20))
     blocks = [*material.blocks, made]
     hashes = [*material.named, made.block_hash, lots.randbytes(32)]
@@ -106,9 +106,9 @@ def random_message(lots: Random, agent: Agent, material: ForgeryMaterial) -> Mes
 
 
 def outcome(agent: Agent, message: Message, others: frozenset[PendingQuestions]) -> Any:
-    """Return the agent's state after a message, and those of its answers for which other agents wait.
+    """Return the agent's state after a message, and those of its sent messages for which other agents wait.
 
-    New blocks have neutral names. The agent is restored.
+    New blocks have neutral names. The agent is then restored to its earlier state.
     """
     before = take(agent)
     agent.receive_message(CAPTURED, 0, message, NOW_S)
@@ -166,7 +166,9 @@ def test_random_attacks_are_contained() -> None:
 
 
 def by_chance(lots: Random) -> Iterator[Any]:
-    """Play a random run: three agents complete one block, and a captured vehicle sends one forged message."""
+    """Play a random run. Three agents complete one block, and the attacker sends one forged message from a captured
+    vehicle.
+    """
     agents = [Agent(number, (1, 2, 3), b"proof", Settings(max_block_bytes=267)) for number in (1, 2, 3)]
     times = {lots.uniform(0, 30): what for what in ("completes", "captured", "lies")}
     while True:
@@ -312,9 +314,8 @@ def test_lie_needs_a_captured_vehicle(tmp_path: Path) -> None:
 
 
 def test_random_attacks_in_any_network_are_contained() -> None:
-    """The agent has one block of its own and receives any number of forged messages.
-
-    Messages of other agents come late, twice or never.
+    """The agent has one block of its own, and receives any number of forged messages. Messages of other agents may come
+    late, twice or never.
     """
     seen = set()
 

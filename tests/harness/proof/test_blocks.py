@@ -1,4 +1,4 @@
-"""Test that states which differ only in the identity of blocks count as one, if any block may be the oldest."""
+"""Test that states which differ only in the identity of blocks count as one state, if any block may be the oldest."""
 
 from collections.abc import Iterator, Sequence
 from itertools import permutations
@@ -19,12 +19,12 @@ from tests.harness.proof.test_explore import Seen, all_seen, by_chance, explored
 
 
 def alike(seen: Seen) -> Seen:
-    """Return a representative of all views that differ only in the identity of agents and blocks."""
+    """Return the same view for all views that differ only in the identity of agents and blocks."""
     return min(tuple(sorted(called)) for called in renumbered(seen))
 
 
 def renumbered(seen: Seen) -> Iterator[Seen]:
-    """Yield all views that differ only in the identity of blocks."""
+    """Yield all views that differ from this view only in the identity of blocks."""
     there = sorted({block for agent in seen for held in agent[:3] for block in held})
 
     def called(order: Sequence[int]) -> Seen:

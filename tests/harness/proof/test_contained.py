@@ -1,4 +1,4 @@
-"""Test explorations in which a state represents states with smaller zones (`--zones contained`)."""
+"""Test explorations with `--zones contained`, in which a state also represents the states whose zones it contains."""
 
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,7 @@ def test_larger_zone_contains_the_smaller_one() -> None:
 
 
 def test_cycle_whose_times_shift_is_no_livelock() -> None:
-    """In each round, the times of the two agents shift. The graph has a cycle, but no run repeats it forever."""
+    """The times of the two agents shift in each round. The graph has a cycle, but no run repeats this cycle forever."""
     swarm = ModelSwarm(Bounds(2, 3, "lossy", stagger=STAGGER, clocks_any=True, zones_contained=True))
     graph = explore(swarm, most_bytes=8e9, most_s=60)
     assert [*_cyclic_parts(graph, lambda: None)]

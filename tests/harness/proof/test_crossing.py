@@ -1,4 +1,4 @@
-"""Test swarms in which all messages of an action are received before another agent acts."""
+"""Test swarms in which all receivers get the messages of an action before another agent acts."""
 
 from pathlib import Path
 from random import Random

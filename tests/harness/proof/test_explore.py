@@ -1,4 +1,4 @@
-"""Test that the full and the reduced state space agree, and contain the states of random runs."""
+"""Test that the full and the reduced state space agree, and contain all states of random runs."""
 
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -32,7 +32,10 @@ def explored(*arguments: Any, **options: Any) -> StateGraph:
 
 
 def view_of(agent: Agent) -> View:
-    """Return the visible state of an agent: its blocks by place, and its running timers."""
+    """Return the visible state of an agent.
+
+    It consists of the blocks in each list of the agent, and of the running timers.
+    """
     return (
         tuple(block.timestamp_us // MICROSECONDS for block in agent.state.chain),
         tuple(block.timestamp_us // MICROSECONDS for block in agent.state.blocks_to_be_committed),
@@ -43,12 +46,12 @@ def view_of(agent: Agent) -> View:
 
 
 def seen_of(agents: Sequence[Agent]) -> Seen:
-    """Return the visible states of agents in sorted order, without their identity."""
+    """Return the visible states of agents in sorted order. Their IDs do not matter."""
     return tuple(sorted(map(view_of, agents)))
 
 
 def by_place(graph: StateGraph) -> set[Seen]:
-    """Return the visible states of the living agents in each state, in the order of their positions."""
+    """Return, for each state of the graph, the visible states of its living agents in the order of their IDs."""
     local = graph.swarm.local
     agent = Agent(1, range(1, graph.swarm.bounds.agents + 1), b"proof", local.settings)
 
@@ -139,7 +142,7 @@ def by_chance(
     most_lost: float = inf,
     stagger: Stagger | None = None,
 ) -> Iterator[Seen]:
-    """Play a random run, and yield the visible states whenever no message is on its way.
+    """Play a random run, and yield the visible states whenever no message is in transit.
 
     If clocks differ, the timestamps of the agents are years apart. `most_lost` limits the number of lost messages.
     """
@@ -170,7 +173,7 @@ def by_chance(
 
 
 def deliver(agents: Sequence[Agent], loss: float, now: float, lots: Random, most_lost: float = inf) -> int:
-    """Deliver messages, and return the number of lost ones."""
+    """Deliver the messages, and return the number of those that were lost."""
     lost = 0
     while said := [(agent, sent) for agent in agents for sent in agent.messages_to_send()]:
         for receiver in agents:

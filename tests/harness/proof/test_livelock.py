@@ -1,4 +1,4 @@
-"""Test endless cycles: their conditions, and their confirmation by the simulation."""
+"""Test the conditions of endless cycles, and that the simulation confirms the cycles."""
 
 from pathlib import Path
 
@@ -76,9 +76,8 @@ def test_cycle_is_found_in_an_incomplete_graph(tmp_path: Path, monkeypatch: pyte
 
 
 def test_only_one_block_of_the_livelock_has_a_fixed_time(tmp_path: Path) -> None:
-    """The first blocks of both agents must be completed directly after each other.
-
-    The other blocks may come until the vote is decided.
+    """The first blocks of both agents must be completed directly after each other. The time of the other blocks does
+    not matter until the vote is decided.
     """
     proof = prove(Bounds(2, 4, "lossless"), out=tmp_path / "round.yaml")
     completions = proof.livelocks[0].completions
@@ -102,9 +101,8 @@ def test_no_livelock_exists_without_coincidences(tmp_path: Path) -> None:
 
 
 def test_one_more_vote_is_enough_for_three_agents_and_two_blocks(tmp_path: Path) -> None:
-    """If two timers must expire at the same moment, either may be first.
-
-    One more vote is enough only for this reason.
+    """If two timers expire at the same moment, either may be handled first. Only for this reason, one more vote is
+    enough.
     """
     proof = prove(Bounds(3, 2, "lossy"), out=tmp_path / "three.yaml")
     assert proof.liveness is not None

@@ -16,7 +16,7 @@ PROPOSES_NOTHING = Bug(
     "core.reconcile_in_progress = False",
 )
 IN_STEP = ("--agents", 2, "--blocks", 3, "--losses", 1)
-"""Bounds in which the published protocol has a livelock of its own."""
+"""Bounds within which the published protocol itself has a livelock."""
 
 
 def test_livelock_of_the_original_is_no_new_finding(tmp_path: Path) -> None:
@@ -39,7 +39,7 @@ def test_violation_that_the_original_lacks_is_a_new_finding(tmp_path: Path) -> N
 
 
 def test_original_with_the_same_bug_leaves_nothing_new_but_undecided(tmp_path: Path) -> None:
-    """The search stops at the violation that both have, so later states may contain a new one."""
+    """The search stops at the violation that both agents have. A later state may contain a new violation."""
     (tmp_path / "original").mkdir()
     original = edited(tmp_path / "original", PROPOSES_NOTHING)
     core = edited(tmp_path, PROPOSES_NOTHING, HARMLESS)

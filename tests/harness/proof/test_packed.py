@@ -1,4 +1,4 @@
-"""Test that compactly stored states and successors give the originals back."""
+"""Test that states and successors are unchanged after they are stored in compact form and read again."""
 
 import pytest
 

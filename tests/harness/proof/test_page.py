@@ -1,4 +1,4 @@
-"""Compare the quick rows of the tables in proof-bounds.md and livelock-measurements.md with new proofs."""
+"""Repeat the quick proofs in the tables of proof-bounds.md and livelock-measurements.md, and compare the results."""
 
 import re
 from collections.abc import Iterator
@@ -16,15 +16,15 @@ from harness.proof.questions._convergence import look
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE = DOCS / "appendix/proof-bounds.md"
 MOST_S = 0.5
-"""Maximum time in seconds of a row on the page that this test repeats."""
+"""The test repeats the rows whose proof takes at most this number of seconds, according to the page."""
 FEW_STATES = 1_000
-"""Maximum number of states of a cell that this test repeats."""
+"""The test repeats the cells that have at most this number of states, according to the page."""
 
 Row = dict[str, str]
 
 
 def rows() -> Iterator[Row]:
-    """Yield each row of a table of bounds, with the command options in the comment above the table."""
+    """Yield each row of the tables of bounds. The comment above a table has the options of the command."""
     lines = iter(PAGE.read_text().splitlines())
     for line in lines:
         if options := re.fullmatch(r"<!-- prove(.*) -->", line):
@@ -66,7 +66,10 @@ def at_most(cell: str) -> int | None:
 
 
 def one_chain(proof: Proof) -> str:
-    """Return the text for the page: how many further votes states need, and how many states need each number."""
+    """Return the text in the page's column about one chain.
+
+    It has the numbers of further votes that states need, and how many states need each number.
+    """
     live = proof.liveness
     if live is None:
         return "not looked at"
@@ -98,7 +101,7 @@ def test_row_of_the_page_equals_the_proof(row: Row, tmp_path: Path) -> None:
 
 
 def captured_rows() -> list[Row]:
-    """Return the quick rows of the table about captured agents."""
+    """Return the rows of the table about captured agents whose proofs are quick."""
     page = PAGE.read_text()
     head, _, *lines = page.partition("<!-- captured -->\n")[2].partition("\n\n")[0].splitlines()
     found = [dict(zip(cells(head), cells(line), strict=True)) for line in lines]
@@ -123,7 +126,7 @@ def test_row_of_captured_agent_equals_the_proof(row: Row, tmp_path: Path) -> Non
 
 
 class Cell(NamedTuple):
-    """A cell of the table of endless cycles: its bounds and its text."""
+    """A cell of the table of endless cycles. It has the bounds of the cell and the text in it."""
 
     bounds: Bounds
     said: str

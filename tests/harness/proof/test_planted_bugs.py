@@ -48,13 +48,13 @@ def test_planted_bug_is_found_and_its_scenario_plays_it(
     ],
 )
 def test_bug_is_found_as_without_reductions(name: str, forced: list[str]) -> None:
-    """The prover makes no reductions. It would miss the bug or refuse the agent with them."""
+    """The prover uses no reductions here. With reductions, it would miss the bug or refuse the agent."""
     expected = [*bug(name).findings]
     assert findings(bug(name)) == {"default": expected, "whole": expected, "forced": forced}
 
 
 def test_violation_after_further_votes_is_a_printed_reason(tmp_path: Path) -> None:
-    """Within the bounds no agent has a chain of two blocks when it votes. A further vote shows the deviation."""
+    """No agent within the bounds has a chain of two blocks when it votes. A further vote would show the deviation."""
     right = "approve = message.chain_hash == core.chain.top_chain_hash"
     core = edited(tmp_path, Bug("commit.py", right, f"{right} and len(core.chain) < 2"))
     done = with_core(core, "prove", "--agents", 2, "--blocks", 2, "--network", "lossless", "--steps", cwd=tmp_path)
@@ -77,7 +77,7 @@ def test_agent_that_depends_on_a_counter_is_refused(tmp_path: Path) -> None:
 
 
 def test_agent_that_depends_on_the_mission_time_is_refused(tmp_path: Path) -> None:
-    """A state of the proof has the remaining times of timers, and not the time of the mission."""
+    """A state of the proof contains the remaining times of timers, but not the mission time."""
     late = Bug("commit.py", NOT_APPROVED, NOT_APPROVED.replace("not approved", "not approved and core.now < 60"))
     done = with_core(edited(tmp_path, late), "prove", "--agents", 2, "--blocks", 2, cwd=tmp_path)
     assert done.returncode == 2

@@ -49,7 +49,7 @@ def test_all_properties_hold_with_fewer_blocks(tmp_path: Path) -> None:
     [("forget_stack", "2", "2"), ("commit_others_twice", "3", "3"), ("leave_flag_set", "hang", "liveness")],
 )
 def test_wrong_agent_is_found_and_its_scenario_confirms_it(tmp_path: Path, quirk: str, kind: str, key: str) -> None:
-    """No state is reduced, although the bounds allow it."""
+    """The prover reduces no states of a wrong agent, although the bounds allow reductions."""
     proof = prove(Bounds(2, 2, "lossy", quirks={quirk: True}), out=tmp_path / "wrong.yaml")
     assert not proof.bounds.reduced
     assert proof.flaw is not None
@@ -59,7 +59,9 @@ def test_wrong_agent_is_found_and_its_scenario_confirms_it(tmp_path: Path, quirk
 
 
 def test_scenario_forces_the_order_of_messages_that_cross(tmp_path: Path) -> None:
-    """Agent 3 receives a commit before a request at the same time, and therefore rejects the block."""
+    """A commit and a request reach agent 3 at the same time. The commit is first, so the agent rejects the requested
+    block.
+    """
     bounds = Bounds(3, 2, "lossy", quirks={"disapproved_and_unmoved": True}, reduced=False, losses=1)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.flaw is not None
@@ -89,7 +91,7 @@ def test_wrong_step_without_consequence_is_found(tmp_path: Path, quirk: str, han
 
 
 def test_timer_that_was_not_stopped_is_found_before_it_expires(tmp_path: Path) -> None:
-    """The record of a run shows the timer only when it expires."""
+    """The record of a run would show this timer only when it expires."""
     bounds = Bounds(2, 2, "lossy", quirks={"phase3_timer_runs_on": True}, reduced=False, steps=True)
     proof = prove(bounds, out=tmp_path / "wrong.yaml")
     assert proof.flaw is not None
@@ -209,7 +211,7 @@ def test_interrupted_workers_stop(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_ctrl_c_during_the_start_of_workers_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Functions that Python calls at a fork ignore all exceptions."""
+    """Exceptions are ignored in functions that Python calls at a fork."""
     interruptions = [signal.SIGINT]
     os.register_at_fork(before=lambda: signal.raise_signal(interruptions.pop()) if interruptions else None)
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)

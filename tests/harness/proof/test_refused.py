@@ -1,4 +1,4 @@
-"""Test an agent whose blocks all others reject: the conditions of its endless cycle, and the corrections."""
+"""Test an agent whose blocks all other agents reject: the conditions of its endless cycle, and the corrections."""
 
 from typing import Any
 
@@ -17,7 +17,9 @@ STAGGER = {"stagger": {"phase1_timeout_s": 0.5}}
 
 
 def after_the_fork(agents: int, holders: list[int], keys: dict[str, Any]) -> ConvergenceResult:
-    """Return the result of exploring a swarm with diverged chains, without losses, with a block at any time."""
+    """Explore a swarm with diverged chains and no losses, in which agents complete blocks at any time. Return the
+    result.
+    """
     bounds = Bounds(agents, len(holders) + 1, "lossless", **keys)
     graph = explore(forked(bounds, holders), most_bytes=8e9, most_s=300)
     assert graph.ended == "complete"

@@ -1,4 +1,4 @@
-"""Test agents with different timers, whose identity matters."""
+"""Test agents with different timers. In such a swarm, the identity of agents matters."""
 
 from pathlib import Path
 from random import Random
@@ -20,7 +20,7 @@ PHASE_1: Stagger = {"phase1_timeout_s": 0.5}
 
 
 def whichever_block(graph: StateGraph) -> set[Seen]:
-    """Return a representative of all views that differ only in the identity of blocks."""
+    """Return the same view for all views that differ only in the identity of blocks."""
     return {min(renumbered(seen)) for seen in by_place(graph)}
 
 
@@ -76,7 +76,7 @@ def test_path_to_an_idle_swarm_is_played_by_the_right_agents() -> None:
 
 
 def test_cure_holds_with_clocks_any(tmp_path: Path) -> None:
-    """Two agents act at the same times. With the timers of the thesis, they have an endless cycle."""
+    """Two agents act at the same times. With the timers of the thesis, these agents have an endless cycle."""
     bounds = Bounds(2, 4, "lossless", clocks_any=True)
     assert prove(bounds, out=tmp_path / "thesis.yaml").livelocks
     cured = prove(Bounds(2, 4, "lossless", clocks_any=True, stagger=PHASE_1), out=tmp_path / "cured.yaml")

@@ -10,7 +10,7 @@ DURATIONS = (10, 5)
 
 
 def test_zones_contain_exactly_the_possible_times() -> None:
-    """Timers start and expire at random. Whole units are enough, because all bounds are whole numbers."""
+    """Timers start and expire at random. Whole time units are enough, because all bounds are whole numbers."""
     for seed in range(30):
         lots, zones = Random(seed), ZoneTable()
         zone, points = NOTHING_RUNS, {()}

@@ -1,5 +1,5 @@
-"""Control a headless Chromium through its debugging pipe, with the standard library only. It loads only our own
-pages.
+"""Control a headless Chromium through its debugging pipe, with the standard library only. The browser loads only pages
+of the harness.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ def chromium_or_skip() -> str:
 
 
 class Browser:
-    """A browser that shows one page at a time. `complaints` contains the messages of its console."""
+    """A browser that shows one page at a time. `complaints` contains the messages in the browser's console."""
 
     def __init__(self, to_browser: int, from_browser: int) -> None:
         self._to, self._from = to_browser, from_browser
@@ -89,7 +89,7 @@ class Browser:
 
     @contextlib.contextmanager
     def on_paper(self) -> Iterator[None]:
-        """Lay out the page as for a printer inside the context."""
+        """Lay out the page as on paper inside the context."""
         self._call("Emulation.setEmulatedMedia", media="print")
         yield
         self._call("Emulation.setEmulatedMedia", media="")
@@ -128,7 +128,10 @@ class Browser:
 
 @contextlib.contextmanager
 def open_browser(profile: Path) -> Iterator[Browser]:
-    """Start a Chromium with a new, empty profile, and end it afterwards. It expects the pipe on descriptors 3 and 4."""
+    """Start a Chromium with a new, empty profile, and end it afterwards.
+
+    Chromium expects the debugging pipe on file descriptors 3 and 4.
+    """
     chromium = chromium_or_skip()
     its_input, to_browser = os.pipe()
     from_browser, its_output = os.pipe()

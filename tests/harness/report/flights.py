@@ -1,4 +1,4 @@
-"""Write flight paths and the network that follows from them, for tests of the map."""
+"""Write flight paths, and the network conditions that follow from them, for tests of the map."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from harness.scenario.changes import NetworkChange, timeline_of
 from netem.radio import Place
 
 Way = Callable[[float], tuple[float, float]]
-"""Mission seconds -> metres north and east."""
+"""The position of a vehicle at each mission second, in metres north and metres east."""
 
 
 def still(north_m: float, east_m: float) -> Way:
@@ -21,7 +21,9 @@ def still(north_m: float, east_m: float) -> Way:
 
 
 def split_and_rejoin(vehicle: int) -> Way:
-    """Return the position of a vehicle in a flight: a minute together, two minutes in two groups, and back again."""
+    """Return the position of a vehicle in a flight. The vehicles are together for a minute, in two groups for two
+    minutes, and together again.
+    """
     side = -1 if vehicle <= 3 else 1
 
     def way(at_s: float) -> tuple[float, float]:

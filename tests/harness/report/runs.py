@@ -1,4 +1,4 @@
-"""Write run directories for tests of the report. Chains are given as names of blocks."""
+"""Write run directories for tests of the report. Chains are given as texts with the names of blocks."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,10 @@ def block(name: str) -> Block:
 
 
 def documents(chains: Chains) -> dict[int, dict[str, Any]]:
-    """Return the export of each agent. `chains` is like {1: "1.1 2.1", 2: "1.1"}, with the oldest block first."""
+    """Return the export of each agent.
+
+    `chains` is like {1: "1.1 2.1", 2: "1.1"}. The oldest block is first.
+    """
     named = {agent_id: chain.split() if isinstance(chain, str) else list(chain) for agent_id, chain in chains.items()}
     everywhere = {name for chain in named.values() for name in chain}
     exported = {}
@@ -41,7 +44,7 @@ def exports(chains: Chains) -> dict[int, Export]:
 
 
 def write_run(run_dir: Path, chains: Chains, result: Mapping[str, Any] | None = None) -> Path:
-    """Write a run directory with these chains. `result` replaces the content that `result_of` returns."""
+    """Write a run directory with these chains. `result` replaces the run.json that `result_of` would return."""
     write_exports(run_dir / "agents", chains)
     (run_dir / "run.json").write_text(json.dumps({**result_of(list(chains)), **(result or {})}))
     return run_dir

@@ -30,9 +30,9 @@ def git(repository: Path, *arguments: str) -> str:
 
 @pytest.fixture(scope="module")
 def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Create a repository with commits that are good, unrelated, not executable, broken, and unrelated again.
+    """Create a repository with six commits: good, unrelated, not executable, executable again, broken, and unrelated.
 
-    One breaks a handler, and the one before cannot run.
+    The broken commit breaks a handler.
     """
     path = tmp_path_factory.mktemp("project")
     for package in ("ucp", "harness", "netem", "sitl", "scenarios"):

@@ -1,4 +1,4 @@
-"""Test the replay with an agent process: a correct agent agrees with the record, and a wrong one does not."""
+"""Test the replay with an agent process: a correct agent agrees with the record, and a wrong agent does not."""
 
 import json
 import shlex

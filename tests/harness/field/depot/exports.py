@@ -18,7 +18,7 @@ DATA = b"the inception block"
 
 
 def make_block(agent_id: int, number: int, events: int = 2) -> Block:
-    """Return a block that is different for each number."""
+    """Return a block. Its content is different for each number."""
     logged = [LoggableEvent(1000 * number + index, 1 + index, bytes([agent_id, number])) for index in range(events)]
     return Block(agent_id, logged[-1].timestamp_us, b"".join(event.encode() for event in logged))
 
@@ -34,7 +34,9 @@ def document(
     exported_at_us: int = 10**6,
     completed: str | None = None,
 ) -> dict[str, Any]:
-    """Return an export with blocks named like "1.1 2.1". The block under construction contains `building` events."""
+    """Return an export with the blocks in a text like "1.1 2.1". The block under construction contains `building`
+    events.
+    """
 
     def blocks(names: str) -> list[Block]:
         return [make_block(*map(int, name.split("."))) for name in names.split()]

@@ -1,4 +1,4 @@
-"""Test `ucp-harness consolidate`: each event occurs once with its holders, and lost blocks are listed."""
+"""Test `ucp-harness consolidate`: each event occurs once, with the agents that hold it, and lost blocks are listed."""
 
 import base64
 import csv
@@ -156,7 +156,7 @@ def test_trace_lists_blocks_that_were_lost_with_a_disk(tmp_path: Path) -> None:
 
 
 def simulate_into(directory: Path) -> dict[int, Export]:
-    """Write the run directory of three agents that lose most of their messages."""
+    """Write the run directory of three agents that do not receive most of the messages."""
     lossy = {"agents": 3, "duration_s": 400, "network": {"loss": 0.95}, "settle": {"limit_s": 1}}
     path = write_scenario(directory.parent, **lossy, events={"source": "random", "mean_s": 5})
     harness("run", path, "--backend", "sim", "--out", directory)
@@ -365,6 +365,6 @@ def test_logged_position_is_in_the_track_files(tmp_path: Path) -> None:
 
 
 def all_data(export: Export, agent_id: int) -> list[bytes]:
-    """Return the event data of an agent in its own export."""
+    """Return the data of all events in an agent's own export."""
     own = [block.event_bytes for block in export.blocks() if block.agent_id == agent_id]
     return [*own, base64.b64decode(export.current_block.event_data)]

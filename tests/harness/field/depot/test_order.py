@@ -67,7 +67,7 @@ def test_order_has_each_block_once_and_keeps_agreed_orders(chains: list[str], at
 
 
 def closure(chains: Sequence[str]) -> dict[str, set[str]]:
-    """Return all blocks that follow each block, directly or indirectly, in any chain."""
+    """Return all blocks that follow each block in any chain, directly or indirectly."""
     after: dict[str, set[str]] = {letter: set() for letter in LETTERS}
     for letters in chains:
         for position, letter in enumerate(letters):

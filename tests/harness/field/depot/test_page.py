@@ -1,4 +1,4 @@
-"""Test the page of a merged record: it agrees with the record, loads no files, and escapes all data."""
+"""Test the page of a merged record: its content agrees with the record, it loads no files, and all data are escaped."""
 
 import base64
 import json
@@ -23,7 +23,9 @@ WIDE, NARROW = 1280, 390
 
 @pytest.fixture(scope="module")
 def consolidated_flight(tmp_path_factory: pytest.TempPathFactory) -> MergedRecord:
-    """Merge the exports of four vehicles. One has no export, and one lost two blocks and holds one on its stack."""
+    """Merge the records of four vehicles. One vehicle has no export. Another one lost two blocks and holds one on its
+    stack.
+    """
     directory = tmp_path_factory.mktemp("home")
     for path in write_flown(fly_vehicles(4, 700), directory):
         export: dict[str, Any] = json.loads(path.read_text())

@@ -71,7 +71,7 @@ def test_record_of_a_run_is_complete_and_reconciles_to_one_chain(seed: int, tmp_
 
 
 def events_held(exports: dict[int, Export]) -> list[tuple[int, bytes]]:
-    """Return each event in any export, with the agent that logged it."""
+    """Return each event in any export, together with the agent that logged the event."""
     import base64
 
     from ucp.events import decode_events

@@ -23,7 +23,7 @@ for number, line in enumerate(sys.stdin):
     CODE
     print(json.dumps(said), flush=True)
 """
-"""An agent that only answers. CODE can make it fail."""
+"""The source text of an agent that only answers its input. Code in place of CODE can make the agent fail."""
 
 EXPORT = """
 if 'mission' in given:
@@ -39,7 +39,7 @@ if given.get('command') == 'export':
 
 
 def small(directory: Path, code: str = "pass") -> list[str]:
-    """Return the command of a small agent program, which runs `code` before each answer."""
+    """Return the command of a small agent program. The program runs `code` before each answer."""
     path = directory / "agent.py"
     path.write_text(SMALL.replace("CODE", code.replace("\n", "\n    ")))
     return [sys.executable, "-S", "-E", str(path)]
@@ -50,7 +50,7 @@ def played_by(command: list[str] | dict[int, list[str]], **keys: Any) -> Scenari
 
 
 def living(word: Path) -> list[int]:
-    """Return the processes whose command contains this path."""
+    """Return the processes whose command line contains this path."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():

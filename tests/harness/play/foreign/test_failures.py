@@ -1,4 +1,4 @@
-"""Test errors of a foreign agent in virtual time. The record contains one sentence that names the agent."""
+"""Test errors of a foreign agent in virtual time. The record of the run contains one sentence that names the agent."""
 
 import json
 import re
@@ -32,7 +32,7 @@ def narrow_limits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run_with(tmp_path: Path, code: str, **keys: Any) -> Run:
-    """Play a run in which agent 2 is a small program with `code`."""
+    """Play a run in which agent 2 is a small program that runs `code` before each answer."""
     one = played_by({2: small(tmp_path, code)}, **{**SHORT, **keys})
     return run(one, 1, tmp_path / "run", SilentProgress(), "sim")
 
@@ -222,7 +222,7 @@ def test_program_that_dies_at_its_start_leaves_the_others(tmp_path: Path) -> Non
 
 
 def test_agent_with_growing_number_of_datagrams_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each of two agents answers each datagram with two datagrams."""
+    """Each of the two agents answers each datagram with two datagrams."""
     monkeypatch.setattr(_foreign_agent, "MAX_SENT_PER_S", 200)
     code = EVENT + "said['sent'] = ['AA==']\nif 'datagram' in given:\n    said['sent'] = ['AA==', 'AA==']"
     one = played_by(small(tmp_path, code), **SHORT)
@@ -232,7 +232,7 @@ def test_agent_with_growing_number_of_datagrams_fails(tmp_path: Path, monkeypatc
 
 
 def test_stray_datagram_reaches_other_agents(tmp_path: Path) -> None:
-    """The agent sends half a header, and a message in another agent's name."""
+    """The agent sends the first half of a header, and a message in the name of another agent."""
     forged = in_base64(encode(1, 0, BlockAddRequest(bytes(32), bytes(32))))
     code = EVENT + f"said['sent'] = ['VUMB', '{forged}']"
     run_with(tmp_path, code, agents=3, duration_s=20)

@@ -1,4 +1,4 @@
-"""Test that the harness's own agent gives exactly the same run as a separate program and in the simulation."""
+"""Test that the harness's own agent gives the same run as a separate program and inside the simulation."""
 
 import json
 from operator import itemgetter
@@ -52,7 +52,7 @@ def both(one: Scenario, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def test_own_agent_behaves_the_same_behind_lines() -> None:
-    """The scenario contains all kinds of faults. The second mission reuses the process of the first."""
+    """The scenario contains all kinds of faults. The second mission uses the same process as the first."""
     for seed in (1, 2):
         within, outside = both(scenario(**EVENTFUL), seed)
         assert within == outside
@@ -60,7 +60,9 @@ def test_own_agent_behaves_the_same_behind_lines() -> None:
 
 
 def test_own_agent_with_keys_behaves_the_same_behind_lines() -> None:
-    """It encrypts and decrypts datagrams, remembers excluded vehicles after a reboot, and drops the same datagrams."""
+    """The agent encrypts and decrypts datagrams, remembers excluded vehicles after a reboot, and drops the same
+    datagrams.
+    """
     revoked = {"at_s": 200, "revoke": [1], "heard_by": [2]}
     forged = {"at_s": 120, "forge": {"message": "Commit Block", "sender": 2}}
     keys = {

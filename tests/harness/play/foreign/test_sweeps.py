@@ -1,4 +1,6 @@
-"""Test foreign agents (separate programs) over many missions: searches, matrices, and the end of all programs."""
+"""Test foreign agents (separate programs) in searches and matrices, which play many missions. All programs end
+afterwards.
+"""
 
 import json
 import signal

@@ -1,4 +1,4 @@
-"""Test how agents are distributed over workers."""
+"""Test how the harness distributes agents over workers."""
 
 import pytest
 

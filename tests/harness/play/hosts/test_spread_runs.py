@@ -23,7 +23,9 @@ GOOD = {**dict.fromkeys("123456", "holds"), "steps": "as specified", "records": 
 
 
 class Hosts(Cluster):
-    """Workers whose agents have their files in the directory `files`. Their environment names it."""
+    """Workers whose agents have their files in the directory `files`. An environment variable of the workers names
+    it.
+    """
 
     def __init__(self, directory: Path, stack: contextlib.ExitStack) -> None:
         super().__init__(directory, stack)
@@ -36,7 +38,7 @@ class Hosts(Cluster):
         return self.start_worker(self.scheduler_address, name, TMPDIR=str(self.files / name), **options)
 
     def processes(self, name: str = "") -> dict[int, str]:
-        """Return the processes of the agents of a worker, or of all workers, with their commands."""
+        """Return the agent processes of a worker, or of all workers, with their command lines."""
         found = {}
         for process in Path("/proc").iterdir():
             with contextlib.suppress(OSError):
@@ -45,7 +47,7 @@ class Hosts(Cluster):
         return {pid: command for pid, command in found.items() if "dask_worker" not in command}
 
     def left_behind(self) -> list[str]:
-        """Return the files and processes of agents."""
+        """Return the files and processes of agents that still exist."""
         return [*self.processes().values(), *(path.name for path in self.files.glob("*/*"))]
 
 
@@ -68,7 +70,7 @@ def verdicts(record: dict[str, Any]) -> dict[str, str]:
 
 
 def losses(record: dict[str, Any]) -> tuple[int, int]:
-    """Return the numbers of lost copies of messages and of all copies."""
+    """Return the number of lost copies of messages, and the number of all copies."""
     receivers = record["counters"]["receivers"].values()
     lost = sum(receiver["lost"] for receiver in receivers)
     return lost, lost + sum(receiver["passed"] for receiver in receivers)

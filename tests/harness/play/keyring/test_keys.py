@@ -1,5 +1,6 @@
-"""Test `ucp-harness keys`: secrets stay in their directory, a bundle has one vehicle's keys, and output has no
-secret.
+"""Test `ucp-harness keys`.
+
+Secrets stay in their directory, a bundle has the keys of one vehicle only, and the output contains no secret.
 """
 
 import json
@@ -27,7 +28,7 @@ def home(tmp_path: Path) -> Path:
 
 
 def secrets(home: Path) -> list[str]:
-    """Return the secrets of all files."""
+    """Return the secrets in all files of a directory."""
     private = json.loads((home / "vehicles.key").read_text())
     keys = [json.loads((home / name).read_text())["private_key"] for name in ("authority.key", "depot.key")]
     return [*keys, private["group_secret"], *private["vehicles"].values()]

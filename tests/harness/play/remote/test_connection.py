@@ -74,7 +74,7 @@ def test_changed_message_is_refused(position: int) -> None:
 
 
 def test_message_of_the_own_direction_is_refused() -> None:
-    """An attacker may send the messages of one end back to it."""
+    """An attacker may send the messages of one end back to the same end."""
     sender, _ = channels()
     with pytest.raises(WireError, match="not authentic"):
         sender.decode(sender.encode(Kind.SIGNAL, b"{}"))
@@ -98,7 +98,7 @@ def test_another_process_continues_a_channel() -> None:
 
 
 def shake(lab_secret: bytes, far_secret: bytes, welcome: dict[str, Any]) -> Any:
-    """Let two ends greet each other. Return the results or errors of both."""
+    """Let two ends greet each other. Return the result or the error of each end."""
 
     async def lab(connection: socket.socket) -> Any:
         hello = await receive_hello(connection, lab_secret)
@@ -178,7 +178,7 @@ def test_long_or_broken_hello_ends_the_handshake(sent: bytes) -> None:
 
 
 def test_offset_lies_within_its_uncertainty(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The way back takes three times as long as the way there, which no measurement can see."""
+    """A message takes three times as long in one direction as in the other. No measurement can detect this."""
     clock = FarClock()
     now = 100.0
     monkeypatch.setattr(_far_clock.time, "monotonic", lambda: now)

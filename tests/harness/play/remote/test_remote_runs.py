@@ -34,7 +34,7 @@ def scenario(directory: Path, **keys: Any) -> Path:
 
 
 def play(computers: TwoComputers, path: Path, *disturb: Any) -> tuple[dict[str, Any], str]:
-    """Play a run with agent 2 on the far computer. Return run.json and the output."""
+    """Play a run with agent 2 on the far computer. Return the content of run.json, and the output."""
     far = computers.join("--service")
     run = computers.start("lab", "run", path, "--seed", 1, "--out", "run")
     for step in disturb:
@@ -57,7 +57,7 @@ GOOD = {**dict.fromkeys("123456", "holds"), "steps": "as specified", "records": 
 
 
 def left_behind(computers: TwoComputers) -> list[str]:
-    """Return the processes of the far computer, except that which keeps its network."""
+    """Return the processes of the far computer, except the process that keeps its network open."""
     pids = computers.on("far", "sh", "-c", "echo $PPID; readlink /proc/self/ns/net").split()
     own = pids[-1]
     found = []
@@ -101,9 +101,9 @@ def test_remote_agent_is_paused_rebooted_and_killed_as_any_agent(computers: TwoC
 
 
 def test_lost_connection_cuts_the_vehicle_off_until_it_returns(computers: TwoComputers) -> None:
-    """The agent goes on meanwhile. Its record is complete, and no check accuses it.
+    """Break the connection to a remote agent, which continues to run. Its record is complete, and no check accuses it.
 
-    First the cable loses everything for a while, and then the connection breaks and another one replaces it.
+    First the cable loses everything for a while. Then the connection breaks, and another connection replaces it.
     """
     trace = computers.directory / "run/agents/2.trace.jsonl"
     changes = computers.directory / "run/network.jsonl"
@@ -139,7 +139,7 @@ with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3)) as cable,
 
 
 def test_keys_of_a_secured_mission_travel_encrypted(computers: TwoComputers) -> None:
-    """The agent reboots with its keys, and starts again with others after a kill."""
+    """The agent reboots with its keys. After a kill, it starts again with other keys."""
     path = scenario(
         computers.directory,
         duration_s=240,

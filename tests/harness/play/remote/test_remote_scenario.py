@@ -1,4 +1,6 @@
-"""Test which scenarios with remote agents are refused, and how the delay of a connection counts."""
+"""Test which scenarios with remote agents the harness refuses, and how it takes the delay of a connection into
+account.
+"""
 
 from pathlib import Path
 from typing import Any

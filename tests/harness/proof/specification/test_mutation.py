@@ -1,4 +1,4 @@
-"""Test the comparison of agent and specification, and the detection of planted mistakes."""
+"""Test the comparison of the agent core with the specification, and whether it detects planted mistakes."""
 
 import pytest
 
@@ -48,7 +48,7 @@ def test_reasons_hold_in_the_specification(comparison: States | Inputs) -> None:
 
 
 def test_false_reason_is_refused() -> None:
-    """The stories put two blocks on the stack."""
+    """The directed inputs put two blocks on the stack, so the reason is false."""
     require_tlc()
     assert violated_in(DIRECTED, ["Len(a.triggered) <= 1", "Len(a.reconcileStack) <= 1"]) == 1
 

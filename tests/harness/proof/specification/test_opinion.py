@@ -1,4 +1,4 @@
-"""Test that the TLA+ specification and the real agents have the same states and verdicts within the same bounds."""
+"""Test that the TLA+ specification and the real agents reach the same states and verdicts within the same bounds."""
 
 import json
 import shutil
@@ -63,7 +63,7 @@ def test_agent_and_specification_reach_equal_states_without_crossing(
 
 
 def test_different_timers_give_equal_states_without_a_livelock() -> None:
-    """Both have an endless cycle if timers are equal."""
+    """If all timers are equal, both the agents and the specification have an endless cycle."""
     stagger: Stagger = {"phase1_timeout_s": 2.5}
     opinion = second_opinion(Bounds(2, 4, "lossless", settings=NO_GAP, stagger=stagger))
     assert (opinion.states, opinion.specified) == (2627, 2627)

@@ -14,7 +14,7 @@ from tests.machine import require_tlc
 
 SHORT = {"agents": 3, "duration_s": 100, "network": {"loss": 0.3}, "events": {"source": "random", "mean_s": 4}}
 WRONG = {"forget_own_vote": 2, "approve_everything": 3, "never_pop": 11}
-"""Quirk -> whose mistake it is."""
+"""The Algorithm to which each deliberate error belongs."""
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +29,7 @@ def of(name: str, **keys: Any) -> RunTraces:
 
 @pytest.fixture(scope="module")
 def validation() -> TraceValidation:
-    """Validate the traces of correct and wrong agents together."""
+    """Validate the traces of correct and wrong agents in one call."""
     require_tlc()
     lost = [{"at_s": 30, "reboot": [2], "down_s": 5, "disk": "kept"}, {"at_s": 40, "kill": [3]}]
     right = [

@@ -1,4 +1,4 @@
-"""Play one run, which the tests of all formats share."""
+"""Play one run that the tests of all export formats share."""
 
 from pathlib import Path
 

@@ -21,7 +21,7 @@ ABOUT: dict[str, Any] = {
 
 
 def play(directory: Path) -> Path:
-    """Play a run of three agents. One flies away and loses contact, and another reboots."""
+    """Play a run of three agents. One agent flies away and loses contact, and another agent reboots."""
     out = directory / "run"
     ended = harness("run", write_scenario(directory, duration_s=180, **ABOUT), "--backend", "sim", "--out", out)
     assert ended.returncode in (0, 1), ended.stderr

@@ -1,4 +1,4 @@
-"""Test that hostile run directories and full disks give one sentence and leave no partial file."""
+"""Test that hostile run directories and full disks cause an error of one sentence and leave no partial file."""
 
 import json
 import os

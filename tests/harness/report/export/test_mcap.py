@@ -33,7 +33,7 @@ def copy(run: Path, tmp_path: Path) -> Path:
 
 
 def read(file: Path) -> Messages:
-    """Return the time and content of each message by topic. JSON messages are checked against their schema."""
+    """Return the time and content of each message, by topic. The function checks JSON messages against their schema."""
     by_topic: Messages = defaultdict(list)
     validators: dict[str, Any] = {}
     with file.open("rb") as stream:

@@ -15,7 +15,7 @@ Track = tuple[str, str]
 
 
 class Read:
-    """A trace: its tracks as (group, name), and the events of each in Perfetto's order."""
+    """A trace that was read: its tracks as pairs (group, name), and the events of each track in Perfetto's order."""
 
     def __init__(self, file: Path) -> None:
         trace = Trace()

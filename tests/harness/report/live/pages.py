@@ -1,4 +1,4 @@
-"""Start a command that serves a page, and wait for the page's contents."""
+"""Start a command that serves a page, and wait until the page has the expected content."""
 
 import signal
 import subprocess
@@ -28,7 +28,7 @@ def page_of(*arguments: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def until(browser: Browser, expression: str) -> Any:
-    """Return the value of the expression as soon as it is true."""
+    """Wait until the value of the JavaScript expression is true, and return the value."""
     deadline = time.monotonic() + DEADLINE_S
     while time.monotonic() < deadline:
         if value := browser.evaluate(expression):

@@ -22,12 +22,12 @@ PLAYED = {
 
 
 def played(directory: Path, **keys: Any) -> Path:
-    """Play a simulated run with a partition, a lost vehicle and its return, in which vehicles have positions."""
+    """Play a simulated run with positions of vehicles, a partition, and a vehicle that is lost and comes back."""
     return flown(directory, **{**PLAYED, **keys})
 
 
 def film(directory: Path, stride_s: float = 20.0) -> list[Change]:
-    """Return all changes in a finished run, read `stride_s` mission seconds at a time."""
+    """Return all changes of a finished run for the live page. The feed reads `stride_s` mission seconds at a time."""
     feed = ChangeFeed(directory)
     feed_changes, until_s = [feed.run_change(live=False)], 0.0
     while True:

@@ -13,12 +13,12 @@ from harness.scenario import Scenario
 
 HAND = Interventions(Scenario(name="watched"), virtual_time=True)
 MUCH = "head -c 300000 /dev/zero | tr '\\0' 'x' >&2; echo >&2"
-"""More than a pipe holds."""
+"""Code that writes more bytes to standard error than a pipe holds."""
 
 
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the path of a program that a test writes in place of the server."""
+    """Return the path of a program that runs in place of the server. A test writes this program."""
     program = tmp_path / "server"
     program.touch(0o755)
     monkeypatch.setattr(sys, "executable", str(program))

@@ -83,7 +83,7 @@ def test_changes_do_not_depend_on_the_size_of_reads(run: Path) -> None:
 
 
 def test_growing_files_give_the_same_changes(run: Path, tmp_path: Path) -> None:
-    """Let each file grow a little at a time, cut at any place, with restarted agents in separate files."""
+    """Let each file grow a little at a time. The files end within lines, and restarted agents have separate files."""
     growing = tmp_path / "run"
     (growing / "agents").mkdir(parents=True)
     shutil.copy(run / "run.json", growing)
@@ -102,7 +102,9 @@ def test_growing_files_give_the_same_changes(run: Path, tmp_path: Path) -> None:
 
 
 def late_film(run: Path, growing: Path, lag: int = 3) -> list[Change]:
-    """Return the changes of an active run in which each agent writes its trace later than the previous one."""
+    """Return the changes of an active run in which each agent writes its trace later than the agent with the next lower
+    ID.
+    """
     (growing / "agents").mkdir(parents=True)
     shutil.copy(run / "run.json", growing)
     shutil.copy(run / "network.jsonl", growing)
@@ -120,7 +122,7 @@ def late_film(run: Path, growing: Path, lag: int = 3) -> list[Change]:
 
 
 def receivers(feed_changes: list[Change]) -> dict[tuple[int, int, float], str]:
-    """Return the receivers of each message, by sender, sequence number and time."""
+    """Return the receivers of each message. The keys are the sender, the sequence number and the time."""
     masks = {}
     for kind, at_s, *rest in feed_changes:
         if kind == "m":
@@ -215,7 +217,7 @@ def test_directory_without_a_run_is_refused_in_one_sentence(
 
 
 def intervals(feed_changes: list[Change]) -> list[tuple[str, float, float, str]]:
-    """Return each finished vote and reconcile: its kind, its start and end, and its result or reason."""
+    """Return each finished vote and reconcile with its kind, its start and end, and its result or reason."""
     began: dict[tuple[int, str], tuple[float, str]] = {}
     ended = []
     for _, at_s, agent, doing, more in of_kind("s", feed_changes):
@@ -237,7 +239,7 @@ def of_report(traces: dict[int, Trace]) -> list[tuple[str, float, float, str]]:
 
 
 def reconcile_during_a_vote(directory: Path) -> tuple[list[Change], Trace]:
-    """Return the changes and the trace of an agent that begins a reconcile before its vote timer expires."""
+    """Return the changes and the trace of an agent that begins a reconcile while its vote timer runs."""
     trigger = TimerTrigger("vote_timer_expiration")
     runs = [
         handler_run(1.0, "process_next_deque_block", "proposed", sent=[SentMessage("Block Add Request", 0, "aa")]),
@@ -282,7 +284,7 @@ def test_slow_reader_of_a_live_run_skips_messages() -> None:
 
 
 class SetClock(RunClock):
-    """A clock whose wall time the test sets."""
+    """A clock that shows the wall time that a test sets."""
 
     late_s = 0.0
 
@@ -291,8 +293,9 @@ class SetClock(RunClock):
 
 
 def late_run(run: Path, growing: Path, monkeypatch: pytest.MonkeyPatch) -> list[Change]:
-    """Return the changes of an active run in which each agent writes later than the previous one. The feed is late
-    during two thirds of the run.
+    """Return the changes of an active run in which each agent writes later than the agent with the next lower ID.
+
+    The feed is late during two thirds of the run.
     """
     monkeypatch.setattr(feeds, "LINES_AT_ONCE", 3)
     (growing / "agents").mkdir(parents=True)

@@ -101,7 +101,7 @@ def test_page_keeps_a_vote_open_when_a_reconcile_begins(browser: Browser, run: P
 def test_live_page_and_film_show_the_loss_of_the_network(
     browser: Browser, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Receivers record messages late, and a partition lasts for a part of the minute."""
+    """Receivers record messages late. The partition lasts for a part of the minute."""
     partition = [{"at_s": 50, "partition": [[1, 2, 3], [4, 5, 6]]}, {"at_s": 80, "heal": True}]
     asked = scenario(agents=6, duration_s=150, network={"loss": 0.2}, timeline=partition, events={"mean_s": 4})
     lossy = play(asked, 1, tmp_path / "lossy", SilentProgress(), "sim", delivers_all=True).directory

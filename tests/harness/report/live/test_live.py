@@ -31,17 +31,17 @@ def scenario(directory: Path) -> Path:
 
 
 class Page:
-    """A page without a browser, which receives changes and sends requests."""
+    """Receives changes and sends requests like the live page, but without a browser."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket = socket
         self._unread: list[list[Any]] = []
         self._number = 0
         self.interventions: dict[str, Any] | None = None
-        """The last state of the controls, or None before the first."""
+        """The latest state of the controls. None before the first state arrives."""
 
     async def next(self, kind: str) -> list[Any]:
-        """Return the next change of that kind."""
+        """Return the next change of this kind."""
         async with asyncio.timeout(DEADLINE_S):
             while True:
                 while self._unread:

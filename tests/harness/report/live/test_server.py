@@ -1,4 +1,4 @@
-"""Test the web server of the live page: access, and slow or closed browsers."""
+"""Test the web server of the live page: the control of access, and slow or closed browsers."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""Compare the agent with the TLA+ specification, which may contain a planted mistake."""
+"""Compare the agent core with the TLA+ specification, into which a mistake may be planted."""
 
 import abc
 import functools
@@ -32,31 +32,34 @@ from ucp.trace import HandlerRun
 
 NO_GAP = {"finalize_gap_s": 0}
 READINGS = {"vote_names_chain": True, "changed_before_tally": True, "phase1_tie": "pop", "phase2_tie": "block"}
-"""The settings of the protocol that the specification has, all different from their defaults."""
+"""Settings of the agent that the specification supports. All of them differ from their defaults."""
 MOST_STEPS = 20
-"""Steps of an edited specification for each state of the core. The correct specification has at most five."""
+"""Maximum number of explored steps of an edited specification, divided by the number of states of the core.
+
+The correct specification takes at most five steps for each state.
+"""
 NO_VALUE = "no value"
-"""The difference of a specification for which TLC stops, for example at the first element of an empty sequence."""
+"""The result of a comparison if TLC stops, for example at the first element of an empty sequence."""
 INVALID = re.compile(r"\*\*\* (?:Parse )?Error|Parsing or semantic analysis failed")
-"""How TLC starts a sentence about a text that is no specification."""
+"""Matches the beginning of TLC's error message about an invalid specification."""
 
 
 class Comparison(Protocol):
-    """A comparison, with a name for tables."""
+    """A comparison of specifications with the agent core. The tables show its name."""
 
     @property
     def name(self) -> str: ...
 
     def prepare(self) -> None:
-        """Compute the results of the agent, which all comparisons share."""
+        """Compute the results of the agent core, which are needed for every specification."""
 
     def differences(self, specifications: Sequence[str]) -> list[str | None]:
-        """Return, for each specification, its first difference from the agent, or None."""
+        """Return the first difference of each specification from the agent core, or None if there is no difference."""
 
 
 @dataclass(frozen=True)
 class States:
-    """A comparison of the states that TLC finds within bounds with the states that `prove` finds."""
+    """A comparison within bounds of the states that TLC finds with the states that `prove` finds."""
 
     bounds: Bounds
 
@@ -70,7 +73,7 @@ class States:
 
     @functools.cached_property
     def real(self) -> set[_spec_states.Plain]:
-        """Return the states of the agent."""
+        """Return the states that `prove` finds."""
         graph = explore(ModelSwarm(self.bounds), most_bytes=8e9, most_s=float("inf"))
         assert graph.ended == "complete", f"{self.name}: {graph.ended}"
         return set(_spec_states.real(graph))
@@ -98,8 +101,9 @@ class States:
 def _explored(bounds: Bounds, specifications: Mapping[int, str], states: int) -> dict[int, list[str]] | int:
     """Let TLC explore several specifications at once, because its start takes longer than the exploration.
 
-    Return the states that it finds for each number, as text, or the number of a specification for which it stops. It
-    explores no more than `MOST_STEPS` times `states` steps of each.
+    Return the states that TLC finds for each specification, as text, by the number of the specification. If TLC stops,
+    return the number of the specification at which it stops. TLC explores at most about `MOST_STEPS` times `states`
+    steps of each specification.
     """
     swarm = (_tlc.MODULES / "Swarm.tla").read_text("utf-8")
     config = _config(bounds).partition("INVARIANTS")[0]
@@ -147,18 +151,18 @@ def _explored(bounds: Bounds, specifications: Mapping[int, str], states: int) ->
 
 @dataclass(frozen=True)
 class Inputs(abc.ABC):
-    """The steps of an agent with given inputs, compared with the steps that the specification allows."""
+    """A comparison of an agent's steps for some inputs with the steps that the specification allows."""
 
     settings: tuple[tuple[str, Any], ...] = ()
 
     @property
     @abc.abstractmethod
     def inputs(self) -> str:
-        """A noun phrase for tables."""
+        """The name of the inputs in tables, which is a noun phrase."""
 
     @abc.abstractmethod
     def traces(self) -> list[Trace]:
-        """Return traces of the agent core. All have the same settings."""
+        """Return traces of the agent core for these inputs. All traces have the same settings."""
 
     @property
     def name(self) -> str:
@@ -166,7 +170,7 @@ class Inputs(abc.ABC):
 
     @functools.cached_property
     def encoded(self) -> tuple[_validate.Constants, _validate._EncodedStepBatch]:
-        """The steps of the core, with the settings of the specification."""
+        """The steps of the agent core in the form that TLC reads, with the settings of the specification."""
         with _all_tallies():
             [batch] = _validate._batches([RunTraces(self.name, self.traces())], _validate.TraceValidation())
         assert not any(life.unread for life in batch[1].lives)
@@ -189,7 +193,7 @@ class Inputs(abc.ABC):
 
 
 class DirectedInputs(Inputs):
-    """The sequences of inputs that `directed_inputs` generates."""
+    """A comparison for the sequences of inputs that the module `directed_inputs` defines."""
 
     @property
     def inputs(self) -> str:
@@ -200,7 +204,7 @@ class DirectedInputs(Inputs):
 
 
 class RandomInputs(Inputs):
-    """A comparison of an agent's steps for random inputs with the steps that the specification allows."""
+    """A comparison for random inputs."""
 
     COUNT: ClassVar = 2_500
 
@@ -214,7 +218,10 @@ class RandomInputs(Inputs):
 
 @contextmanager
 def _all_tallies() -> Iterator[None]:
-    """Compare the tally after each handler run. Other agents need not keep one that counts nothing at the moment."""
+    """Compare the tally after each handler run inside the context.
+
+    An ordinary comparison skips a tally that counts nothing at the moment, because agents need not keep it.
+    """
     before = _recorded_incarnations.COUNTING
     _recorded_incarnations.COUNTING = frozenset(branch for branches in BRANCHES.values() for branch in branches)
     try:
@@ -230,7 +237,7 @@ def _settings_words(settings: Mapping[str, Any]) -> list[str]:
 
 @contextmanager
 def _modules_with(specification: str) -> Iterator[None]:
-    """Let TLC read this specification in place of the one in the repository."""
+    """Let TLC read this specification in place of the specification in the repository."""
     before = _tlc.MODULES
     with tempfile.TemporaryDirectory(prefix="ucp-edited-spec-") as name:
         for path in before.glob("*.tla"):
@@ -244,7 +251,7 @@ def _modules_with(specification: str) -> Iterator[None]:
 
 
 def random_trace(seed: int, count: int, settings: dict[str, Any]) -> Trace:
-    """Return the trace of an agent that gets `count` random inputs, and restarts after every LIFE inputs."""
+    """Return the trace of an agent that gets `count` random inputs and restarts after every LIFE inputs."""
     rng, now = Random(seed), 0.0
     inputs = random_inputs.Inputs(rng, newest_us=4)
     used = Settings(**{"max_block_bytes": MAX_EVENT_BYTES + 2 * EVENT_HEADER_BYTES + 40, **settings})

@@ -1,4 +1,5 @@
-"""Inputs that lead an agent to branches which random inputs and small bounds hardly reach, as traces of the core.
+"""Create traces of the agent core for inputs that lead to rare branches. Random inputs and small bounds hardly reach
+these branches.
 
 Each function plays one short story of agent 1, and starts with a new agent. The stories take blocks from the reconcile
 stack, hold ties in phase 2, and give an agent answers that no correct agent sends.
@@ -26,7 +27,7 @@ from ucp.trace import SCHEMA, HandlerRun, RecordedBytes, in_base64
 
 DATA = b"mission"
 SMALL_EVENTS = 3
-"""Number of events without data that fill a block. A single one does not, and neither do two."""
+"""Number of events without data that fill a block. One or two such events do not fill it."""
 
 
 def new_trace(settings: Settings) -> Trace:
@@ -40,7 +41,7 @@ def new_trace(settings: Settings) -> Trace:
 
 
 class Story:
-    """An agent with its trace, and the inputs that it can get."""
+    """An agent with its trace. The methods give the agent inputs."""
 
     def __init__(self, settings: dict[str, Any]) -> None:
         full = MAX_EVENT_BYTES + SMALL_EVENTS * EVENT_HEADER_BYTES
@@ -68,7 +69,7 @@ class Story:
         self._record()
 
     def expire(self) -> None:
-        """Let the next timer expire."""
+        """Let the next running timer expire."""
         ends = self.agent.next_timer()
         assert ends is not None
         self.now = ends
@@ -80,17 +81,19 @@ class Story:
         self.agent.messages_to_send()
 
     def commit(self, *blocks: Block) -> None:
-        """Let agent 2 commit these blocks on top of the chain."""
+        """Give the agent commits of these blocks by agent 2. Each block extends the agent's chain."""
         for block in blocks:
             self.hear(CommitBlock(block, next_chain_hash(self.top, block.block_hash)), 2)
 
     def contained(self, contained: bool, *senders: int) -> None:
-        """Let these agents answer phase 1, and end it."""
+        """Give the agent answers of phase 1 from these senders, and let the timer of phase 1 expire."""
         self.hear(ChainContainResponse(self.top, contained), *senders)
         self.expire()
 
     def named(self, block: Block | None, *senders: int, timestamp_us: int | None = None) -> None:
-        """Let these agents answer phase 2: this block is the next one, or their chain ends here (None)."""
+        """Give the agent answers of phase 2 from these senders. They name `block` as the successor, or the end of the
+        chain if it is None.
+        """
         if block is None:
             self.hear(NextInSequenceResponse(self.top, None, 0), *senders)
             return
@@ -98,7 +101,7 @@ class Story:
         self.hear(NextInSequenceResponse(self.top, block.block_hash, stamp_us), *senders)
 
     def in_phase_2(self) -> None:
-        """Begin a reconcile, and let agents 2 and 3 contain this agent's chain."""
+        """Begin a reconcile. Agents 2 and 3 answer that they contain this agent's chain, so phase 2 begins."""
         self.reconcile()
         self.contained(True, 2, 3)
 
@@ -109,7 +112,7 @@ def _block(number: int, timestamp_us: int) -> Block:
 
 OLD, MIDDLE, NEW = _block(1, 10), _block(2, 20), _block(3, 30)
 LOW, HIGH = sorted((_block(4, 20), _block(5, 20)), key=lambda block: block.block_hash)
-"""Two blocks with the same timestamp, in the order of their hashes."""
+"""Two blocks with the same timestamp. LOW has the smaller hash."""
 
 
 def three_events_fill_a_block(story: Story) -> None:
@@ -261,7 +264,7 @@ STORIES: tuple[Callable[[Story], None], ...] = (
 
 
 def directed_traces(settings: dict[str, Any]) -> list[Trace]:
-    """Return the trace of each story with these settings of the agent."""
+    """Return the trace of each story. The agent has these settings."""
     traces = []
     for play in STORIES:
         story = Story(settings)

@@ -13,16 +13,19 @@ EDITS_FILE = Path(__file__).with_name("edits.yaml")
 
 
 class Reason(NamedTuple):
-    """The reason why an edit changes nothing, and an invariant of an agent `a`, in TLA+, that implies it."""
+    """The reason why an edit changes no behaviour.
+
+    `because` states the reason. `always` is an invariant of an agent `a` in TLA+ that implies the reason.
+    """
 
     because: str
     always: str
 
 
 class Edit(NamedTuple):
-    """A mistake in the specification: `new` in place of `old`, in the part for this Algorithm (0 is common text).
+    """A mistake in the specification. `new` replaces `old` in the part for this Algorithm (0 for the common part).
 
-    If the edit changes nothing, `reason` explains it.
+    If the edit changes no behaviour, `reason` explains why.
     """
 
     algorithm: int
@@ -36,7 +39,7 @@ class Edit(NamedTuple):
         return f"{self.algorithm}: {self.about}"
 
     def applied(self, text: str) -> str:
-        """Return `text` with the mistake. Raises ValueError unless `old` occurs exactly once."""
+        """Return `text` with the mistake. Raises ValueError unless `old` occurs exactly once in `text`."""
         pattern = r"\s+".join(map(re.escape, self.old.split()))
         edited, count = re.subn(pattern, lambda match: self.new, text)
         if count != 1:
@@ -47,7 +50,7 @@ class Edit(NamedTuple):
 
 
 def specification() -> str:
-    """Return the text of the TLA+ specification of one agent."""
+    """Return the text of the TLA+ specification of an agent."""
     return (_tlc.MODULES / "UCP.tla").read_text("utf-8")
 
 

@@ -1,4 +1,4 @@
-"""Check with TLC that the reasons of edits that change nothing hold in the specification."""
+"""Check with TLC that the specification satisfies the reasons for which some edits change no behaviour."""
 
 from collections.abc import Mapping, Sequence
 
@@ -11,9 +11,9 @@ MODULE = "Invariants"
 
 
 def violated_in(comparison: States | Inputs, invariants: Sequence[str]) -> int | None:
-    """Return the position of an invariant that some state of the comparison violates. None if all of them hold.
+    """Return the index of an invariant that a state of the comparison violates. Return None if all invariants hold.
 
-    An invariant is an expression with the agent `a`.
+    Each invariant is a TLA+ expression about the agent `a`.
     """
     names = [f"Invariant{number}" for number in range(len(invariants))]
     if isinstance(comparison, States):

@@ -1,4 +1,4 @@
-"""Run the comparisons, cheapest first, and record which one detects each planted mistake."""
+"""Run the comparisons in order of their cost, and record which comparison first detects each planted mistake."""
 
 import hashlib
 import json
@@ -34,7 +34,7 @@ def _states(agents: int, blocks: int, network: Network, settings: Mapping[str, A
 
 
 OTHER_SETTINGS = tuple({**READINGS, **NO_GAP}.items())
-"""Settings of an agent, as different from the defaults as the specification allows."""
+"""Settings of an agent, with as many differences from the defaults as the specification supports."""
 
 COMPARISONS: tuple[Comparison, ...] = (
     _states(2, 1, "lossy"),
@@ -49,24 +49,28 @@ COMPARISONS: tuple[Comparison, ...] = (
     RandomInputs(),
     RandomInputs(OTHER_SETTINGS),
 )
-"""All comparisons, in the order in which they are tried. The tests make each with the unedited specification."""
+"""All comparisons, in the order in which they run. Tests also run each with the specification without an edit."""
 BATCH = 16
-"""Number of edited specifications in one comparison."""
+"""Number of edited specifications that a comparison tests at once."""
 
 
 class Found(NamedTuple):
-    """The result for one mistake: the first comparison that detects it, and the difference. None if none detects it."""
+    """The result for one mistake.
+
+    `by` is the first comparison that detects the mistake, and `difference` is the difference that it finds. Both are
+    None if no comparison detects the mistake.
+    """
 
     text: str
     """The digest of the edited specification."""
     by: str | None = None
     difference: str | None = None
     missed_by: tuple[str, ...] = ()
-    """Comparisons that do not find it."""
+    """Names of the comparisons that do not detect the mistake."""
 
 
 def digest(edit: Edit) -> str:
-    """Return a digest of the specification with the mistake, without comments."""
+    """Return a digest of the specification with the mistake. Comments do not affect the digest."""
     texts = edit.applied(specification()), (_tlc.MODULES / "Swarm.tla").read_text("utf-8")
     code = [" ".join(re.sub(r"\(\*.*?\*\)|\\\*[^\n]*", "", text, flags=re.DOTALL).split()) for text in texts]
     return hashlib.sha256("\n".join(code).encode()).hexdigest()[:16]
@@ -83,7 +87,7 @@ def stored() -> dict[str, Found]:
 
 
 def store(results: Mapping[str, Found]) -> None:
-    """Write `score.json` with one line for each mistake."""
+    """Write `score.json`. Each mistake has one line."""
     lines = [f"{json.dumps(edit.name)}: {json.dumps(results[edit.name])}" for edit in edits() if edit.name in results]
     write_atomically(SCORE_FILE, "{\n" + ",\n".join(lines) + "\n}\n")
 
@@ -102,7 +106,7 @@ def main() -> int:
 
 
 def _find(comparison: Comparison, results: dict[str, Found], jobs: int) -> None:
-    """Run a comparison for each mistake that is not detected yet, and record the differences."""
+    """Run a comparison for each mistake that no earlier comparison detected, and record the differences."""
     name = comparison.name
     waiting = [edit for edit in edits() if (found := results[edit.name]).by is None and name not in found.missed_by]
     if not waiting:
@@ -133,7 +137,9 @@ def _row(title: str, group: Sequence[Edit], results: Mapping[str, Found]) -> str
 
 
 def tables() -> str:
-    """Return the tables of the page: the mistakes in each Algorithm, and the comparisons that detect them first."""
+    """Return the tables of the page: the number of mistakes in each Algorithm, and the comparisons that first detect
+    them.
+    """
     results = stored()
     lines = ["| Algorithm | mistakes | found | without effect | open |", "|--:|--:|--:|--:|--:|"]
     for algorithm, group in groupby(edits(), lambda edit: edit.algorithm):
