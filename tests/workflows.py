@@ -1,9 +1,9 @@
 """Play the jobs of a workflow of a build server in a directory, without the service.
 
-The shell steps run with a clean environment. Their `PATH` has the system and a directory of tools, with which a test
-replaces programs that need a network or much time. Steps that use an action of the service are imitated if they move
-files, such as caches and artefacts, and skipped otherwise. A workflow that uses an unknown name or function in an
-expression fails.
+The shell steps run with a clean environment. `PATH` contains the directories of the system, and a directory in which a
+test replaces programs that need a network or much time. Steps that use an action of the service are imitated if they
+move files, such as caches and artefacts, and skipped otherwise. The test fails if a workflow uses an unknown name or
+function in an expression.
 """
 
 import os
@@ -26,7 +26,7 @@ _EXPRESSION = re.compile(r"\$\{\{(.*?)\}\}")
 
 
 class Names(dict[str, Any]):
-    """A part of the context of an expression. Its values are attributes too."""
+    """A part of the context of an expression. Its values can also be read as attributes."""
 
     def __getattr__(self, name: str) -> Any:
         return self[name]
@@ -38,7 +38,7 @@ def load(path: Path) -> dict[str, Any]:
 
 
 class _TextLoader(yaml.SafeLoader):
-    """A loader that reads all scalars as texts, because `on` is true for YAML."""
+    """A loader that reads all scalars as texts. In YAML, the key `on` would otherwise be the value true."""
 
 
 _TextLoader.yaml_implicit_resolvers = {}
@@ -46,20 +46,20 @@ _TextLoader.yaml_implicit_resolvers = {}
 
 @dataclass
 class Runner:
-    """A runner with one workspace. Caches survive from job to job."""
+    """A runner with one workspace. Its caches are kept from job to job."""
 
     workspace: Path
     tools: Path
-    """A directory with programs. They come before those of the system."""
+    """A directory with programs, which replace those of the system with the same names."""
     caches: dict[str, Path] = field(default_factory=dict)
-    """Key -> directory with the saved files, the oldest first."""
+    """The directory with the saved files of each cache key. The oldest key is first."""
     artifacts: dict[str, list[Path]] = field(default_factory=dict)
-    """Name -> paths, of the last job."""
+    """The paths of each artefact of the last job."""
     github: Names = field(default_factory=Names)
     summary: str = ""
 
     def play(self, workflow: Path, job: str, run_id: int) -> dict[str, str]:
-        """Play a job. Return step -> outcome: "success", "failure" or "skipped"."""
+        """Play a job. Return the outcome of each step: "success", "failure" or "skipped"."""
         self.artifacts.clear()
         self.github = Names(run_id=str(run_id), run_attempt="1", job=job, token="")
         return _Steps(self, Names()).play(load(workflow)["jobs"][job]["steps"])
@@ -181,7 +181,7 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def write_tool(directory: Path, name: str, script: str) -> None:
-    """Write a shell script as a program of the runner."""
+    """Write a shell script into the directory of tools, as a program for the runner."""
     directory.mkdir(exist_ok=True)
     (directory / name).write_text(f"#!/bin/sh\n{script}\n")
     (directory / name).chmod(0o755)

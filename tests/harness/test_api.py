@@ -1,4 +1,4 @@
-"""Test that the public packages list their names, and import each one when it is first used."""
+"""Test that each public package lists its public names, and imports a name only when it is first used."""
 
 import ast
 import asyncio

@@ -1,4 +1,4 @@
-"""Test the measurement of how many vehicles a shared radio channel can serve, and its page."""
+"""Test the program that measures how many vehicles a shared radio channel can serve, and its page."""
 
 from docs.generate.channel_capacity import MISSIONS, PAGE, RADIOS, SEEDS, Cell, Run, carried, play, put, size_row
 

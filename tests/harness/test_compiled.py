@@ -1,4 +1,5 @@
-"""Test that compiled modules give the same results as their sources, and that developers and users can choose.
+"""Test that compiled modules give the same results as their sources, and that developers and users can choose which to
+use.
 
 The tests compile the modules in a copy of the repository, without optimization. That takes about a minute of processor
 time.
@@ -24,7 +25,7 @@ COPIED = ("harness", "netem", "sitl", "ucp", "scenarios", "docs", "tests", "pypr
 
 
 def python(tree: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run Python with the modules of this tree, and return the ended process."""
+    """Run Python with the modules of this directory, and return the finished process."""
     inherited = {name: value for name, value in os.environ.items() if name != "UCP_PURE"}
     return subprocess.run(
         [sys.executable, *arguments],
@@ -37,7 +38,7 @@ def python(tree: Path, *arguments: str, **environment: str) -> subprocess.Comple
 
 
 def in_use(tree: Path, before: str = "", **environment: str) -> str:
-    """Return the modules that a process of this tree uses. `before` is a program that runs before the import."""
+    """Return which modules a process in this directory uses, compiled ones or sources. `before` is code that runs first."""
     program = f"{before}\nfrom harness import compiled\nimport harness.play.simulation.air as air\n"
     ended = python(tree, "-c", f"{program}print(compiled.in_use, air.__file__, sep='|')", **environment)
     modules, _, file = ended.stdout.strip().partition("|")

@@ -1,4 +1,6 @@
-"""Commands with files that an attacker made: one sentence within a short time, never a traceback."""
+"""Test commands with files that an attacker made: they print one sentence within a short time, and never a
+traceback.
+"""
 
 import ast
 import os
@@ -25,7 +27,9 @@ OWN_FILES = {
     "scenario/load.py": "the library",
     "sweep/matrix/_results_file.py": "a file that it also writes",
 }
-"""Modules that read files without `ucp.plain_file`, each with the files. Package data need no entry."""
+"""Modules that read files without `ucp.plain_file`, and the files that each module reads. Package data need no
+entry.
+"""
 
 
 def _reads(node: ast.AST) -> bool:
@@ -49,7 +53,7 @@ def test_readers_of_unknown_files_use_the_bounded_reader() -> None:
 
 @pytest.fixture(scope="module")
 def run_of_fifos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run directory in which each file is a FIFO."""
+    """Return a run directory in which each file is a FIFO."""
     run = tmp_path_factory.mktemp("hostile") / "run"
     for name in (
         *("run.json", "network.jsonl", "tracks.jsonl", "lag.jsonl", "channel.jsonl", "rogue.jsonl", "public.json"),
@@ -62,7 +66,7 @@ def run_of_fifos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 SHOW_THE_REST = ("report", "export", "mission verify")
-"""Commands that print the readable part, and report the other files."""
+"""Commands that print the readable part of a run and report the other files."""
 
 
 @pytest.mark.parametrize(

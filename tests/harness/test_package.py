@@ -1,7 +1,8 @@
-"""Test the built Python package: it is always the same, and works outside a clone and without optional packages.
+"""Test the built Python package: each build gives the same bytes, and the package works outside a clone and without
+optional packages.
 
 The tests do not download packages. They unpack the built wheel beside links to the packages that it requires, and run
-the commands with these packages and the standard library only. There is no extra, and no clone.
+the commands with these packages and the standard library only. The optional packages and the clone are not accessible.
 """
 
 import json
@@ -31,7 +32,7 @@ DEADLINE_S = 60.0
 
 
 def required(name: str, found: dict[str, Distribution]) -> dict[str, Distribution]:
-    """Add a package and its required packages to `found`, and return `found`."""
+    """Add a package and all packages that it requires to `found`, and return `found`."""
     if name not in found:
         found[name] = distribution(name)
         for line in found[name].requires or ():
@@ -143,7 +144,9 @@ WORKING = [
     "sitl path",
     "clean",
 ]
-"""Commands that need no extra. Some end with a mistake of the user, which is cheaper than the work of the command."""
+"""Commands that need no optional packages. Some contain a mistake, because an error takes less time than the work of
+the command.
+"""
 NEEDS = {
     "run secure --backend sim": "secure",
     "run secure": "secure",
@@ -164,7 +167,7 @@ NEEDS = {
     "prove --captured 2 --agents 2 --blocks 1": "secure",
     "validate run": "spec",
 }
-"""Command -> the extra that it needs."""
+"""The extra (group of optional packages) that each command needs."""
 SMALL = {"name": "small", "agents": 3, "duration_s": 100, "events": {"source": "random"}}
 MATRIX = {"name": "small", "scenario": SMALL, "loss": [0.1], "seeds": 1, "backend": "sim"}
 

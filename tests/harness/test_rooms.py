@@ -1,8 +1,8 @@
-"""Test the rooms (packages) of the harness: imports run one way, use public modules only, and form no circle.
+"""Test the imports between the rooms (packages) of the harness.
 
-A room is one folder of `harness/`, or one of the packages `ucp`, `ucp.contract`, `netem` and `sitl`. A module with a
-leading underscore belongs to its room alone. A module without one is a door: another room imports it, a user does, or
-it starts as a program.
+Imports run in one direction, use public modules only, and form no circle. A room is one folder of `harness/`, or one of
+the packages `ucp`, `ucp.contract`, `netem` and `sitl`. Only the room itself uses a module with a leading underscore.
+Any other module is public: another room or a user imports it, or it is started as a program.
 """
 
 import ast
@@ -30,14 +30,14 @@ DOORS = {
     "ucp.contract.vectors.replay": "a program",
     "harness.play.containers.start": "a program that is copied beside a compose file",
 }
-"""Modules that no other room imports and that are public all the same, each with the reason."""
+"""Public modules that no other room imports, each with the reason why it is public."""
 LOADED_BY_NAME = ("harness.commands.", "harness.scenario.faults.", "harness.pytest_plugin.entry.")
-"""Folders whose modules are loaded by their names."""
+"""Beginnings of the names of modules that are imported by their names at run time."""
 
 
 @cache
 def modules() -> dict[str, Path]:
-    """Return all modules of the four packages, by dotted name."""
+    """Return the path of each module of the four packages, by the dotted name of the module."""
     found = {}
     for package in PACKAGES:
         for path in (REPOSITORY / package).rglob("*.py"):
@@ -48,7 +48,7 @@ def modules() -> dict[str, Path]:
 
 @cache
 def imports(module: str) -> frozenset[str]:
-    """Return the modules that a module imports anywhere, including those for types."""
+    """Return the modules that a module imports. Imports inside functions and for type annotations are included."""
     return frozenset(name for name in _imported(modules()[module]) if name != module)
 
 
@@ -145,12 +145,12 @@ def test_every_listed_door_exists_and_needs_its_entry() -> None:
 
 
 def test_modules_import_in_no_circle() -> None:
-    """A CycleError of the library names the circle."""
+    """`graphlib` raises a CycleError that names the circle."""
     [*TopologicalSorter({module: imports(module) for module in modules()}).static_order()]
 
 
 def test_rooms_import_in_no_circle() -> None:
-    """A CycleError of the library names the circle. The package `ucp.contract` counts as a room of its own."""
+    """`graphlib` raises a CycleError that names the circle. The package `ucp.contract` counts as a separate room."""
     graph: dict[str, set[str]] = {}
     for module in modules():
         graph.setdefault(room_of(module), set()).update({room_of(name) for name in imports(module)} - {room_of(module)})

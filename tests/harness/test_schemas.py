@@ -1,4 +1,4 @@
-"""Test that each JSON schema has a digest in schemas.sha256, so that schemas change only on purpose."""
+"""Test that the file schemas.sha256 has the digest of each JSON schema, so that schemas change only on purpose."""
 
 import hashlib
 from pathlib import Path
@@ -8,7 +8,7 @@ from jsonschema import Draft202012Validator
 from docs.generate import json_schemas
 
 DIGESTS = Path(__file__).with_name("schemas.sha256")
-"""Lines as `sha256sum` writes them: a digest, two spaces, a path."""
+"""Lines in the format of `sha256sum`: a digest, two spaces, and a path."""
 
 WHAT_TO_DO = """A JSON Schema has changed. To see the change, run from the top of the repository:
 

@@ -1,4 +1,6 @@
-"""Test the table of wrong agents: every deliberate error is found, and repeated trials give the same results."""
+"""Test the table in docs/appendix/wrong-agents.md: every deliberate error is found, and repeated trials give the same
+results.
+"""
 
 from functools import cache
 
@@ -15,7 +17,7 @@ ROWS = rows_of(PAGE.read_text(encoding="utf-8"))
 
 @cache
 def right(seed: int) -> Trial:
-    """Play the mission with the correct agent. The result is cached, because several tests need it."""
+    """Play the mission with correct agents. The result is cached, because several tests need it."""
     return play(None, seed)
 
 

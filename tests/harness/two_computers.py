@@ -1,7 +1,7 @@
-"""Two computers for tests: network namespaces with a veth pair between them.
+"""Imitate two computers for tests by two network namespaces with a veth pair between them.
 
-The lab's computer has the address 192.168.7.1, and the far one 192.168.7.2. `cut` and `lose` spoil the cable between
-them with nftables.
+The lab's computer has the address 192.168.7.1, and the far one 192.168.7.2. `cut`, `reset` and `lose` disturb the cable
+between them with nftables.
 """
 
 import os
@@ -30,7 +30,7 @@ needs_two_computers = [
 
 
 class TwoComputers:
-    """The namespaces of two computers, and the programs that a test started in them."""
+    """Two network namespaces in place of computers, and the programs that a test started in them."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -87,20 +87,20 @@ class TwoComputers:
         return process
 
     def join(self, *options: object, agent: int = 2, key: str = "lab.key") -> subprocess.Popen[str]:
-        """Start the far end of an agent of the harness."""
+        """Start the command with which the far computer joins the harness with an agent."""
         words = ["join", LISTEN, "--as", agent, "--secret-file", key, *options]
         return self.start("far", *words, "--", sys.executable, "-P", "-m", "ucp.node")
 
     def cut(self) -> None:
-        """Let the cable lose everything."""
+        """Let the cable lose all packets."""
         self._spoil("drop")
 
     def reset(self) -> None:
-        """Break all connections between the computers, and let no other succeed."""
+        """Break all connections between the computers, and let all new connections fail."""
         self._spoil("tcp flags & (syn | rst) == 0 reject with tcp reset")
 
     def lose(self, percent: int) -> None:
-        """Let the cable lose this share of the packets in each direction."""
+        """Let the cable lose this percentage of the packets in each direction."""
         self._spoil(f"numgen random mod 100 < {percent} drop")
 
     def _spoil(self, rule: str) -> None:

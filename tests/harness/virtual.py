@@ -1,4 +1,4 @@
-"""Create scenarios in virtual time with few words."""
+"""Create short scenarios in virtual time for tests."""
 
 from typing import Any
 

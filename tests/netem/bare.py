@@ -1,6 +1,6 @@
 """Open a virtual network, start programs in it that ignore signals, and wait.
 
-bare.py FOLDER [ENGINE]       says on standard output how far it has come
+bare.py FOLDER [ENGINE] prints each step on standard output
 """
 
 from __future__ import annotations

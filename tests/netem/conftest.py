@@ -1,4 +1,4 @@
-"""Common parts of the tests of virtual networks: each engine in turn, and test programs in vehicles."""
+"""Provide fixtures for tests of virtual networks: each engine in turn, and test programs in vehicles."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def netem() -> str:
 
 
 class Program:
-    """A program of `air.py` that runs in a vehicle."""
+    """A call of `air.py` that runs in a vehicle."""
 
     def __init__(self, process: LabProcess, output: Path) -> None:
         self.process = process
@@ -55,7 +55,7 @@ class Program:
 
 
 class Air:
-    """Starts programs of `air.py` in vehicles of a lab."""
+    """Starts calls of `air.py` in the vehicles of a lab."""
 
     def __init__(self, lab: Lab, folder: Path) -> None:
         self.lab = lab
@@ -82,7 +82,7 @@ class Air:
         return program
 
     async def run(self, vehicle: int, *arguments: object) -> None:
-        """Run a sender until it ends."""
+        """Run a program that sends, until it ends."""
         program = await self.start(vehicle, *arguments)
         assert await asyncio.wait_for(program.process.wait(), 4 * DEADLINE_S) == 0, program.output.read_text()
 
@@ -91,7 +91,7 @@ class Air:
 
 
 def play(story: Coroutine[Any, Any, None]) -> None:
-    """Run the coroutine of a test. If it stops making progress, the test fails."""
+    """Run the coroutine of a test. Fail the test if the coroutine makes no progress."""
     asyncio.run(asyncio.wait_for(story, 6 * DEADLINE_S))
 
 
@@ -104,7 +104,7 @@ async def until(condition: Any, what: str) -> None:
 
 
 def assert_binomial(found: int, count: int, probability: float) -> None:
-    """Check that a count fits the probability. A correct program fails once in 100,000 checks."""
+    """Check that a count agrees with the probability. With a correct program, one of 100,000 checks fails."""
     deviation = 4.42 * math.sqrt(count * probability * (1 - probability))
     expected = count * probability
     assert abs(found - expected) <= deviation, f"{found} of {count}; expected {expected:.0f} ± {deviation:.0f}"

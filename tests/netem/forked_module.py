@@ -1,4 +1,4 @@
-"""Print the surroundings of a forked program, and end in the way that the first argument names."""
+"""Print facts about the forked process, and end in the way that the first argument names."""
 
 import os
 import resource

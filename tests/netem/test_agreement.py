@@ -1,8 +1,8 @@
 """Test that a scenario has the same meaning with real packets and in virtual time.
 
-The medium gets the real sending time of each packet, so effects of rates and limits can be compared packet by packet.
-Other conditions are random in both, and are compared by intervals of two samples. A correct program fails one check in
-100,000.
+The simulated medium gets the real sending time of each packet, so the tests can compare effects of rates and limits
+packet by packet. Other conditions are random both in the kernel and in the medium. The tests compare them as two random
+samples. With a correct program, one of 100,000 checks fails.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ SEEDS = range(1, 6)
 
 @dataclass
 class Heard:
-    """The numbered packets that a receiver received."""
+    """The numbered packets that were sent, and their copies that a receiver received."""
 
     sent_at: list[float]
     """Sending time of each packet in seconds."""
     delays: list[list[float]]
-    """Delays of the received copies of each packet, in seconds."""
+    """Delays of the received copies of each packet in seconds. A lost packet has an empty list."""
 
     @property
     def came(self) -> list[bool]:
@@ -55,7 +55,7 @@ class Heard:
 
     @property
     def arrivals(self) -> list[float]:
-        """The arrival times of the copies, in the order of their packets."""
+        """The arrival times of all copies, in the order of their packets."""
         return [at + delay for at, copies in zip(self.sent_at, self.delays, strict=True) for delay in copies]
 
 
@@ -66,17 +66,17 @@ class Both:
     kernel: Heard
     medium: list[Heard]
     late_s: float
-    """Assumed lateness of this machine: the largest measured one, but more than zero."""
+    """Assumed delay of this machine in seconds. It is the largest measured delay, but not less than LATE_S."""
 
     def agree_on_copies(self) -> None:
-        """Check that the numbers of lost, single and duplicate packets agree."""
+        """Check that the numbers of packets with no, one and two copies agree."""
         for number in range(3):
             kernel, medium = ([len(copies) == number for copies in one.delays] for one in self.sides)
             assert_same_share(f"{number} copies", kernel, medium)
         assert max(map(len, self.kernel.delays)) <= 2
 
     def agree_on_delays(self) -> None:
-        """Check that the distributions of delays agree, apart from delays of this machine."""
+        """Check that the distributions of delays agree. Delays that this machine causes are allowed."""
         kernel, medium = (one.all_delays for one in self.sides)
         for at in statistics.quantiles(medium, n=20):
             by_then = [delay <= at for delay in medium]
@@ -89,7 +89,9 @@ class Both:
         return 2 * self.late_s
 
     def agree_on_arrivals(self) -> None:
-        """Check that packets which arrive in both cases arrive at the same time, apart from delays of this machine."""
+        """Check that packets which arrive in both cases arrive at the same time. Delays that this machine causes are
+        allowed.
+        """
         pairs = zip(self.kernel.delays, self.medium[0].delays, strict=True)
         later = statistics.quantiles(one[0] - other[0] for one, other in pairs if one and other)
         assert all(-EARLY_S < late_s < self.late_in_queue_s for late_s in later), later
@@ -100,7 +102,7 @@ class Both:
 
     @property
     def pooled(self) -> Heard:
-        """Return all packets in virtual time."""
+        """Return the packets of all seeds in virtual time."""
         sent_at = [at for one in self.medium for at in one.sent_at]
         return Heard(sent_at, [copies for one in self.medium for copies in one.delays])
 
@@ -110,7 +112,7 @@ async def broadcast(
 ) -> dict[int, Both]:
     """Send packets as fast as `sender` can, and return the packets at each receiver.
 
-    `at_once`: number of packets before each pause. Without pauses, a kernel may drop packets for many receivers.
+    `at_once` is the number of packets before each pause. With many receivers and no pauses, a kernel may drop packets.
     """
     receivers = sorted({WITNESS, *receivers})
     listeners = {vehicle: await air.start_ready(vehicle, "receive", PORT) for vehicle in receivers}
@@ -139,7 +141,7 @@ async def broadcast(
 def through_medium(
     vehicles: Sequence[int], seed: int, conditions: NetworkConditions, sender: int, sent_at: list[float]
 ) -> list[Heard]:
-    """Return the simulated packets of each vehicle. Vehicles and `sender` are given by number."""
+    """Return the simulated packets at each vehicle. `sender` is an index in `vehicles`."""
     medium = Medium(vehicles, seed)
     medium.apply(conditions)
     flown = [Heard(sent_at, [[] for _ in sent_at]) for _ in vehicles]
@@ -163,7 +165,7 @@ def assert_same_share(what: str, one: Sequence[bool], other: Sequence[bool]) -> 
 
 
 def test_independent_draws_agree(netem: str, tmp_path: Path) -> None:
-    """Conditions are loss and duplicates together, corruption, reordering, and delays of every distribution."""
+    """The conditions are loss together with duplicates, corruption, reordering, and delays of every distribution."""
     links = {
         WITNESS: CONSTANT,
         3: LinkConditions(loss=0.4, duplicate=0.6),
@@ -249,7 +251,7 @@ def test_rates_and_limits_agree(netem: str, tmp_path: Path) -> None:
 
 
 def assert_jitter_keeps_order(both: Both, spread_s: float) -> None:
-    """Check that random delays do not change the order or add up if the data rate is limited."""
+    """Check that, with a limited data rate, random delays neither change the order of packets nor add up."""
     heard = [one.arrivals for one in (both.kernel, *both.medium)]
     assert all(map(in_order, heard))
     ends = [arrivals[-1] for arrivals in heard]
@@ -257,7 +259,7 @@ def assert_jitter_keeps_order(both: Both, spread_s: float) -> None:
 
 
 def assert_overtakers_take_no_time(both: Both, each_s: float) -> None:
-    """Check that reordered packets are not delayed if the data rate is limited, and that the others keep their
+    """Check that, with a limited data rate, reordered packets are not delayed and the other packets keep their
     order.
     """
     assert_same_share("overtakes", *([delay < CONSTANT_S / 2 for delay in one.all_delays] for one in both.sides))
@@ -272,5 +274,5 @@ def assert_overtakers_take_no_time(both: Both, each_s: float) -> None:
 
 
 def in_order(arrivals: list[float]) -> bool:
-    """Return whether the arrivals are in order, within the accuracy of the clocks."""
+    """Return whether the arrival times are in order, within the accuracy of the clocks."""
     return all(later > before - EARLY_S for before, later in pairwise(arrivals))

@@ -1,4 +1,4 @@
-"""Test network conditions as objects: their meaning, and the refusal of invalid ones."""
+"""Test objects for network conditions: their meaning, and the refusal of invalid conditions."""
 
 from __future__ import annotations
 
@@ -189,7 +189,9 @@ def test_engine_refuses_unsupported_conditions_before_any_change(conditions: Net
 
 
 class _Forgetful(Engine):
-    """An engine that forgets the conditions in `refused`. If it is `stuck`, it keeps only the first ones."""
+    """An engine that fails to apply the conditions in `refused`. If `stuck` is true, it keeps the first conditions
+    forever.
+    """
 
     name = "forgetful"
     has_queues = True

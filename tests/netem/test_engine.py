@@ -1,4 +1,4 @@
-"""Test the effect of conditions on real packets, the same for both engines, and the counts of the kernel."""
+"""Test the effect of conditions on real packets, with both engines, and the counters of the kernel."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def in_lab(vehicles: Sequence[int], engine: str, folder: Path, story: Callable[[
 
 
 def loss(default: float, **receivers: float) -> NetworkConditions:
-    """Return conditions from examples such as loss(0.1, v3=0.5)."""
+    """Return network conditions. For example, loss(0.1, v3=0.5) means a loss rate of 0.1, and of 0.5 at vehicle 3."""
     links = {int(name[1:]): LinkConditions(value) for name, value in receivers.items()}
     return NetworkConditions(LinkConditions(default), links)
 
 
 async def deliveries(air: Air, sender: int, receivers: Sequence[int], count: int) -> dict[int, set[int]]:
-    """Broadcast `count` numbered datagrams. Return which of them each receiver received."""
+    """Broadcast `count` numbered datagrams. Return the numbers of the datagrams that each receiver received."""
     listeners = {vehicle: await air.start_ready(vehicle, "receive", PORT) for vehicle in receivers}
     await air.broadcast(sender, count)
     heard = {vehicle: await listener.finish() for vehicle, listener in listeners.items()}
@@ -82,7 +82,9 @@ def test_loss_per_receiver_is_as_requested_and_independent(engine: str, tmp_path
 
 
 async def crossings(air: Air, vehicles: Sequence[int]) -> set[tuple[int, int, str]]:
-    """Return the connected pairs and protocols, tested by all kinds of frames and destinations."""
+    """Send all kinds of frames to all kinds of destinations. Return (sender, receiver, kind) for each frame that
+    arrived.
+    """
     listeners = {vehicle: await air.start_ready(vehicle, "listen") for vehicle in vehicles}
     for sender in vehicles:
         destinations = [EVERYONE, MULTICAST, *(addresses.mac(v) for v in vehicles if v != sender)]

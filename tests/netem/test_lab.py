@@ -1,4 +1,4 @@
-"""Test the virtual network from the view of its users: programs, connections, and all kinds of ends."""
+"""Test the virtual network as its users see it: programs, connections, and all ways in which it can end."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_vehicle_has_its_address_a_broadcast_address_and_a_default_route(tmp_p
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may enter a network that somebody else made")
 def test_cable_can_end_in_an_existing_network(tmp_path: Path) -> None:
-    """Programs in that network can be reached under its conditions. Afterwards it is as before."""
+    """The conditions also apply to programs in that network. Afterwards, the network is unchanged."""
     neighbour = subprocess.Popen(["unshare", "--net", "sleep", "60"])
     network = Path(f"/proc/{neighbour.pid}/ns/net")
 
@@ -114,7 +114,7 @@ def test_an_idle_lab_is_silent(tmp_path: Path) -> None:
 
 
 def test_kernel_counts_datagrams_that_programs_read(tmp_path: Path) -> None:
-    """Vehicle 2 reads three of its datagrams, and leaves its broadcast in the socket. Vehicle 1 has no socket."""
+    """Vehicle 2 reads three datagrams to it, and leaves a broadcast unread in the socket. Vehicle 1 has no socket."""
     program = (
         "import socket, sys; s = socket.socket(type=socket.SOCK_DGRAM); s.bind(('', 9)); "
         "s.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1); "

@@ -27,7 +27,7 @@ NAMESPACES = ("net", "user", "mnt", "pid")
 
 
 def processes_of(mark: Path) -> set[int]:
-    """Return the running processes of this user with the mark in their environment."""
+    """Return the running processes of this user whose environment contains the mark."""
     found = set()
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -49,7 +49,7 @@ def namespaces() -> set[str]:
 
 
 def has_ended(folder: Path) -> bool:
-    """Return true if the process is a zombie. The state follows the name in the file (proc(5))."""
+    """Return whether the process is a zombie. In the file, the state follows the name of the program (proc(5))."""
     return (folder / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
@@ -90,7 +90,7 @@ def test_a_killed_orchestrator_leaves_nothing(tmp_path: Path, after_s: float) ->
 
 
 def namespaces_of(pids: set[int]) -> set[str]:
-    """Return the namespaces that contain these processes but not the present one."""
+    """Return the namespaces of these processes. The namespaces of the present process are left out."""
     own = {str(Path("/proc/self/ns", kind).readlink()) for kind in NAMESPACES}
     found = set()
     for pid in pids:

@@ -1,6 +1,7 @@
 """Test all effects of netem on a link: delays and their distributions, bursts of losses, duplicates, and others.
 
-The kernel draws these lots, so figures are compared with wide intervals; a right program fails about one in 100,000.
+The kernel decides at random, so the tests compare figures with wide intervals. With a correct program, about one of
+100,000 checks fails.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ async def heard(air: Air, sender: int, receivers: dict[int, Any], count: int, si
 
 
 async def until_quiet(air: Air) -> None:
-    """Wait until no packet is on its way any more."""
+    """Wait until no packet is in transit."""
     before = None
     while before != (now := (await air.lab.read()).receivers):
         before = now
@@ -83,7 +84,7 @@ def test_delays_have_the_requested_mean_deviation_and_shape(netem: str, tmp_path
 
 
 def median(delay: Delay) -> float:
-    """Return the median of a delay in seconds. For the Pareto distribution, it is below the mean."""
+    """Return the median of a delay in seconds. With the Pareto distribution, the median is less than the mean."""
     shift = {"pareto": -0.32, "paretonormal": -0.2}.get(delay.distribution, 0.0)
     return delay.mean_s + shift * delay.jitter_s
 

@@ -1,4 +1,4 @@
-"""Test machines that cannot run a virtual network, users without permission, and the messages about them."""
+"""Test the error messages on machines that cannot run a virtual network, and for users without permission."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 def run_as_nobody(argv: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command as an ordinary user: the present one, or the user `nobody` if this is root."""
+    """Run a command as an ordinary user. This is the present user, or the user `nobody` if the present user is root."""
     nobody = {"user": "nobody", "group": "nogroup", "extra_groups": []} if os.geteuid() == 0 else {}
     return subprocess.run(argv, capture_output=True, text=True, check=False, **nobody, **options)
 
@@ -40,7 +40,7 @@ def require_nobody_can() -> None:
 
 
 def run_script(script: str, *, prefix: list[str] | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a Python script as an ordinary user, in a folder of that user."""
+    """Run a Python script as an ordinary user, in a folder that this user may write."""
     require_nobody_can()
     folder = run_as_nobody(["mktemp", "-d"], cwd="/").stdout.strip()
     try:

@@ -1,4 +1,4 @@
-"""Test measurements of the network: the statistics, the comparisons, and the detection of wrong networks."""
+"""Test measurements of the network: the statistics, the comparisons, and how they detect wrong networks."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def one_question(asked: float) -> NetworkStudy:
 
 
 def losing(*shares: float) -> tuple[list[tuple[NetworkStudy, int]], EngineMeasurement]:
-    """Return a measurement whose network loses these shares, and its results."""
+    """Return a measurement of a network that loses these shares of packets, and its results."""
     asked: list[tuple[NetworkStudy, int]] = []
     kept = iter(shares)
 

@@ -1,4 +1,4 @@
-"""Test the simulated network by counting many broadcasts with a fixed seed."""
+"""Test the simulated network: count the effects on many broadcasts with a fixed seed."""
 
 from collections import Counter
 from itertools import pairwise
@@ -27,7 +27,7 @@ def draw(air: Medium, sender: int, now: float = 0.0) -> RandomDraws:
 
 
 def delays(air: Medium, sender: int, receiver: int, broadcasts: int = BROADCASTS) -> list[list[float]]:
-    """Return, for each broadcast of one sender, the delays of the copies at one receiver."""
+    """Return the delays of the copies at one receiver, for each broadcast of one sender."""
     return [[delay for number, delay in draw(air, sender).to_all() if number == receiver] for _ in range(broadcasts)]
 
 
@@ -101,12 +101,12 @@ def test_reordered_packets_arrive_at_once_and_copies_have_own_delays() -> None:
 
 
 def arrivals(air: Medium, sent_at: list[float], receiver: int = 1) -> list[list[float]]:
-    """Return, for each broadcast of the first vehicle, the arrival times of the copies."""
+    """Return the arrival times of the copies, for each broadcast of the first vehicle."""
     return [[at + delay for delay in draw(air, 0, at).copies_to(receiver)] for at in sent_at]
 
 
 def test_packet_on_a_rate_leaves_after_earlier_ones() -> None:
-    """Frames of 1000 bits take one second each at 1000 bit/s."""
+    """A frame of 1000 bits takes one second at 1000 bit/s."""
     assert arrivals(medium(rate=1000), [0.0, 0.25, 0.5, 5.0]) == [[1.0], [2.0], [3.0], [6.0]]
     # A packet waits for the rate after its delay and after earlier packets. The queue is empty again at 8.
     air = medium(rate=1000, delay=Delay(2.0))
@@ -153,7 +153,9 @@ def test_corrupted_packet_takes_a_place_and_a_lost_one_does_not() -> None:
 
 
 def test_second_copy_leaves_the_queue_before_the_first() -> None:
-    """A packet with two copies therefore needs only one free place in the queue, and then occupies two."""
+    """A packet with two copies needs only one free place in the queue when it arrives. Afterwards it occupies two
+    places.
+    """
     assert arrivals(medium(rate=1000, duplicate=1.0), [0.0, 0.0]) == [[2.0, 1.0], [4.0, 3.0]]
     one_waits = medium(rate=1000, duplicate=1.0, limit=1)
     assert arrivals(one_waits, [0.0, 0.0, 1.5, 2.0]) == [[2.0, 1.0], [], [], [4.0, 3.0]]
@@ -235,7 +237,7 @@ def test_draws_are_equal_one_by_one_and_all_at_once() -> None:
 
 
 def test_each_sender_and_effect_has_its_own_random_stream() -> None:
-    """Messages of other senders, and a higher loss, do not change the delay of a message."""
+    """The delay of a message does not depend on messages of other senders, or on a higher loss rate."""
     quiet, busy, lossy = medium(), medium(), medium(loss=0.9)
     for _ in range(500):
         draw(busy, 1)

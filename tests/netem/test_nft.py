@@ -1,4 +1,6 @@
-"""Test that long changes are divided for ordinary users, and that a partly applied change can be undone."""
+"""Test that a long change is divided into several transactions for ordinary users, and that an incomplete change can be
+undone.
+"""
 
 from typing import Any
 
@@ -13,7 +15,7 @@ VEHICLES = range(1, 31)
 
 
 class Narrow(NftablesEngine):
-    """An nftables engine that accepts few commands at once, and fails after `lasts` transactions."""
+    """An nftables engine that accepts few commands in a transaction. After `lasts` transactions, it fails."""
 
     def __init__(self) -> None:
         self._vehicles = tuple(VEHICLES)

@@ -1,4 +1,4 @@
-"""Test packet capture files by reading them with scapy: complete, truncated, and on a full disk."""
+"""Test packet capture files: scapy reads complete files, truncated files, and files of a full disk."""
 
 import resource
 import subprocess
@@ -52,7 +52,7 @@ def test_truncated_file_has_every_complete_packet(tmp_path: Path) -> None:
 
 @contextmanager
 def full_after(limit: int) -> Iterator[None]:
-    """Limit the size of files of this process to `limit` bytes inside the context."""
+    """Limit the size of the files that this process writes to `limit` bytes inside the context."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
     try:

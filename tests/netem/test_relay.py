@@ -1,4 +1,4 @@
-"""Test broadcasts that are taken over from the virtual switch and delivered one by one."""
+"""Test the relay, which takes broadcasts from the virtual switch and delivers them one by one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ print(json.dumps(heard), flush=True)
 
 
 async def relayed(folder: Path, engine: str, conditions: NetworkConditions) -> dict[str, Any]:
-    """Broadcast from vehicle 1 while only vehicle 3 receives the taken-over broadcasts, and then without the relay.
+    """Broadcast from vehicle 1 twice: while the relay is active and delivers only to vehicle 3, and then without the
+    relay.
 
     Vehicle 4 does not belong to the relay.
     """

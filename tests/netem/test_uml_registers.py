@@ -23,7 +23,9 @@ WAYS = ["as here"] if _uml_registers.needed(Path(KERNEL) if KERNEL else None) el
 
 @pytest.fixture(params=WAYS)
 def guest(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run User Mode Linux normally, and also with the register library where it is not needed."""
+    """Run User Mode Linux in two ways: normally, and with the register library although this processor does not need
+    it.
+    """
     if request.param == "preloaded":
         monkeypatch.setenv(_uml_registers.FORCE, "1")
     require_uml()
@@ -31,7 +33,9 @@ def guest(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.fixture(scope="module")
 def check(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Compile the program that checks its registers. It prints lost registers, and then ends with status 1."""
+    """Compile the program that checks its own registers. If registers are lost, the program prints them and ends with
+    status 1.
+    """
     program = tmp_path_factory.mktemp("registers") / "check"
     argv = ["cc", "-O1", "-fno-builtin", "-pthread", "-o", str(program), str(PROGRAMS / "check.c")]
     if not _uml_registers.has_compiler():

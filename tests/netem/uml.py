@@ -1,7 +1,7 @@
 """Run the tests of netem inside User Mode Linux: `python -m tests.netem.uml`.
 
-The same tests run in the same virtual environment, see `netem.uml`. Arguments go to pytest. The exit status is
-pytest's, or 3 if User Mode Linux is not here, does not boot, hangs or panics.
+The tests and the Python environment are the same as outside (see `netem.uml`). The program passes its arguments to
+pytest. The exit status is that of pytest. It is 3 if User Mode Linux is missing, does not boot, hangs or panics.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Run pytest inside a test, and read its output."""
+"""Run pytest on a small project inside a test, and read its output."""
 
 import json
 import os
@@ -16,12 +16,12 @@ SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
 def run(pytester: pytest.Pytester, *arguments: object) -> pytest.RunResult:
-    """Run the tests of the inner project in this process."""
+    """Run the tests of the small project in this process."""
     return pytester.runpytest_inprocess("-p", "no:cacheprovider", *map(str, arguments))
 
 
 def write_scenario(pytester: pytest.Pytester, file: str, **keys: Any) -> Path:
-    """Write a quick scenario as YAML with one key per line."""
+    """Write a scenario that takes little time, as YAML with one key in each line."""
     keys = {"name": "inner", "agents": 3, "duration_s": 100, "vehicles": {"kind": "none"}, **keys}
     path = pytester.path / file
     path.write_text("".join(f"{key}: {json.dumps(value)}\n" for key, value in keys.items()))
@@ -29,7 +29,7 @@ def write_scenario(pytester: pytest.Pytester, file: str, **keys: Any) -> Path:
 
 
 def report(result: pytest.RunResult) -> Path:
-    """Return the report that a failing test names. It must exist."""
+    """Return the path of the report that the output of a failing test names. The report must exist."""
     found = re.search(r"^report: (\S+)$", result.stdout.str(), re.MULTILINE)
     assert found, result.stdout.str()
     path = Path(found[1])
@@ -38,7 +38,7 @@ def report(result: pytest.RunResult) -> Path:
 
 
 def no_internals(result: pytest.RunResult) -> None:
-    """Check that the output contains the test and sentences, but no source line of the harness."""
+    """Check that the output contains the name of the test and sentences, but no source line of the harness."""
     shown = result.stdout.str() + result.stderr.str()
     assert "Traceback" not in shown
     assert not re.search(r"harness/(?!harness/|pytest_plugin/_?judged_run\.py:\d+: )\w+[\w/]*\.py:\d+", shown), shown

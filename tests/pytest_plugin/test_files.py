@@ -1,4 +1,4 @@
-"""Test scenarios that are tests by themselves, and YAML files of other programs."""
+"""Test scenarios that are collected as tests, and YAML files of other programs, which are not."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Test runs in parallel tests, interrupted tests, and tests beside unrelated tests."""
+"""Test runs in parallel tests, interrupted tests, and tests among tests that do not use the plugin."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Test stories: they are played and compared with their text, or rewritten on request."""
+"""Test stories: the plugin plays them and compares the run with their text, or rewrites the text on request."""
 
 import json
 import shlex
@@ -36,7 +36,7 @@ def write(pytester: pytest.Pytester, text: str, file: str = "missed.story") -> P
 
 
 def written(pytester: pytest.Pytester, text: str = TOLD) -> Path:
-    """Write a story with the reactions of agents."""
+    """Write a story together with the reactions of the agents."""
     path = write(pytester, text)
     run(pytester, path, "--ucp-rewrite").assert_outcomes(passed=1)
     return path

@@ -1,4 +1,4 @@
-"""Test the fixture `swarm`: a test controls a run, which is judged when the test ends."""
+"""Test the fixture `swarm`: a test controls a run, which the checker judges when the test ends."""
 
 import json
 import re
@@ -71,7 +71,9 @@ def test_a_partition_heals_at_the_end_of_its_block(pytester: pytest.Pytester) ->
 @pytest.mark.lab
 @pytest.mark.any_user
 def test_processes_pass_the_same_test(pytester: pytest.Pytester) -> None:
-    """A shorter partition allows a lower speedup, at which a busy machine does not delay a vote too long."""
+    """The partition is shorter than in virtual time. Thus the speedup can be lower, so that a busy machine does not
+    delay a vote too long.
+    """
     pytester.makepyfile(STORY.replace("run_for(600)", "run_for(200)"))
     run(pytester, "--ucp-backend", "process", "--ucp-speedup", "20").assert_outcomes(passed=1)
     assert not run_directories(pytester)

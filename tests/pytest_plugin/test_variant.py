@@ -1,4 +1,4 @@
-"""Test protocol variants: in the marks of tests, and as an option of the session."""
+"""Test how tests select protocol variants: by a mark, or by an option for the session."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ NAMED = 'assert json.loads((run.directory / "run.json").read_text())["versions"]
 
 @pytest.fixture(autouse=True)
 def variants(pytester: pytest.Pytester) -> Path:
-    """Write a variant, and a file in which agents and judge follow different variants."""
+    """Write a variant, and a file in which agents and checker follow different variants."""
     (pytester.path / "answers.py").write_text(ANSWERS)
     (pytester.path / "differs.py").write_text(
         ANSWERS.replace(

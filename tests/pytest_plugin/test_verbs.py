@@ -1,4 +1,6 @@
-"""Test further actions of the fixture `swarm`: wait for a handler, hold messages, change links, inject datagrams."""
+"""Test the other methods of the fixture `swarm`: wait for a handler, hold messages, change links, and inject
+datagrams.
+"""
 
 import json
 from pathlib import Path
@@ -16,7 +18,7 @@ pytest_plugins = "pytester"
 
 
 def record(pytester: pytest.Pytester) -> dict[str, Any]:
-    """Return the record of the only stored run."""
+    """Return the record of the run. Only one run may be stored."""
     (kept,) = run_directories(pytester)
     document: dict[str, Any] = json.loads((kept / "run.json").read_text())
     return document
@@ -27,7 +29,7 @@ def given(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def is_played_again_alike(pytester: pytest.Pytester, directory: Path) -> None:
-    """Check that the recorded scenario leads to the same chain when it is played again."""
+    """Check that the recorded scenario gives the same chain when it is played again."""
     (kept,) = run_directories(pytester)
     run_record = record(pytester)
     play(parse(run_record["scenario"]), run_record["seed"], directory, SilentProgress(), "sim")

@@ -1,4 +1,4 @@
-"""Test the options for the place of a run: User Mode Linux, or containers."""
+"""Test the options that select where a run takes place: in User Mode Linux, or in containers."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Test the agent that is a ROS 2 node, as its page describes it. `make test-ros` provides ROS."""
+"""Test that an agent can be a ROS 2 node, as the documentation describes. `make test-ros` provides ROS."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.lab, pytest.mark.ros]
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a directory in which all steps of the page were done."""
+    """Return a directory in which the steps of the documentation page were done."""
     if not (REPOSITORY / ".ros" / "installed").exists():
         do_without("ros", "there is no ROS 2 in .ros: make test-ros installs it")
     directory = tmp_path_factory.mktemp("a clone")

@@ -1,4 +1,7 @@
-"""Run an autopilot of an embedded vehicle in the test's process, with one client and a clock that the test advances."""
+"""Run the autopilot of an embedded vehicle in the test's process.
+
+The vehicle has one client, and a clock that the test advances.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ ACCEPTED, FAILED, UNSUPPORTED = (
 
 
 class Cockpit:
-    """A vehicle with one client. `heard` contains all messages of the vehicle except telemetry."""
+    """A vehicle with one client. `heard` contains all messages that the vehicle has sent, except telemetry."""
 
     def __init__(self, vehicle_type: VehicleType = "copter") -> None:
         self.vehicle = Autopilot(3, HOME, 0, vehicle_type)
@@ -34,7 +37,7 @@ class Cockpit:
         self.heard: list[Any] = []
 
     def tell(self, message: Any) -> list[Any]:
-        """Send a message, and return the direct answers."""
+        """Send a message to the vehicle, and return its direct answers."""
         self.channel.receive(message.pack(self._mav))
         return self.listen()
 
@@ -57,7 +60,7 @@ class Cockpit:
         return self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
 
     def fly(self, until_s: float, step_s: float = 1.0) -> None:
-        """Advance the time in steps."""
+        """Advance the time in small steps."""
         while self.vehicle.now_s < until_s:
             self.vehicle.advance(min(until_s, self.vehicle.now_s + step_s))
             self.listen()
@@ -83,7 +86,7 @@ class Cockpit:
         return mission
 
     def begin(self, plan: Plan) -> float:
-        """Start a plan in AUTO mode, and return the second of its start."""
+        """Start a plan in AUTO mode, and return the time of its start in seconds."""
         self.ready()
         self.load(plan)
         if self.vehicle.vehicle_type == "copter":

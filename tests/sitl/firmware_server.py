@@ -1,4 +1,6 @@
-"""A local server for firmware with ArduPilot's paths. It works correctly, or fails as the test requests."""
+"""A local server for firmware, with the same paths as ArduPilot's server. It works correctly, or fails as a test
+requests.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ def git_version(version: str = "4.6.3", commit: str = COMMIT) -> bytes:
 
 @dataclass(frozen=True)
 class Resource:
-    """The content at one path, and how the server sends it."""
+    """The content at one path, and the way in which the server sends it."""
 
     content: bytes
     status: int = 200
@@ -52,9 +54,9 @@ class Resource:
 
 @dataclass
 class FirmwareServer:
-    """A server for `files` by path. A test may change them.
+    """A server with the contents `files` by path.
 
-    It records requests (path, Range header) and answers (path, status).
+    A test may change `files`. The server records each request (path, Range header) and each answer (path, status).
     """
 
     files: dict[str, Resource]

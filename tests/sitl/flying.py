@@ -1,4 +1,4 @@
-"""Helpers for tests of vehicles: an embedded vehicle in its own process, and a simple client."""
+"""Provide an embedded vehicle in its own process, and a simple client, for tests of vehicles."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 def until(condition: Callable[[], T | None], what: str) -> T:
-    """Wait until a condition is true, and return its value."""
+    """Wait until the value of the condition is true, and return this value."""
     deadline = time.monotonic() + DEADLINE_S
     while not (result := condition()):
         assert time.monotonic() < deadline, f"waited in vain: {what}"
@@ -39,7 +39,7 @@ def free_ports(count: int) -> list[int]:
 
 
 def connect(port: int) -> socket.socket:
-    """Connect to a port as soon as a program listens there."""
+    """Connect to a port as soon as a program listens at it."""
 
     def attempt() -> socket.socket | None:
         try:
@@ -57,7 +57,7 @@ def embedded_argv(*extra: str, sysid: int = 3, home: str = str(HOME), speedup: f
 
 @dataclass
 class Vehicle:
-    """A running embedded vehicle and its ports."""
+    """An embedded vehicle that runs, and its ports."""
 
     process: subprocess.Popen[bytes]
     pilot_port: int
@@ -88,7 +88,7 @@ class Client:
         self.bytes_received = 0
 
     def wait_for(self, kind: str, **fields: Any) -> Any:
-        """Return the next message of this kind whose fields have these values."""
+        """Return the next message of this type whose fields have these values."""
         deadline = time.monotonic() + DEADLINE_S
         while True:
             while self._waiting:

@@ -1,4 +1,4 @@
-"""An embedded vehicle in the test's event loop. The test can change its messages."""
+"""An embedded vehicle in the test's event loop. The test can change the messages that the vehicle sends."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TURN_S = 0.005
 
 
 class Puppet:
-    """An embedded vehicle whose frames the function `tamper` may change. Simulated time runs at SPEEDUP."""
+    """An embedded vehicle whose sent frames the function `tamper` may change. Simulated time runs at SPEEDUP."""
 
     def __init__(self, vehicle_type: VehicleType, sock: socket.socket) -> None:
         self.vehicle = Autopilot(3, HOME, 0, vehicle_type)

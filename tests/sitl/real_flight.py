@@ -2,8 +2,8 @@
 
     python -m tests.sitl.real_flight DIRECTORY copter|plane|rover mission|guided
 
-This command prints the second on the vehicle's clock at which the flight began. Run it in its own network namespace,
-because ArduPilot listens on every address and may send multicasts.
+This command prints the time of the start of the flight, in seconds of the vehicle's clock. Run the command in its own
+network namespace, because ArduPilot listens on every address and may send multicasts.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ PLANS: dict[VehicleType, Plan] = {
 
 
 def fly(directory: Path, vehicle_type: VehicleType, by: By) -> float:
-    """Fly the plan, write the telemetry log to `directory`, and return the start of the plan on the vehicle's clock."""
+    """Fly the plan and write the telemetry log to `directory`. Return the time of the plan's start on the vehicle's
+    clock.
+    """
     launch = ArduPilot.find(None, os.environ, vehicle_type).launch(3, HOME, SPEEDUP, directory)
 
     async def flight() -> float:
@@ -59,7 +61,7 @@ def fly(directory: Path, vehicle_type: VehicleType, by: By) -> float:
 
 
 def track_of(tlog: Path, began_s: float) -> list[tuple[float, tuple[float, float, float]]]:
-    """Return the seconds since the start, and the metres from home, of each recorded position."""
+    """Return, for each recorded position, the seconds since the start and the metres from home."""
     log, points = mavutil.mavlink_connection(str(tlog)), []
     while (message := log.recv_match(type="GLOBAL_POSITION_INT")) is not None:
         if (second := message.time_boot_ms / 1e3 - began_s) >= 0:

@@ -2,8 +2,8 @@
 
     python -m tests.sitl.recorded TELEMETRY.tlog OUT.tlog.gz
 
-cuts a telemetry log: what says where the vehicle is, all of it in its first 50 s and every 2 s after that, and every
-change of its mode, arming and mission, until it repeats itself.
+shortens a telemetry log. It keeps all messages about the position of the first 50 s, and later such messages every 2 s.
+It also keeps each change of the mode, of the arming and of the mission item.
 """
 
 from __future__ import annotations

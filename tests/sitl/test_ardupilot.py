@@ -1,4 +1,4 @@
-"""Test finding and starting ArduPilot, with small programs in place of its binary."""
+"""Test how ArduPilot is found and started. Small programs take the place of its binary."""
 
 from __future__ import annotations
 

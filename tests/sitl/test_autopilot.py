@@ -1,4 +1,4 @@
-"""Test modes and flights of the embedded vehicle, in one process and without a clock."""
+"""Test modes and flights of the embedded vehicle, in the process of the test. The test sets the time."""
 
 from __future__ import annotations
 

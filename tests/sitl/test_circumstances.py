@@ -1,4 +1,4 @@
-"""Test simulated events of a vehicle, such as a GPS failure: they are set by parameters, and cause failsafes."""
+"""Test simulated events of a vehicle, such as a GPS failure. Parameters set these events, which cause failsafes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FAR = Plan((TakeOff(20.0), GoTo(5000.0, 0.0)))
 
 
 def airborne(vehicle_type: VehicleType = "copter") -> tuple[Autopilot, list[str]]:
-    """Return a vehicle in flight, and its text messages."""
+    """Return a vehicle in flight, and the text messages that it has sent."""
     vehicle, texts = Autopilot(3, HOME, 0, vehicle_type), list[str]()
 
     class Ear:

@@ -53,7 +53,7 @@ def server() -> Iterator[FirmwareServer]:
 
 
 class Onlooker:
-    """An observer that records its calls, and can end a download like Ctrl-C or a full disk."""
+    """An observer of a download. It records its calls, and can end the download like Ctrl-C or a full disk."""
 
     def __init__(self, end: BaseException | None = None) -> None:
         self.waited = threading.Event()
@@ -73,7 +73,7 @@ ARM_BINARY = b"\x7fELF\x01\x01\x01" + bytes(9) + b"\x02\x00\x28\x00" + BINARY[20
 
 
 def serve_arm(server: FirmwareServer, binary: bytes) -> None:
-    """Let the server offer the files for 32-bit ARM with this binary."""
+    """Let the server offer the files for 32-bit ARM, with this binary."""
     arm = RELEASE.replace("SITL_x86_64_linux_gnu", "SITL_arm_linux_gnueabihf")
     server.files[f"{arm}git-version.txt"] = server.files[f"{RELEASE}git-version.txt"]
     server.files[f"{arm}arducopter"] = Resource(binary)
@@ -549,7 +549,7 @@ def test_32_bit_arm_gets_its_own_binary(
 def test_aarch64_without_32_bit_support_is_refused(
     server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The machine of the test does not support it either."""
+    """The machine in the test has no support for 32-bit programs."""
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     serve_arm(server, ARM_BINARY)
     with pytest.raises(VehicleError, match="this aarch64 does not run programs of 32 bits: build ArduPilot SITL"):

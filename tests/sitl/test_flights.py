@@ -1,4 +1,4 @@
-"""Test plans that the real pilot flies: embedded vehicles over TCP, and vehicles with wrong messages."""
+"""Test plans that the pilot flies with embedded vehicles over TCP, and with vehicles that send wrong messages."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def places(tlog: Path) -> Iterator[tuple[float, tuple[float, float, float]]]:
 
 @pytest.mark.parametrize("vehicle_type", TYPES)
 def test_mission_in_auto_mode_follows_the_computed_track(vehicle_type: VehicleType, tmp_path: Path) -> None:
-    """The flight is within a metre of the computed path at every second."""
+    """At every second, the vehicle is within a metre of the computed path."""
     tlog = tmp_path / "3.tlog"
     pilot = flown(vehicle_type, "mission", tlog)
     assert pilot.state.armed is (vehicle_type == "rover")
@@ -109,7 +109,7 @@ async def until(condition: Callable[[], bool]) -> None:
 def puppet_flown(
     tmp_path: Path, strings: Callable[[Puppet], None], vehicle_type: VehicleType = "copter", by: By = "mission"
 ) -> Pilot:
-    """Fly the plan on a vehicle whose messages the function `strings` changes."""
+    """Fly the plan with a vehicle whose messages the function `strings` changes. Return the pilot."""
 
     async def fly() -> Pilot:
         async with on_strings(tmp_path, vehicle_type) as (pilot, puppet):
@@ -122,7 +122,10 @@ def puppet_flown(
 
 
 def failure(tmp_path: Path, strings: Callable[[Puppet], None], after_m: float = 25.0, by: By = "mission") -> str:
-    """Return the reason why a flight of a copter fails if its messages are changed from a height of `after_m` on."""
+    """Return the reason for which a flight of a copter fails.
+
+    The function `strings` changes the vehicle's messages when it has reached a height of `after_m` metres.
+    """
 
     async def fly() -> str:
         async with on_strings(tmp_path) as (pilot, puppet):
@@ -138,7 +141,9 @@ def failure(tmp_path: Path, strings: Callable[[Puppet], None], after_m: float = 
 
 
 def without(monkeypatch: pytest.MonkeyPatch, *ids: int) -> Callable[[Puppet], None]:
-    """Return a function that suppresses these messages, or all messages. The pilot's time limits become short."""
+    """Return a function that suppresses the messages with these IDs, or all messages. It also shortens the pilot's time
+    limits.
+    """
 
     def strings(puppet: Puppet) -> None:
         monkeypatch.setattr(sitl.pilot, "SILENCE_S", 0.3)
@@ -205,7 +210,7 @@ def test_undone_mode_is_requested_again(tmp_path: Path) -> None:
 
 
 def test_forgotten_mission_is_uploaded_again(tmp_path: Path) -> None:
-    """The vehicle behaves like ArduCopter 3.5 during its boot."""
+    """During its boot, the vehicle behaves like ArduCopter 3.5."""
     forgotten: list[int] = []
 
     def strings(puppet: Puppet) -> None:
@@ -301,7 +306,7 @@ def test_ready_vehicle_only_needs_arming(by: By, vehicle_type: VehicleType, tmp_
 
 
 def test_vehicle_that_revokes_its_readiness_is_not_ready(tmp_path: Path) -> None:
-    """ArduPilot 4.7 reports for 2.4 s that a rover is ready, and then for 17 s that it is not."""
+    """For 2.4 s, ArduPilot 4.7 reports that a rover is ready. Then it reports for 17 s that the rover is not ready."""
 
     async def fly() -> None:
         async with on_strings(tmp_path, "rover") as (pilot, puppet):
@@ -321,7 +326,7 @@ def test_vehicle_that_revokes_its_readiness_is_not_ready(tmp_path: Path) -> None
 
 
 def test_pilot_stops_after_handing_over(tmp_path: Path) -> None:
-    """Otherwise, the pilot would request its own mode again."""
+    """If the pilot continued, it would request its own mode again."""
 
     async def fly() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):

@@ -1,4 +1,4 @@
-"""Test a ground station on one UDP port: the frames that it receives, its commands, and its limits."""
+"""Test a ground station on one UDP port: the frames that it receives, the commands that it sends, and its limits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def ask(sysid: int) -> bytes:
 
 
 class Field:
-    """Two vehicles, 3 and 4, and a ground station. All are sockets that the test controls."""
+    """Vehicles 3 and 4, and a ground station. The test controls their sockets."""
 
     def __init__(self) -> None:
         self.ground = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -56,7 +56,7 @@ class Field:
         return self.station
 
     async def said(self) -> bytes:
-        """Return the next datagram at the ground station."""
+        """Return the next datagram that the ground station receives."""
 
         def receive() -> bytes:
             data, self.peer = self.ground.recvfrom(65536)

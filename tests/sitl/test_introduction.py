@@ -1,4 +1,4 @@
-"""Test the requests for a vehicle's version and parameters, with lost messages."""
+"""Test how the version and the parameters of a vehicle are requested, even if messages are lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test the vehicle's side of the mission protocol with a client that violates it."""
+"""Test the vehicle's part of the mission protocol with a client that violates the protocol."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def item(
 
 
 def answer(cockpit: Cockpit, message: Any) -> tuple[str, int]:
-    """Return the type of the only answer, and its `seq` or `type`."""
+    """Return the type of the only answer, and the value of its field `seq` or `type`."""
     (reply,) = cockpit.tell(message)
     kind = reply.get_type()
     assert (reply.target_system, reply.target_component) == (255, 190)

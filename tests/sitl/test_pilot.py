@@ -125,7 +125,7 @@ def test_vehicle_that_ends_during_take_off_is_given_up_at_once(tmp_path: Path) -
 
 @contextmanager
 def connected_pilot(tmp_path: Path) -> Iterator[tuple[Pilot, ClientChannel]]:
-    """Provide a pilot, and an autopilot's connection with which the test creates its messages."""
+    """Provide a pilot, and the autopilot's end of its connection. The test sends the autopilot's messages."""
     ours, theirs = socket.socketpair()
     pilot = Pilot(3, ours, tmp_path / "3.tlog", 1.0, HOME)
     channel = ClientChannel(Autopilot(3, HOME, 0))

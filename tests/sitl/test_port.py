@@ -1,4 +1,4 @@
-"""Test the limits of the TCP port, in one process in which only the client empties the buffer."""
+"""Test the limits of the TCP port. All code runs in one process, and only the client empties the buffer."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def link(tmp_path: Path) -> Iterator[PilotLink]:
 
 @pytest.mark.parametrize("name", GOOD_S)
 def test_position_is_unknown_until_the_estimate_is_good(name: Name, link: PilotLink) -> None:
-    """A plane first reports a position near 0 N, 0 E, and a rover reports an altitude of 0."""
+    """At first, a plane reports a position near 0 N, 0 E, and a rover reports an altitude of 0."""
     for frame in frames(name):
         link.data_received(frame)
         if (link.state.time_s or 0.0) < GOOD_S[name] - 0.1:
@@ -57,7 +57,9 @@ def test_position_is_unknown_until_the_estimate_is_good(name: Name, link: PilotL
 def test_height_is_relative_to_home_unless_home_is_wrong(
     says: list[tuple[int, int]], height_m: float, link: PilotLink
 ) -> None:
-    """A copter without GPS always reports the same altitude. A rover sets its home before it knows its altitude."""
+    """A copter without GPS always reports the same altitude. A rover sets its home position before it knows its
+    altitude.
+    """
     vehicle, ahrs = mavlink.MAVLink(None, srcSystem=1, srcComponent=1), mavlink.MAV_SYS_STATUS_AHRS
     well = mavlink.MAVLink_sys_status_message(ahrs, ahrs, ahrs, *[0] * 10)
     place = round(HOME.lat_deg * 1e7), round(HOME.lon_deg * 1e7)
@@ -111,7 +113,9 @@ REACHED: dict[Name, list[int]] = {
 
 @pytest.mark.parametrize("name", REACHED)
 def test_reached_item_is_named_and_not_the_speed_command(name: Name) -> None:
-    """ArduPilot 4.7 reports items 2, 3, 5 and 6 of a copter: the take-off, a place, the loiter, and places again."""
+    """ArduPilot 4.7 reports that a copter reached items 2, 3, 5 and 6: the take-off, a waypoint, the loiter, and a
+    waypoint.
+    """
     reached = [int.from_bytes(data[4:6], "big") for event_id, data in logged(name) if event_id == WAYPOINT]
     assert reached == REACHED[name]
 

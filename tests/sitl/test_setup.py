@@ -1,4 +1,4 @@
-"""Test settings of vehicles: parameter and location files, frames and their defaults, debuggers and logs."""
+"""Test the settings of vehicles: files of parameters and locations, frames and their defaults, debuggers and logs."""
 
 from __future__ import annotations
 

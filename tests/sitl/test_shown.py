@@ -1,4 +1,4 @@
-"""Test a computed flight path as a ground station receives it."""
+"""Test the computed flight path in the form in which a ground station receives it."""
 
 from typing import Any
 

@@ -38,7 +38,7 @@ DRIVE = Plan((GoTo(100, 0, speed_ms=3), Loiter(45), GoTo(0, 200), GoTo(0, 0)))
     ],
 )
 def test_track_equals_the_flight_of_the_embedded_vehicle(vehicle_type: VehicleType, plan: Plan) -> None:
-    """Places are transmitted in units of 1e-7 degrees, about a centimetre. Turns of a plane increase the error."""
+    """Positions are sent in units of 1e-7 degrees, about a centimetre. Turns of a plane increase the difference."""
     cockpit = Cockpit(vehicle_type)
     began_s = cockpit.begin(plan)
     computed = track(vehicle_type, plan, heading_deg=HOME.heading_deg, begin_s=began_s)
@@ -101,9 +101,11 @@ def as_points(computed: VehicleTrack) -> list[tuple[float, float, float, float]]
 
 @pytest.mark.parametrize("by", ["mission", "guided"])
 def test_recorded_square_of_a_copter_equals_the_track(by: str) -> None:
-    """The flight is within 2 m of the line. Each side and the landing take as long as computed, within 4 s.
+    """The copter is always within 2 m of the computed path. Each side and the landing take as long as computed, within
+    4 s.
 
-    Times count from the middle of the take-off. This copter is of 2018, and leaves each place sooner than 4.7 does.
+    Times count from the middle of the take-off. The recorded copter is of 2018. It leaves each waypoint sooner than
+    version 4.7.
     """
     real, model = recorded(by), as_points(track("copter", SQUARE))
     line = [place for _, *place in model]
@@ -122,7 +124,9 @@ WAYS: list[By] = ["mission", "guided"]
 @pytest.mark.parametrize("by", WAYS)
 @pytest.mark.parametrize("vehicle_type", OUT_AND_BACK)
 def test_recorded_vehicle_is_within_5_s_of_the_track(vehicle_type: Literal["copter", "rover"], by: By) -> None:
-    """Seconds count from arming. Each computed position is reached within 5 s and 3 m."""
+    """Times count from arming. The vehicle is within 3 m of a position that is computed for a time at most 5 s earlier
+    or later.
+    """
     flown = flight(f"{vehicle_type}-{by}")  # type: ignore[arg-type]
     computed = track(vehicle_type, Plan(OUT_AND_BACK[vehicle_type]), heading_deg=355.4, by=by)
     for second, *place in flown:
@@ -132,7 +136,9 @@ def test_recorded_vehicle_is_within_5_s_of_the_track(vehicle_type: Literal["copt
 
 @pytest.mark.parametrize("by", WAYS)
 def test_recorded_plane_is_near_the_track(by: By) -> None:
-    """The plane is within 80 m of the computed position at the same time, and within 30 m of the computed line."""
+    """The plane is always within 80 m of the position computed for the same time, and within 30 m of the computed
+    path.
+    """
     plan = Plan((TakeOff(50), GoTo(600, 350, speed_ms=20), Loiter(120), GoTo(0, 0), Land()))
     computed = track("plane", plan, heading_deg=353.0, by=by)
     path = [computed.at(quarter / 4)[:2] for quarter in range(1200)]

@@ -1,4 +1,4 @@
-"""Run a few agents in virtual time, with a chosen delay or loss for each delivery."""
+"""Run a few agents in virtual time. For each delivery, a test chooses the delay or the loss."""
 
 import heapq
 import itertools
@@ -12,9 +12,9 @@ from ucp.settings import Settings
 from ucp.trace import HandlerRun
 
 Fate = Callable[[int, int, Message], list[float]]
-"""Function of (sender, receiver, message) that returns the delays of the deliveries in seconds.
+"""A function that returns the delays of the deliveries of a message in seconds.
 
-[] loses the message.
+Its arguments are the sender, the receiver and the message. With an empty list, the message is lost.
 """
 
 INITIAL_DATA = b"test mission"
@@ -44,7 +44,7 @@ class Air:
         self.flush(agent_id)
 
     def fill_block(self, agent_id: int) -> bytes:
-        """Log events until a block is complete, and return its hash."""
+        """Log events until a block is complete, and return the hash of this block."""
         agent = self.agents[agent_id]
         count = len(agent.state.completed)
         while len(agent.state.completed) == count:
@@ -75,7 +75,7 @@ class Air:
         return min(times, default=None)
 
     def step(self) -> bool:
-        """Run the next delivery, timer or event. Return False if none is left."""
+        """Run the next delivery, timer or event. Return false if none is left."""
         time = self.next_time()
         if time is None:
             return False

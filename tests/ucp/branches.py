@@ -1,7 +1,7 @@
 """List the tests that take each branch of the 20 event handlers. `python -m tests.ucp.branches` writes BRANCHES.md.
 
-A test declares its branches, for example `@takes("vote_timer_expiration", "approved", "chain changed")`. It fails if no
-agent takes them while it runs (`conftest.py`). `test_branches.py` fails if a branch has no such test.
+A test declares its branches, for example `@takes("vote_timer_expiration", "approved", "chain changed")`. The test fails
+if no agent takes these branches while it runs (`conftest.py`). `test_branches.py` fails if a branch has no such test.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -162,7 +162,7 @@ WHEN: dict[str, dict[str, str]] = {
 def takes(handler: str, *branches: str) -> pytest.MarkDecorator:
     """Return a pytest marker which declares that a test takes these branches of `handler`.
 
-    It can be repeated, and used as a mark of a `pytest.param`.
+    A test may have several such markers. A `pytest.param` may have the marker, too.
     """
     return pytest.mark.branch(handler=handler, branches=branches)
 
@@ -196,7 +196,7 @@ def recorded() -> Iterator[set[Branch]]:
 
 
 def taken_by() -> dict[Branch, list[str]]:
-    """Return the tests in this folder that take each branch. Tests that may be skipped do not count."""
+    """Return, for each branch, the tests in this folder that take it. Tests that may be skipped do not count."""
     tests: dict[Branch, list[str]] = {}
     for path in sorted(Path(__file__).parent.glob("test_*.py")):
         for name, test in _tests_in(import_module(f"{__package__}.{path.stem}")):

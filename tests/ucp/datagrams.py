@@ -1,4 +1,4 @@
-"""Create random messages with real events in their blocks, and damaged datagrams."""
+"""Create random messages whose blocks contain valid events, and damaged datagrams."""
 
 from hypothesis import strategies as st
 
@@ -21,7 +21,9 @@ datagrams = st.builds(encode, senders, sequences, all_messages)
 
 @st.composite
 def damaged(draw: st.DrawFn) -> bytes:
-    """Draw a datagram with changed bytes (mostly near its beginning), a missing end, or additional bytes."""
+    """Draw a datagram that is damaged. It has changed bytes (mostly near its beginning), a missing end, or additional
+    bytes.
+    """
     datagram = bytearray(draw(datagrams))
     for _ in range(draw(st.integers(0, 3))):
         place = draw(st.integers(0, 16) | st.integers(0, len(datagram) - 1))

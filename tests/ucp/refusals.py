@@ -20,14 +20,18 @@ VECTORS: dict[str, Any] = json.loads((DIRECTORY / "refusals.json").read_text(enc
 
 
 def expected(vector: dict[str, Any], features: Sequence[str]) -> str:
-    """Return the answer of an agent with these features: "plays", "lacks" or "wrong"."""
+    """Return the expected answer of an agent with these features.
+
+    "plays" means that the agent accepts the mission. "lacks" means that it needs a feature which the agent lacks.
+    "wrong" means that it is invalid.
+    """
     if not {*vector["needs"]} <= {*features}:
         return "lacks"
     return "plays" if vector["plays"] else "wrong"
 
 
 def wrong_missions(command: list[str], features: Sequence[str]) -> list[tuple[str, Any]]:
-    """Return the missions that the agent answers incorrectly in virtual time, with its answers."""
+    """Give the agent the missions in virtual time. Return each mission that it answers incorrectly, with its answer."""
     differences = []
     with Player(command) as player:
         for vector in VECTORS["missions"]:
@@ -39,7 +43,9 @@ def wrong_missions(command: list[str], features: Sequence[str]) -> list[tuple[st
 
 
 def wrong_exits(command: list[str], features: Sequence[str], place: Path) -> list[tuple[str, int]]:
-    """Return the missions for which the agent program has the wrong exit status."""
+    """Give the agent program the mission files. Return each mission for which it has the wrong exit status, with this
+    status.
+    """
     status = {"lacks": UNSUPPORTED, "wrong": WRONG_MISSION}
     differences = []
     path = place / "7.mission.json"
@@ -57,7 +63,9 @@ def wrong_exits(command: list[str], features: Sequence[str], place: Path) -> lis
 
 
 def wrong_answers(command: list[str], place: Path) -> list[tuple[str, Any]]:
-    """Return the requests that the agent answers incorrectly on its control socket, with its answers."""
+    """Give the agent requests on its control socket. Return each request that it answers incorrectly, with its
+    answer.
+    """
     differences = []
     with _served(command, place) as client, client.makefile("rwb") as stream:
         for vector in VECTORS["requests"]:

@@ -1,4 +1,4 @@
-"""Test properties of an agent after each step, for any behaviour of radio, clock and neighbours."""
+"""Test properties that hold after each step of an agent, for any behaviour of the radio, the clock and other agents."""
 
 import base64
 import pickle
@@ -18,7 +18,7 @@ from ucp.trace import DroppedDatagram
 
 
 def state_of(agent: Agent) -> bytes:
-    """Return the state without the counters of received and dropped datagrams."""
+    """Return the agent's state without the counters of received and dropped datagrams."""
     state = {name: value for name, value in vars(agent.state).items() if name not in ("now", "running")}
     return pickle.dumps({**state, "chain": vars(agent.state.chain), "trace": vars(agent)["_trace"]})
 

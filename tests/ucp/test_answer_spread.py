@@ -1,4 +1,4 @@
-"""Test the delay of answers by the setting `answer_spread_s`."""
+"""Test the setting `answer_spread_s`, which delays answers."""
 
 import pytest
 

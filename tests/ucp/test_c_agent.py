@@ -1,4 +1,6 @@
-"""Test the agent in C (`ucp/contract/examples/ucp_agent.c`): the duties of any agent, and errors typical of C."""
+"""Test the agent in C (`ucp/contract/examples/ucp_agent.c`): the requirements for any agent, and errors that are
+typical of C.
+"""
 
 import json
 import os
@@ -133,7 +135,7 @@ def test_agent_answers_ambiguous_requests_as_in_the_vectors(checked: Path, tmp_p
 
 
 def test_c_agent_passes_generated_vectors(agent: Path) -> None:
-    """Each generated path is a list of states with their inputs, from the mission to the end."""
+    """Each generated path is a list of states with their inputs. It leads from the mission to the end."""
     steps = list(explore(VARIANTS["default"]))[::8]
     lines = to_lines([VectorSet(VARIANTS["default"], steps, {step.key: step for step in steps})])
     by_number = {step["step"]: step for step in map(json.loads, lines) if "step" in step}
@@ -204,7 +206,7 @@ def test_c_agent_refuses_a_mission_in_one_sentence(
 
 
 def test_hostile_lines_do_not_harm_the_c_agent(checked: Path) -> None:
-    """The agent answers damaged input lines, and leaks no memory."""
+    """The agent answers damaged input lines without leaking memory."""
     random = Random(1)
     lines = []
     for transcript in sorted(INDEX.parent.glob("*.jsonl")):
@@ -274,7 +276,7 @@ SECURED_RUN: dict[str, Any] = {
 
 
 def test_secured_c_agent_sends_the_same_bytes_as_our_agent(secured: Path) -> None:
-    """The mission is encrypted, and contains a reboot, an exclusion and repeated datagrams."""
+    """The mission is encrypted, and contains a reboot, an excluded vehicle and repeated datagrams."""
     ours = scenario(agents=4, security={"seal": True}, **SECURED_RUN)
     mixed = ours.model_copy(update={"agent_command": {1: [str(secured)], 3: [str(secured)]}})
     played, among_ours = simulate(mixed, 1, tracing=True), simulate(ours, 1, tracing=True, deliver_all=True)

@@ -162,7 +162,7 @@ def test_vote_that_ends_during_a_reconcile_is_repeated_after_it() -> None:
 
 @takes("vote_timer_expiration", "chain changed")
 def test_an_approved_vote_is_repeated_when_the_chain_changed_meanwhile() -> None:
-    """Otherwise the agent would become idle with a block in its deque (characteristic 2)."""
+    """If the vote were not repeated, the agent would become idle with a block in its deque (characteristic 2)."""
     air = Air([1, 2, 3])
     first = air.fill_block(1)
     air.run_until(5.0)
@@ -249,7 +249,7 @@ def test_a_commit_that_does_not_succeed_the_top_is_not_followed() -> None:
 
 @takes("receive_commit_block", "held already")
 def test_a_second_copy_of_a_block_is_never_committed() -> None:
-    """No correct agent sends one. Characteristic 3 holds nevertheless."""
+    """No correct agent sends a second copy. Characteristic 3 holds even if an agent does."""
     air = Air([1, 2])
     air.fill_block(2)
     air.settle()

@@ -1,4 +1,4 @@
-"""Test that the schemas and test vectors of the agent contract agree with the code, and that its page explains all
+"""Test that the schemas and test vectors of the agent contract agree with the code, and that the contract explains all
 names.
 """
 
@@ -102,7 +102,7 @@ def test_mission_file_on_the_page_is_valid() -> None:
 
 @pytest.fixture(scope="module")
 def left(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Document]]]:
-    """Return the inputs of an agent, its outputs, and its files."""
+    """Play a mission with an agent. Yield its inputs, its outputs, and the content of its files."""
     directory = tmp_path_factory.mktemp("agent")
     document = mission()
     agent = AgentUnderTest(directory, document)

@@ -1,4 +1,4 @@
-"""Compare the agent's own dataclasses with those of the standard library."""
+"""Compare the dataclass decorator of `ucp` with that of the standard library."""
 
 import copy
 import dataclasses

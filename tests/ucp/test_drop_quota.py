@@ -1,4 +1,4 @@
-"""Floods of datagrams that an agent drops."""
+"""Test the quota for dropped datagrams in the trace of an agent, with floods of datagrams."""
 
 from collections import Counter
 from itertools import pairwise

@@ -41,7 +41,10 @@ RUNS = {
     "asking": {"network": {"loss": 0.25}, "settings": {"asks_after_commit": True}},
 }
 HELD_ALREADY = ("reconcile_phase_3", "Reconcile Finalize")
-"""Return an agent whose mutual successor is already in its chain. Correct agents never reach this state."""
+"""The handler and the event of an agent whose mutual successor is already in its chain.
+
+Correct agents never reach this state.
+"""
 
 
 def traces(**keys: Any) -> Iterator[Trace]:
@@ -52,7 +55,11 @@ def traces(**keys: Any) -> Iterator[Trace]:
 
 
 def done(trace: Trace, handlers: dict[str, EventHandler[Any]]) -> Iterator[tuple[str, str]]:
-    """Yield (handler, sent message, started timer or triggered event) for a trace. Fail at the first undeclared one."""
+    """Yield what each handler in a trace does, as pairs of the handler and an action. Fail if an action is not
+    declared.
+
+    An action is the name of a sent message, of a started timer or of a triggered event.
+    """
     for life in trace.incarnations():
         ran: set[str] = set()
         for number, run in life:
@@ -110,7 +117,7 @@ def test_undeclared_action_of_a_handler_raises_an_error() -> None:
 
 
 def test_each_algorithm_has_one_handler_in_one_table() -> None:
-    """The pause between two commits of Algorithm 20 (Section 4.2) ends with a timer."""
+    """The pause between two commits in Algorithm 20 (Section 4.2) also ends with a timer, which has its own handler."""
     assert [handler.algorithm for handler in HANDLERS.values()] == list(range(1, 21))
     tabled = [handler.name for table in (ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT) for handler in table.values()]
     assert sorted(tabled) == sorted([*HANDLERS, "reconcile_finalize"])
@@ -149,7 +156,7 @@ def test_driver_interface_offers_no_operation_on_the_state() -> None:
 
 
 def test_no_module_of_ucp_imports_in_a_circle() -> None:
-    """Imports for type checking count too. The CycleError names the circle."""
+    """Imports for type checking count too. The CycleError of `graphlib` names the circle."""
     folder = Path(ucp.__path__[0])
     modules = {path.stem: imported(path) for path in folder.glob("*.py")}
     order = list(TopologicalSorter(modules).static_order())

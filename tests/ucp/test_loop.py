@@ -75,7 +75,7 @@ class Client:
         self.heard = b""
 
     def hear(self) -> bool:
-        """Return true if the server has closed the connection."""
+        """Return whether the server has closed the connection."""
         try:
             data = self.socket.recv(1 << 20)
         except BlockingIOError:

@@ -1,4 +1,4 @@
-"""Test the encoding of messages: an encoded message can be decoded, and other bytes are rejected."""
+"""Test the encoding of messages: each encoded message can be decoded, and other bytes are rejected."""
 
 import pytest
 from hypothesis import given

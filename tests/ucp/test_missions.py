@@ -1,4 +1,4 @@
-"""Test missions of the thesis (Section 4.3) in virtual time: five agents, 20 minutes."""
+"""Test missions of the thesis (Section 4.3) in virtual time. Five agents run for 20 minutes."""
 
 from random import Random
 
@@ -48,7 +48,10 @@ def test_final_reconcile_makes_one_chain_after_15_percent_loss(seed: int) -> Non
 
 
 def mutual_share(loss: float, seeds: range = range(5)) -> float:
-    """Return the share of all blocks that all chains have in common, as the mean over a few missions."""
+    """Return the number of blocks that all chains have in common, divided by the number of completed blocks.
+
+    The result is the mean over a few missions.
+    """
     shares = []
     for seed in seeds:
         air = mission(loss, seed)
@@ -58,9 +61,9 @@ def mutual_share(loss: float, seeds: range = range(5)) -> float:
 
 
 def test_chains_diverge_as_in_section_4_3() -> None:
-    """All agents have one chain up to a loss of 0.15.
+    """Up to a loss of 0.15, the chains of all agents are nearly equal.
 
-    From 0.30 chains diverge, and from 0.50 they share hardly a block.
+    From a loss of 0.30, the chains diverge. From 0.50, they have hardly a block in common.
     """
     assert mutual_share(0.15) > 0.85
     assert 0.3 < mutual_share(0.30) < 0.9

@@ -46,7 +46,7 @@ NEEDED = {
     ),
     *("_drop_quota", "plain_file", "sealed", "_status", "store", "timers", "trace", "trigger", "wire"),
 }
-"""The modules of `ucp` that each agent imports."""
+"""The modules of `ucp` that every agent imports."""
 
 
 def free_port() -> int:
@@ -101,7 +101,7 @@ class AgentUnderTest:
             time.sleep(0.005)
 
     def send(self, datagram: bytes) -> None:
-        """Send a datagram from an address other than the agent's, which ignores its own datagrams."""
+        """Send a datagram to the agent from another address. The agent ignores datagrams from its own address."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.bind(("127.0.0.2", 0))
             sock.sendto(datagram, ("127.0.0.1", self.document["network"]["port"]))
@@ -109,7 +109,7 @@ class AgentUnderTest:
 
 @pytest.fixture
 def directory(tmp_path: Path) -> Path:
-    """Return a directory whose path is longer than the address of a Unix socket."""
+    """Return a directory whose path is longer than the path of a Unix socket may be."""
     deep = tmp_path / ("d" * 100) / "agents"
     deep.mkdir(parents=True)
     return deep
@@ -147,7 +147,7 @@ def test_agent_waits_for_start_and_then_commits_and_exports_blocks(directory: Pa
 
 
 def test_agent_imports_only_the_modules_that_it_needs(directory: Path) -> None:
-    """Modules that the mission does not need would delay the start and take memory."""
+    """Other modules would make the start slower and need memory."""
     loaded = modules_of(directory, mission(events={"source": "random"}))
     assert not loaded & {"asyncio", "logging", "ssl", "subprocess", "threading", "pymavlink", "scapy", "difflib"}
     assert not loaded & {"dataclasses", "inspect", "hashlib", "_hashlib"}
@@ -166,7 +166,7 @@ def test_agent_imports_modules_for_the_features_of_its_mission(
 
 
 def modules_of(directory: Path, document: dict[str, Any]) -> set[str]:
-    """Return the modules that an agent has imported at the end of a started mission."""
+    """Play a short mission, and return the modules that the agent has imported at its end."""
     path = directory / "7.mission.json"
     path.write_text(json.dumps(document | {"epoch_us": round(time.time() * 1e6)}))
     command = [sys.executable, "-X", "importtime", "-m", "ucp.node", str(path)]
@@ -386,7 +386,7 @@ def test_agent_plays_a_later_contract_without_new_features() -> None:
 
 
 def test_a_killed_agent_leaves_no_half_export(directory: Path) -> None:
-    """The export is replaced completely or not at all, even if the agent is killed at any time."""
+    """If the agent is killed at any time, the old export or the complete new export remains."""
     rng = Random(5)
     for _ in range(5):
         agent = AgentUnderTest(directory, mission(events={"source": "random", "mean_s": 1.0}))
@@ -453,7 +453,9 @@ sys.exit(agent.process.wait(10))
 
 
 def test_killed_agent_continues_from_its_store(directory: Path, tmp_path: Path) -> None:
-    """After a kill at any time, the agent has its completed blocks, and rejoins the running mission."""
+    """The agent is killed at any time. When it starts again, it has its completed blocks and rejoins the active
+    mission.
+    """
     epoch_us = round(time.time() * 1e6)
     document = mission(events={"source": "random", "mean_s": 1.0}, epoch_us=epoch_us, store="../7.store")
     known: list[str] = []
@@ -480,7 +482,7 @@ def test_killed_agent_continues_from_its_store(directory: Path, tmp_path: Path) 
 
 
 def test_agent_writes_trace_and_store_before_it_sends(tmp_path: Path) -> None:
-    """If it is killed after sending, other agents have already received the message."""
+    """If the agent is killed after it sends a message, other agents may have received this message."""
     sent = []
 
     class Radio:
@@ -601,7 +603,7 @@ def test_error_names_the_file_or_the_port_that_is_unavailable(directory: Path) -
 
 
 def test_agent_that_joins_late_logs_no_earlier_events(directory: Path) -> None:
-    """Otherwise it would log all events of the mission at once."""
+    """If the agent logged them, it would log all events since the start of the mission at once."""
     epoch_us = round((time.time() - 100) * 1e6)
     agent = AgentUnderTest(directory, mission(events={"source": "random", "mean_s": 20.0}, epoch_us=epoch_us))
     agent.wait_for(lambda: agent.ask("status")["handled"] > 3)

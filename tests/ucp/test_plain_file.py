@@ -1,4 +1,4 @@
-"""Files of unknown origin: no special files, limited size, limited JSON."""
+"""Test the reader of files from unknown sources: it refuses special files, large files and deeply nested JSON."""
 
 import os
 from pathlib import Path

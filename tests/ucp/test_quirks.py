@@ -16,7 +16,7 @@ from ucp.messages import BlockAddResponse
 from ucp.quirks import CRASHED, QUIRKS, active_quirks, check_quirk, wrong_handlers
 
 CRASHING = {"break_off_commit", "break_off_broadcast", "crash_on_tie"}
-"""Quirks whose mistake is an exception."""
+"""Deliberate errors that raise an exception."""
 INDIRECTLY_CRASHING = {
     "keep_committed_block",
     "commit_others_twice",
@@ -24,7 +24,7 @@ INDIRECTLY_CRASHING = {
     "ask_for_what_is_held",
     "take_any_block",
 }
-"""Quirks whose mistake leads to a state in which a good handler raises an exception."""
+"""Deliberate errors that lead to a state in which a correct handler raises an exception."""
 
 
 def value(quirk: str) -> float | bool:
@@ -33,7 +33,9 @@ def value(quirk: str) -> float | bool:
 
 @cache
 def traces(seed: int, quirk: str | None) -> dict[int, Trace]:
-    """Return the traces of a swarm with loss, duplicated messages, diverged chains and long deques."""
+    """Return the traces of a swarm with this error. The mission has loss, duplicates, diverged chains and long
+    deques.
+    """
     difficult = scenario(
         duration_s=450,
         network={"loss": 0.25, "duplicate": 0.2},
@@ -79,7 +81,7 @@ def test_error_for_an_unknown_quirk_lists_similar_names() -> None:
 
 
 def agent_with_a_tied_vote() -> Agent:
-    """Return an agent that has proposed a block and received one disapproval, next to its own approval."""
+    """Return an agent that has proposed a block. It has approved the block itself and received one disapproval."""
     agent = Agent(1, [1, 2], b"")
     while agent.state.candidate_block is None:
         agent.add_event(LoggableEvent(1, 1, bytes(256)), 0.0)

@@ -24,7 +24,7 @@ from ucp.settings import Settings
 
 
 def part(*groups: set[int]):
-    """Return a network in which an agent receives only messages of its group."""
+    """Return a network in which each agent receives only messages of its own group."""
     latency = uniform_latency(Random(2))
     return lambda sender, receiver, message: (
         latency(sender, receiver, message) if any({sender, receiver} <= group for group in groups) else []
@@ -32,7 +32,7 @@ def part(*groups: set[int]):
 
 
 def diverged(blocks_on_2: int = 1, **settings: object) -> Air:
-    """Return three agents. 2 and 3 have the same chain, and 1 has a different chain of one block."""
+    """Return three agents. Agents 2 and 3 have the same chain. Agent 1 has a different chain of one block."""
     air = Air([1, 2, 3], fate=part({1}, {2, 3}), settings=Settings(**settings))
     air.fill_block(1)
     for _ in range(blocks_on_2):
@@ -147,7 +147,9 @@ def test_a_vote_against_a_diverged_chain_starts_the_reconcile() -> None:
 
 @takes("reconcile_phase_3", "from the stack")
 def test_block_on_the_stack_is_committed_without_a_request() -> None:
-    """Agents 2 and 3 have agent 1's first block on top of theirs. Phase 3 finds it on agent 1's stack."""
+    """Agents 2 and 3 have agent 1's first block on top of their chains. Phase 3 of agent 1 finds the block on its
+    stack.
+    """
     air = diverged()
     own = next(iter(air.agents[1].state.chain))
     for agent in (air.agents[2], air.agents[3]):
@@ -160,7 +162,7 @@ def test_block_on_the_stack_is_committed_without_a_request() -> None:
 
 @takes("receive_request_next_in_sequence", "diverged")
 def test_queried_agent_without_the_chain_starts_a_reconcile() -> None:
-    """Agent 3 missed a block. It notices this when it receives agent 1's phase 2 query (Algorithm 13)."""
+    """Agent 3 missed a block. It notices this when it receives the phase 2 query of agent 1 (Algorithm 13)."""
     air = Air([1, 2, 3], fate=part({1, 2}, {3}))
     air.fill_block(1)
     air.settle()
@@ -236,7 +238,7 @@ def test_tie_in_phase_1_continues_with_phase_2_or_pops(phase1_tie: str, expected
 
 
 def in_phase_2(agents: int, **settings: object) -> Air:
-    """Return agents without a network. Agent 1 asked for the block after the inception block at 5 s."""
+    """Return agents that cannot reach each other. At 5 s, agent 1 has asked for the block after the inception block."""
     air = Air(range(1, agents + 1), fate=lambda *_: [], settings=Settings(**settings))
     agent = air.agents[1]
     agent.begin_reconcile(0.0)
@@ -246,7 +248,11 @@ def in_phase_2(agents: int, **settings: object) -> Air:
 
 
 def phase_2(answers: list[tuple[bytes | None, int]], **settings: object) -> tuple[Air, str]:
-    """Give agent 1 an answer of phase 2 (block hash, timestamp) from each of the agents 2, 3, ..."""
+    """Give agent 1 these answers of phase 2 from the agents 2, 3 and so on. Return the swarm, and the branch that ends
+    phase 2.
+
+    An answer is a block hash and a timestamp.
+    """
     air = in_phase_2(len(answers) + 1, **settings)
     agent = air.agents[1]
     for sender, (block_hash, timestamp_us) in enumerate(answers, start=2):
@@ -320,7 +326,9 @@ def test_setting_top_needs_majority_requires_a_majority(
 
 @takes("receive_response_next_in_sequence", "counted already", "another chain")
 def test_phase_2_counts_each_responder_once_for_the_queried_chain() -> None:
-    """A repeated answer and an answer about another chain do not count, so A and the older B tie."""
+    """A repeated answer and an answer about another chain do not count. Therefore the blocks A and B have equally many
+    votes, and B is older.
+    """
     air = in_phase_2(agents=4)
     agent = air.agents[1]
     top = agent.state.chain.top_chain_hash

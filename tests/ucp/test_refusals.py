@@ -1,4 +1,4 @@
-"""Test that the agent of the harness treats ambiguous missions and requests as the test vectors require."""
+"""Test that the agent of the harness answers ambiguous missions and requests as the test vectors require."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,6 @@
-"""Test that the scapy layers and the codec implement the same format: both read and reject the same bytes."""
+"""Test that the scapy layers and the codec implement the same format. Both read the same datagrams and reject the same
+bytes.
+"""
 
 import subprocess
 import sys
@@ -58,7 +60,7 @@ def crafted_events(event_data: bytes) -> list[Packet]:
 
 
 def crafted(message: Message) -> Packet:
-    """Return a message as a scapy layer, created from its fields by name."""
+    """Return a message as a scapy layer. The layer is created from the fields of the message by their names."""
     fields: dict[str, Any] = {name: getattr(message, name) for name in message.WIRE}
     if "block" in fields:
         fields["block"] = crafted_block(fields["block"])

@@ -1,4 +1,6 @@
-"""Test that the declarations of settings agree with the fields, the TLA+ specification and the error messages."""
+"""Test that the declarations of settings agree with the dataclass fields, the TLA+ specification and the error
+messages.
+"""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Test the stored data of an agent, and its continuation after a reboot."""
+"""Test the stored data of an agent, and that the agent continues from them after a reboot."""
 
 import errno
 import os
@@ -35,7 +35,7 @@ class StoringAir(Air):
 
 
 def a_store(path: Path, blocks: int = 5) -> AgentState:
-    """Write a store whose agent has committed `blocks` blocks and completed one more. Return its state."""
+    """Write the stored data of an agent that has committed `blocks` blocks and completed one more. Return its state."""
     core = Core(1, INITIAL_DATA, Settings())
     store = Store(path, core)
     for number in range(blocks + 1):
@@ -67,7 +67,7 @@ def test_store_always_equals_the_state_of_the_agent(tmp_path: Path) -> None:
 
 
 def test_booted_agent_has_its_blocks_and_commits_completed_ones() -> None:
-    """Power losses during votes and reconciles of a lossy mission lose and duplicate no block."""
+    """In a mission with loss, power failures during votes and reconciles neither lose nor duplicate a block."""
     air = Air([1, 2, 3], uniform_latency(Random(2), loss=0.3))
     air.generate_events(seed=2, mean_s=5.0)
     rng = Random(3)

@@ -49,7 +49,9 @@ def position_msg(ms: int = 60_000, lat: int = -353632620, lon: int = 1491652370)
 
 
 def good_estimate() -> Any:
-    """Return a SYS_STATUS message with a good position estimate. Without it, positions are not logged."""
+    """Return a SYS_STATUS message which reports that the position estimate is good. Without it, positions are not
+    logged.
+    """
     bit = mavlink.MAV_SYS_STATUS_AHRS
     return mavlink.MAVLink_sys_status_message(bit, bit, bit, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)
 
@@ -112,7 +114,7 @@ def test_event_data_never_exceeds_its_limit() -> None:
 
 
 def positions(events: TelemetryEvents, seconds: int) -> list[float]:
-    """Pass a position every tenth of a second to the converter, and return the times of the position events."""
+    """Give the converter a position every tenth of a second, and return the times of the resulting position events."""
     data = frames(good_estimate(), position_msg())
     return [now / 10 for now in range(10 * seconds) if events.receive(data, now / 10)]
 

@@ -1,4 +1,4 @@
-"""Test the selection of event kinds in a scenario, in the mission file, and in the agent."""
+"""Test the key that selects kinds of events in a scenario and in a mission file, and its effect on the agent."""
 
 import base64
 import json

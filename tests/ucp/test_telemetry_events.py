@@ -1,4 +1,6 @@
-"""Test events in a vehicle's stream, such as waypoints, failsafes and battery levels, and their text."""
+"""Test the events that a vehicle's messages cause, such as waypoints, failsafes and battery levels, and their
+descriptions.
+"""
 
 import random
 import struct
@@ -97,7 +99,7 @@ def test_breached_fence_is_a_failsafe_although_it_is_not_critical() -> None:
     ("bit", "name"), [(mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG, "compass"), (mavlink.MAV_SYS_STATUS_SENSOR_GPS, "GPS")]
 )
 def test_sensor_lost_in_flight_is_a_failsafe_although_not_critical(bit: int, name: str) -> None:
-    """ArduPilot 4.7 reports a lost compass, and a plane also a lost GPS, only with this bit."""
+    """ArduPilot 4.7 reports a lost compass only with this bit. For a plane, this is also true for a lost GPS."""
     lost = mavlink.MAVLink_sys_status_message(ALL | bit, ALL | bit, ALL, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)
     assert event_texts(source("failsafe"), heartbeat(ACTIVE), lost) == [f"[0.0 s] failsafe, active: {name}"]
 
@@ -114,7 +116,7 @@ def test_other_unhealthy_sensors_are_no_failsafe() -> None:
 
 
 def levels(percentages: Iterable[int]) -> list[int]:
-    """Return the percentages of the battery at which an event occurs."""
+    """Return the percentages of the battery's charge at which an event occurs."""
     events = source("battery")
     return [left for left in percentages if events.receive(frames(status(left=left)), 0.0)]
 
@@ -167,7 +169,7 @@ def test_default_kinds_are_mode_arming_text_and_position() -> None:
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
 def test_events_of_kinds_that_are_not_selected_are_not_logged(kind: EventKind) -> None:
-    """If only this kind is selected, its events are the same as if all kinds are selected."""
+    """If only one kind is selected, its events are the same as with all kinds."""
     stream = [
         frames(heartbeat(CRITICAL), status(RADIO, 50), mavlink.MAVLink_mission_item_reached_message(2), position_msg()),
         frames(

@@ -22,7 +22,7 @@ def test_paused_timer_keeps_its_remaining_time() -> None:
 
 
 def test_expired_timers_are_handled_in_order_of_their_deadlines() -> None:
-    """A late agent handles the expiry of a vote before the later expiry of a phase, and each of them once."""
+    """A late agent handles the expiry of a vote before the later expiry of a phase. It handles each of them once."""
     air = Air([1, 2], fate=lambda *_: [])
     air.fill_block(1)
     agent = air.agents[1]

@@ -1,4 +1,4 @@
-"""Test that each kind of trigger is read from a trace and written as the same object."""
+"""Test that a trigger of each kind can be written to a trace and read from it without a change."""
 
 from typing import Any
 

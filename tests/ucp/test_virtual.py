@@ -1,4 +1,4 @@
-"""Test the agent in virtual time: refused inputs change nothing."""
+"""Test the program of the agent in virtual time: an input that it refuses changes nothing."""
 
 import io
 import json

@@ -69,7 +69,9 @@ def frame(datagram: bytes) -> bytes:
 
 
 def tshark(folder: Path, frames: Sequence[bytes], *options: str, captured: int | None = None) -> str:
-    """Return the output of tshark for these frames, of which `captured` bytes were captured (None means all)."""
+    """Return the output of tshark for these frames. `captured` is the number of captured bytes of each frame (None for
+    all).
+    """
     program = require_tshark()
     capture = folder / "air.pcap"
     with RawPcapWriter(str(capture), linktype=1) as writer:
@@ -86,7 +88,7 @@ def tshark(folder: Path, frames: Sequence[bytes], *options: str, captured: int |
 
 
 def layers(folder: Path, datagrams: Sequence[bytes], captured: int | None = None) -> list[dict[str, Any]]:
-    """Return the dissector's tree for each datagram, with `captured` bytes of each frame."""
+    """Return the dissector's tree for each datagram. Only `captured` bytes of each frame are captured."""
     options = ("-T", "json", "-J", "ucpchain", "--no-duplicate-keys")
     packets = json.loads(tshark(folder, [frame(datagram) for datagram in datagrams], *options, captured=captured))
     return [packet["_source"]["layers"]["ucpchain"] for packet in packets]
@@ -103,7 +105,7 @@ def experts(tree: Any) -> dict[str, str]:
 
 
 def shown(prefix: str, values: dict[str, Any]) -> dict[str, Any]:
-    """Return values in the form in which tshark shows them. Omitted fields are not shown."""
+    """Return values in the form in which tshark shows them. Fields that tshark does not show are left out."""
     text: dict[str, Any] = {}
     for name, value in values.items():
         if isinstance(value, Block):

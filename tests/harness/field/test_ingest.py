@@ -1,4 +1,6 @@
-"""Test the function that reads the files of a flight: it groups records by their content, and uses every usable part."""
+"""Test the function that reads the files of a flight. It groups records by their content, and uses every usable
+part.
+"""
 
 import base64
 import gzip

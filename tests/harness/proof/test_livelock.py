@@ -76,8 +76,8 @@ def test_cycle_is_found_in_an_incomplete_graph(tmp_path: Path, monkeypatch: pyte
 
 
 def test_only_one_block_of_the_livelock_has_a_fixed_time(tmp_path: Path) -> None:
-    """The first blocks of both agents must be completed directly after each other. The time of the other blocks does
-    not matter until the vote is decided.
+    """The first blocks of both agents must be completed directly after each other. The other blocks may be completed at
+    any time before the vote is decided.
     """
     proof = prove(Bounds(2, 4, "lossless"), out=tmp_path / "round.yaml")
     completions = proof.livelocks[0].completions

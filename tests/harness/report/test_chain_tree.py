@@ -1,4 +1,4 @@
-"""Test the tree of chains that agree, diverge, or end early."""
+"""Test the tree of chains. Chains in it agree, diverge, or end early."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Test that agents' colours differ, and that labels on them are readable."""
+"""Test that agents have different colours, and that labels on these colours are readable."""
 
 from harness.present.colours import contrast, inks
 

@@ -1,4 +1,4 @@
-"""Test that each figure of the thesis has its story in tests/stories, and that the guide names each."""
+"""Test that each figure of the thesis has a story in tests/stories, and that the guide names each story."""
 
 import re
 from pathlib import Path
@@ -25,11 +25,11 @@ IN_NO_FIGURE = {
     "reconcile_phase_3": {"held already"},
     "reconcile_finalize": {"asked who follows"},
 }
-"""Branches of the harness for cases that the thesis does not cover."""
+"""Branches that the harness adds for cases which the thesis does not cover."""
 
 
 def story_with_answers(story: Story, directory: Path, seed: int = 1) -> str:
-    """Return the text of the story as it is played in virtual time."""
+    """Play the story in virtual time, and return its text with the reactions of the agents in this run."""
     run(story.in_virtual_time, seed, directory, SilentProgress(), "sim", delivers_all=True)
     narrator = StoryWriter(RunArchive(directory).traces, story.scenario.roster)
     return story.with_answers([narrator.answer(section) for section in story.sections])
@@ -95,7 +95,7 @@ def test_wrong_agent_changes_the_story(tmp_path: Path, figure: str, quirk: str, 
 
 @pytest.mark.parametrize("path", sorted(STORIES.glob("*.story")), ids=lambda path: path.stem)
 def test_sentences_do_not_coincide_with_the_end_of_a_timer(path: Path) -> None:
-    """The order of two simultaneous inputs would depend on chance between real processes."""
+    """If two inputs are simultaneous, their order depends on chance in runs with real processes."""
     text = path.read_text()
     told_at = {*re.findall(r"^(\d+) s: ", text, re.MULTILINE)}
     instants = re.split(r"^    at (\d+) s\n", text, flags=re.MULTILINE)[1:]

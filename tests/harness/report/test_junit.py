@@ -22,7 +22,7 @@ from tests.harness.report.live.runs import film
 from tests.harness.report.runs import result_of, write_run
 
 Case = tuple[str, str, str] | None
-"""Tag, message and text of the element in a test case; None if it passed."""
+"""The tag, message and text of the element in a test case. The value is None if the test case passed."""
 
 
 def suite_of(result: dict[str, Any]) -> ElementTree.Element:
@@ -40,7 +40,7 @@ def cases(result: dict[str, Any]) -> dict[str, Case]:
 
 
 def judged(number: str, **keys: Any) -> dict[str, Any]:
-    """Return a result in which one characteristic has these values, and the others hold."""
+    """Return a result in which one characteristic has this judgement, and all others hold."""
     result = result_of([1, 2, 3])
     for one in result["characteristics"].values():
         one["verdict"] = "holds"

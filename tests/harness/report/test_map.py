@@ -84,7 +84,7 @@ def test_the_moments_are_begin_changes_and_end_with_the_live_links(tmp_path: Pat
 
 
 def test_links_are_drawn_and_described_by_their_loss(tmp_path: Path) -> None:
-    """All vehicles are connected, but most messages are lost."""
+    """All vehicles are connected, but they lose most of the messages."""
     section = drawn(tmp_path, network={"loss": 0.98, "radio": {"hard_range": {"range_m": 2000}}})
     assert said(section)[0] == "0 s all 5 connected, links lose 98 %"
     assert 'class="link whole q3"' in section.moments[0].picture
@@ -104,7 +104,9 @@ def test_each_type_of_vehicle_has_its_shape(tmp_path: Path) -> None:
 
 
 def test_a_known_track_gives_the_known_path(tmp_path: Path) -> None:
-    """A square of 200 m, flown north, east, south and west, is drawn up, right, down and left."""
+    """A flight around a square of 200 m leads north, east, south and west. The map shows it as up, right, down and
+    left.
+    """
 
     def square(at_s: float) -> tuple[float, float]:
         side, along = int(at_s // 50) % 4, at_s % 50 * 4

@@ -72,7 +72,9 @@ def test_no_point_is_farther_from_the_thinned_line_than_the_tolerance(line: list
 
 
 def _distance(point: Point, start: Point, end: Point) -> float:
-    """Return the distance, found by trying points along the line, independently of the tested code."""
+    """Return the distance of a point from a line. The function tries points along the line and does not use the tested
+    code.
+    """
     low, high = 0.0, 1.0
 
     def at(share: float) -> float:

@@ -1,4 +1,4 @@
-"""Test report.md: it is short enough for a pull request, and no text from a run becomes markup."""
+"""Test report.md: the report is short enough for a pull request, and no text from a run is read as markup."""
 
 import re
 from pathlib import Path

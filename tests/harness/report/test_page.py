@@ -1,4 +1,4 @@
-"""Test the page of complete and damaged run directories: it shows and escapes all their contents."""
+"""Test the page of complete and damaged run directories: the page shows and escapes all their contents."""
 
 import gc
 import json

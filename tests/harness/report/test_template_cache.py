@@ -1,4 +1,4 @@
-"""Test the cache of compiled templates: it changes no page, and no damaged file in it does harm."""
+"""Test the cache of compiled templates: it does not change pages, and a damaged file in it does no harm."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def template(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def drawn(template: Path) -> str:
-    """Render the page as a new process does."""
+    """Render the page in the same way as a new process."""
     html._environment.cache_clear()
     return html.render(template, styles=["x"], words="a < b")
 

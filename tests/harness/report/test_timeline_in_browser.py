@@ -23,7 +23,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def span(browser: Browser) -> tuple[float, float]:
-    """Return the mission seconds at which all pictures begin and end."""
+    """Return the mission seconds at which the pictures begin and end. They must be the same for all pictures."""
     views = browser.evaluate(VIEW)
     assert len(views) == 4
     assert all(view == views[0] for view in views), "lanes and charts share the time axis"

@@ -1,4 +1,4 @@
-"""Test runs in which answers are delayed before they are sent."""
+"""Test runs in which agents delay their answers."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ ROUGH: dict[str, Any] = {
 
 
 def waits(evidence: Evidence) -> list[float]:
-    """Return the mission seconds between each sent answer and its handling by the receiver."""
+    """Return, for each answer, the mission seconds from its sending until the receiver handles it."""
     runs = [(agent_id, run) for agent_id, trace in evidence.traces.items() for run in trace.runs]
     answered = {(agent_id, sent.seq): run.t for agent_id, run in runs for sent in run.sent if sent.message in ANSWERS}
     triggers = [(run.t, run.trigger) for _, run in runs if isinstance(run.trigger, MessageTrigger)]

@@ -1,5 +1,5 @@
-"""Test that the checker detects an error in an edited agent and names the handler, or the edited file if the judge uses
-it too.
+"""Test that the checker detects an error in an edited agent and names the handler. If the checker itself uses the
+edited file, it names the file instead.
 
 Each test edits a copy of `ucp`, as an engineer edits a clone, and plays a scenario with the copy.
 """
@@ -28,7 +28,7 @@ SCENARIO = {
 
 
 class Edit(NamedTuple):
-    """An edit of a file of `ucp`, and the handler that it breaks, if it breaks one."""
+    """An edit of a file of `ucp`, and the handler that the edit breaks. `handler` is empty if no handler is broken."""
 
     about: str
     file: str
@@ -42,7 +42,7 @@ def edits(name: str) -> list[Edit]:
 
 
 def verdict_after(edit: Edit, scenario: dict[str, Any], folder: Path, status: int = 1) -> list[str]:
-    """Play the scenario with a copy of `ucp` that has this edit. Return the sentences of the verdict on all steps."""
+    """Play the scenario with a copy of `ucp` that has this edit. Return the sentences of the verdict on the steps."""
     shutil.copytree(Path(ucp.__file__).parent, folder / "ucp", ignore=shutil.ignore_patterns("__pycache__"))
     file = folder / "ucp" / edit.file
     text = file.read_text("utf-8")

@@ -1,4 +1,4 @@
-"""Test protocol variants: agents play them, the checker uses them, and records name them."""
+"""Test protocol variants: agents follow them, the checker compares with them, and records name them."""
 
 import json
 import sys
@@ -53,7 +53,7 @@ def tie_pops(state):
     return "not contained"
 """
 LOSSY = {"agents": 5, "duration_s": 600.0, "network": {"loss": 0.3}}
-"""A mission with ties of phase 1."""
+"""Keys of a scenario in which ties of phase 1 occur."""
 NEW_BRANCH = """
 @of_core(6, branches=("refused",))
 def refuse(core, sender, message):
@@ -68,7 +68,7 @@ def refuses(state, sender, message):
 
 @pytest.fixture
 def pop_variant(tmp_path: Path) -> Path:
-    """Return the file of a variant that equals the setting `phase1_tie: pop`."""
+    """Return the path of a variant with the same behaviour as the setting `phase1_tie: pop`."""
     return write_variant(tmp_path, HEAD + CORE + REFERENCE)
 
 

@@ -1,4 +1,6 @@
-"""Test the keys of `network.channel`: a preset, single figures, and errors of one sentence."""
+"""Test the keys of `network.channel`: a preset, other values for single keys of the preset, and errors of one
+sentence.
+"""
 
 import typing
 from dataclasses import fields

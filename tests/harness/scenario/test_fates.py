@@ -1,4 +1,6 @@
-"""Test scripted deliveries of single messages. They force events that the experiments of the thesis could not."""
+"""Test scripted deliveries of single messages. They force situations that the experiments of the thesis could not
+force.
+"""
 
 import json
 from pathlib import Path
@@ -18,7 +20,7 @@ from ucp.trigger import MessageTrigger
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 
 BLOCK_OF_1 = [{"at_s": at_s, "agent": 1} for at_s in (1, 2, 3)]
-"""Three events of 256 bytes: block 1.1 is complete and proposed at second 3, committed at second 13."""
+"""Three events of 256 bytes. They complete block 1.1, which is proposed at second 3 and committed at second 13."""
 
 
 def played(
@@ -30,7 +32,7 @@ def played(
 
 
 def arrivals(simulated: Simulated, agent_id: int, message: str) -> list[tuple[float, int]]:
-    """Return (mission second, sender) of each message of this type that reached the agent."""
+    """Return the mission second and the sender of each message of this type that reached the agent."""
     runs = simulated.evidence.traces[agent_id].runs
     return [
         (run.t, run.trigger.sender)
@@ -44,7 +46,7 @@ def branches(simulated: Simulated, agent_id: int, handler: str) -> list[str]:
 
 
 def test_fate_drops_one_commit_for_one_receiver() -> None:
-    """Figure 4.2: agent 2 misses the commit of agent 4's last block, and no agent detects the missing block."""
+    """Agent 2 misses the commit of agent 4's last block, and no agent detects the missing block (Figure 4.2)."""
     simulated = simulate(load_scenario(SCENARIOS / "lost_last_commit.yaml"), 1, tracing=True)
     chains = {agent_id: len(export.chain) for agent_id, export in simulated.evidence.exports.items()}
     assert chains == {1: 4, 2: 3, 3: 4, 4: 4, 5: 4}

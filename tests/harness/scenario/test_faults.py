@@ -1,4 +1,4 @@
-"""Test the faults of agents: kill, crash, restart, pause, resume, reboot, switch off, and wrong clocks."""
+"""Test the faults of agents: kill, crash, restart, pause, resume, reboot, switching off, and wrong clocks."""
 
 from itertools import pairwise
 from random import Random
@@ -78,7 +78,7 @@ def test_restarted_agent_receives_no_message_sent_before_its_start() -> None:
 
 
 def test_restarted_agent_logs_no_event_of_its_first_incarnation() -> None:
-    """The events that the agent had not yet logged when it was killed are lost."""
+    """The events that the agent had not logged when it was killed are lost."""
     simulated = played([{"at_s": 300, "kill": [2]}, {"at_s": 300.5, "restart": [2]}])
     source = RandomEvents(Random(agent_seed(4, 2, incarnation=2)), mean_s=10)
     expected = [t for t in (300.5 + source.next()[0] for _ in range(100)) if t <= 600]
@@ -134,7 +134,7 @@ def test_stale_chain_hash_violates_characteristic_4() -> None:
 
 
 def test_block_lost_in_a_brown_out_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An agent whose disk is kept must not lose blocks."""
+    """An agent that keeps its disk must not lose blocks."""
     alone = [{"at_s": 0, "partition": [[2], [1, 3, 4, 5]]}, {"at_s": 400, "heal": True}]
     reboot = {"at_s": 300, "reboot": [2], "down_s": 30, "disk": "kept"}
     assert verdicts(played([*alone, reboot], final_reconcile=True)) == {"holds"}
@@ -143,7 +143,7 @@ def test_block_lost_in_a_brown_out_is_a_violation(monkeypatch: pytest.MonkeyPatc
 
 
 def test_reconcile_ended_by_a_brown_out_counts_as_no_chance_to_agree() -> None:
-    """The agent ends this reconcile when it restarts, without answers of other agents."""
+    """When the agent restarts, its reconcile has ended without answers of other agents."""
     began = {"handler": "reconcile_begin", "algorithm": 7, "branch": "begun", "reconciling": True}
     ended = {"handler": "reconcile_finalize", "algorithm": 20, "branch": "done", "reconciling": False}
     runs = [run_of(10.0, **began), run_of(20.0, **ended)]
@@ -203,7 +203,7 @@ def test_agent_that_stays_paused_leaves_the_run_unsettled() -> None:
 
 @pytest.mark.parametrize(("offset_s", "drift"), [(-1000, 0.0), (1000, 0.0), (0, 0.01), (-50, -0.2)])
 def test_agents_agree_with_wrong_and_drifting_clocks(offset_s: float, drift: float) -> None:
-    """Timers and timestamps follow the inaccurate clock. A timestamp before the start of the run becomes 0."""
+    """Timers and timestamps follow the inaccurate clock. A time before the start of the run has the timestamp 0."""
     simulated = played([], clocks={2: {"offset_s": offset_s, "drift": drift}}, final_reconcile=True)
     assert verdicts(simulated) == {"holds"}
     own = [block for block in simulated.evidence.exports[1].chain if block.agent_id == 2]
@@ -307,7 +307,7 @@ def test_block_held_only_by_a_switched_off_agent_is_no_violation() -> None:
 
 
 def test_liveness_does_not_apply_to_switched_off_agents() -> None:
-    """Switch off one agent after another, while they vote."""
+    """Switch off one agent after another while they vote."""
     off = [{"at_s": 580 + agent, "switch_off": [agent]} for agent in range(1, 6)]
     simulated = played(off, network={"loss": 0.3})
     assert not simulated.result.bad

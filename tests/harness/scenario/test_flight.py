@@ -1,4 +1,4 @@
-"""Test flight plans of vehicles: refused plans, the program and system ID of each vehicle, and a run."""
+"""Test flight plans of vehicles: plans that are refused, the program and the system ID of each vehicle, and a run."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Test failsafes of a real ArduCopter that the timeline causes."""
+"""Test failsafes of a real ArduCopter. Entries of the timeline cause them."""
 
 import json
 import os

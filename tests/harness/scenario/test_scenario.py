@@ -1,4 +1,4 @@
-"""Test scenario files: an error names the key, the value and the allowed values."""
+"""Test scenario files: an error message names the key, the value and the allowed values."""
 
 from pathlib import Path
 

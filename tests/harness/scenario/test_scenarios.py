@@ -42,7 +42,7 @@ def mutual_length(run: Simulated) -> int:
 
 
 def blocks_beyond_mutual(run: Simulated) -> int:
-    """Return the number of blocks by which the longest chain exceeds the common part of all chains."""
+    """Return the length of the longest chain minus the number of blocks that all chains have in common."""
     return max(map(len, chains(run).values())) - mutual_length(run)
 
 
@@ -67,12 +67,12 @@ def reconciles(run: Simulated, *agents: int) -> int:
 
 
 def state(run: Simulated, agent: int, at_s: float) -> StateSummary:
-    """Return the state of the agent just before that mission second."""
+    """Return the state of the agent just before this mission second."""
     return [step.state for step in run.evidence.traces[agent].runs if step.t < at_s][-1]
 
 
 def longest_stack(run: Simulated) -> int:
-    """Return the greatest length of the reconcile stack of any agent."""
+    """Return the greatest length that the reconcile stack of any agent had."""
     return max(step.state.stack for trace in run.evidence.traces.values() for step in trace.runs)
 
 
@@ -274,7 +274,9 @@ def rogue(run: Simulated, seed: int) -> None:
 
 
 def field_test_2020(run: Simulated, seed: int) -> None:
-    """Check Section 4.3 and Figure 4.7 of the thesis, with both of its errors and the listed differences."""
+    """Check the facts in Section 4.3 and Figure 4.7 of the thesis, including both of its errors and the listed
+    differences.
+    """
     whole = chains(run)[10]
     assert chains(run)[28] == whole
     for agent in (32, 122):
@@ -304,7 +306,7 @@ def field_test_2020(run: Simulated, seed: int) -> None:
 
 
 def captured(run: Simulated, seed: int) -> None:
-    """Check that agents accept the attacker's messages with the keys of vehicle 3 only in the name of vehicle 3."""
+    """Check that the attacker with the keys of vehicle 3 can forge messages only in the name of vehicle 3."""
     violated = {number: one for number, one in run.result.characteristics.items() if one.verdict == "violated"}
     assert set(violated) == {"1", "4"}
     assert {finding.agent_id for finding in violated["4"].evidence} == {1, 2, 4, 5}
@@ -328,7 +330,7 @@ def secure(run: Simulated, seed: int) -> None:
 
 
 def revoked_in_partition(run: Simulated, seed: int) -> None:
-    """Check that all running agents learn of the excluded vehicle, and inform agents that start later."""
+    """Check that all running agents learn of the excluded vehicle, and that they inform agents that start later."""
     heard_s = {}
     for agent_id, trace in run.evidence.traces.items():
         heard = [aside.t for _, aside in trace.asides if isinstance(aside, CommandEntry) and aside.command == "revoke"]
@@ -381,7 +383,7 @@ CLAIMS: dict[str, Callable[[Simulated, int], None]] = {
 }
 SEEDS_OF = {"field_test_2020": (339,), "captured": (1,)}
 PLAYED = [(name, seed) for name in CLAIMS for seed in SEEDS_OF.get(name, SEEDS)]
-"""Each scenario with each seed for which its claim holds."""
+"""Each scenario with each seed for which its description holds."""
 
 
 LIVELOCKS = (

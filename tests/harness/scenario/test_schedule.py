@@ -1,4 +1,4 @@
-"""Test schedules of network changes: ramps, repeated changes, and random changes, computed before the run."""
+"""Test schedules of network changes: ramps, repeated changes and random changes. They are computed before the run."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ def states(one: Scenario) -> list[NetworkChange]:
 
 
 def heard(state: NetworkChange, roster: tuple[int, ...]) -> dict[int, set[int]]:
-    """Return the vehicles that each vehicle can receive, including itself."""
+    """Return, for each vehicle, the vehicles that it can receive. Each vehicle can receive itself."""
     conditions = state.conditions
     return {
         receiver: {

@@ -1,4 +1,4 @@
-"""Test timers whose duration increases from agent to agent."""
+"""Test timers that are longer for each next agent."""
 
 from dataclasses import replace
 from typing import Any
@@ -42,7 +42,9 @@ def test_stagger_ends_the_livelock_of_agents_in_step() -> None:
 
 
 def test_two_losses_livelock_a_staggered_swarm() -> None:
-    """Neither loss alone causes the endless cycle. Equal timers, or a majority in phase 2, also prevent it."""
+    """The scenario loses two messages. If only one of them is lost, or with equal timers or a majority in phase 2, the
+    agents do not repeat a cycle.
+    """
     scenario = load_scenario(SCENARIOS / "two_losses.yaml")
     first, second = scenario.fates
 
@@ -57,7 +59,7 @@ def test_two_losses_livelock_a_staggered_swarm() -> None:
 
 
 def test_staggered_phase_1_alone_allows_a_livelock_in_resonance() -> None:
-    """Two phases 1 of one agent last as long as phases 1 and 3 of another agent, for any timer difference."""
+    """For any timer difference, two phases 1 of one agent last as long as phases 1 and 3 of another agent."""
     scenario = load_scenario(SCENARIOS / "in_resonance.yaml")
 
     def liveness(seed: int = 1, **changes: Any) -> str:

@@ -1,4 +1,6 @@
-"""Test network changes in a timeline: any key, for all links, receivers or single links, temporary or permanent."""
+"""Test network changes in a timeline. They change any key, for all links, receivers or single links, for some time or
+permanently.
+"""
 
 import json
 from pathlib import Path
@@ -21,7 +23,7 @@ ONE_WAY = {"links": [{"from": 1, "to": 2, "loss": 0.9}]}
 
 
 def network_states(*timeline: dict[str, Any], **keys: Any) -> list[tuple[float, str, str]]:
-    """Return (mission second, name, description) of each state of the network."""
+    """Return the mission second, the name and the description of each state of the network."""
     changes = timeline_of(scenario(timeline=list(timeline), **keys))
     return [(change.at_s, change.what, change.detail) for change in changes if isinstance(change, NetworkChange)]
 

@@ -16,7 +16,7 @@ from ucp.events import LoggableEvent
 from ucp.messages import CommitBlock, encode
 
 FULL = {"max_block_bytes": 267}
-"""Blocks are full with any event."""
+"""Settings with which any event fills a block."""
 EVENT = {"at_s": 10, "agent": 1, "event_id": 7, "data": base64.b64encode(b"seen").decode(), "timestamp_us": 123}
 
 

@@ -34,7 +34,7 @@ def secrets(home: KeyDirectory, epochs: int, boots: Iterable[tuple[int, bytes]] 
 
 
 def forms(secret: bytes) -> Iterator[bytes]:
-    """Yield encoded forms of a secret: raw, hexadecimal, base64, an integer, a list of numbers, and Python's
+    """Yield encoded forms of a secret: raw bytes, hexadecimal, base64, an integer, a list of numbers, and Python's
     notation.
     """
     yield secret
@@ -52,20 +52,20 @@ def forms(secret: bytes) -> Iterator[bytes]:
 
 
 def leaks(known: dict[str, bytes], contents: Iterable[tuple[str, bytes]]) -> list[str]:
-    """Return the names of the secrets found, with their places."""
+    """Return the name of each secret that occurs in the contents, with the places where it occurs."""
     looked_for = [(name, form) for name, secret in known.items() for form in forms(secret)]
     return [f"{name} in {where}" for where, content in contents for name, form in looked_for if form in content]
 
 
 def left_in(directory: Path) -> Iterator[tuple[str, bytes]]:
-    """Yield the content of all files with their names."""
+    """Yield each file with its name and content."""
     for path in directory.rglob("*"):
         if path.is_file() and not path.is_symlink():
             yield str(path), path.read_bytes()
 
 
 def boots_in(content: bytes) -> set[tuple[int, bytes]]:
-    """Return the senders and their start times in the headers of encrypted datagrams of a packet capture."""
+    """Return the senders and their boot identifiers in the headers of encrypted datagrams of a packet capture."""
     found, start = set(), content.find(_CLEAR_START)
     while start >= 0:
         length = int.from_bytes(content[start + 12 : start + 14], "big")

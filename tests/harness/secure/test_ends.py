@@ -1,4 +1,4 @@
-"""The ends of secured runs: no signal leaves a secret in a file."""
+"""Test how secured runs end: after no signal does a file contain a secret."""
 
 import json
 import os
@@ -26,13 +26,13 @@ def key_directories() -> set[Path]:
 
 
 def bundle_of(run: Running, agent: int) -> Path:
-    """Return the path of an agent's keys, which its mission file names."""
+    """Return the path of the file with an agent's keys. The agent's mission file names this path."""
     mission = json.loads((run.out / "agents" / f"{agent}.mission.json").read_text())
     return Path(os.path.normpath(run.out / "agents" / mission["security"]["bundle"]))
 
 
 def _allow_hang_up_and_core_files() -> None:
-    """Undo an ignored SIGHUP, which a program inherits under nohup, and a limit for core files."""
+    """Restore the default for SIGHUP, which nohup makes a program ignore, and remove the limit for core files."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     resource.setrlimit(resource.RLIMIT_CORE, (resource.getrlimit(resource.RLIMIT_CORE)[1],) * 2)
 
@@ -109,7 +109,7 @@ def test_arguments_and_environment_of_processes_contain_no_secret(tmp_path: Path
 
 
 def visible(pid: int) -> Iterator[tuple[str, bytes]]:
-    """Yield the arguments and the environment of a process, as other programs of the user read them."""
+    """Yield the arguments and the environment of a process, as far as other programs of the same user can read them."""
     for name in ("cmdline", "environ"):
         with suppress(OSError):  # a process with keys denies access to other programs
             yield f"{name} of process {pid}", Path(f"/proc/{pid}/{name}").read_bytes()

@@ -1,4 +1,5 @@
-"""Test a secured flight with encrypted events, packet captures and an exclusion, in every command that reads runs.
+"""Test every command that reads runs with a secured flight. The flight has encrypted events, packet captures and an
+excluded vehicle.
 
 Each command prints correct results with and without keys, and never a secret.
 """
@@ -109,7 +110,7 @@ def test_reconcile_at_the_depot_keeps_block_signatures(flown: Path, tmp_path: Pa
 
 
 def brought_home(flown: Path, directory: Path) -> Path:
-    """Copy exports and packet captures without traces."""
+    """Copy exports and packet captures of a run, without its traces."""
     directory.mkdir()
     for path in (*flown.glob("agents/*.chain.json"), *flown.glob("capture/*")):
         shutil.copy(path, directory)

@@ -1,4 +1,4 @@
-"""Test which vehicles a run excludes: by the authority's key, or by a message that was signed before."""
+"""Test how a run excludes vehicles: with the authority's key, or with a message that the authority signed before."""
 
 import json
 from collections.abc import Callable

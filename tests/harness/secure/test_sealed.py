@@ -1,4 +1,6 @@
-"""Test encrypted event data: agents carry them, the checker follows them, and only the depot can read them."""
+"""Test encrypted event data: agents exchange them, the checker judges their blocks, and only the depot can read
+them.
+"""
 
 import base64
 import dataclasses
@@ -27,7 +29,7 @@ LOGGED = b"nobody else reads this"
 
 
 class SealedSwarm:
-    """Three agents that committed a few encrypted blocks, with exports and keys in a directory."""
+    """Three agents that have committed a few encrypted blocks. Their exports and keys are in a directory."""
 
     def __init__(self, directory: Path) -> None:
         self.home = KeyDirectory.new(directory / "keys", ROSTER, seals=True, epoch_s=600.0)

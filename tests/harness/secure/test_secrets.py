@@ -14,7 +14,7 @@ from tests.harness.secure.secrets import boots_in, forms, leaks, left_in, secret
 
 ROSTER = [1, 2, 3]
 EPOCHS = 14
-"""Those of the mission, and those that vehicles would follow others to."""
+"""Number of epochs whose secrets are searched for. It includes later epochs to which a vehicle would follow others."""
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def scenario(directory: Path, home: KeyDirectory, **keys: Any) -> Path:
 
 
 def run(asked: Path, *options: str) -> tuple[int, list[tuple[str, bytes]]]:
-    """Run the scenario. Return the exit status, and all output and files."""
+    """Run the scenario. Return its exit status, and the content of its output and files."""
     out = asked.parent / "run"
     done = harness("run", asked, "--seed", "1", "--out", out, *options)
     left = list(left_in(out)) if out.exists() else []
@@ -66,7 +66,7 @@ def test_files_of_a_run_contain_no_secret(home: KeyDirectory, tmp_path: Path) ->
 def test_files_of_a_failed_run_of_processes_contain_no_secret(
     home: KeyDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Agent 2 is a program that prints all its input and ends."""
+    """The program of agent 2 prints all its input and ends."""
     monkeypatch.setenv("TOKEN_OF_THE_USER", "a token")
     tells = ["sh", "-c", "cat *.mission.json; printenv; exit 3"]
     asked = scenario(tmp_path, home, agent_command={"2": tells}, capture=False, speedup=20, duration_s=40, timeline=[])
@@ -80,7 +80,7 @@ def test_files_of_a_failed_run_of_processes_contain_no_secret(
 @pytest.mark.lab
 @pytest.mark.any_user
 def test_agent_as_a_process_reads_keys_of_other_agents(home: KeyDirectory, tmp_path: Path) -> None:
-    """Check a known limit, which the threat model states. Containers separate the agents."""
+    """This test shows a known limit, which the threat model states. Containers would separate the agents."""
     reads = """cat "$(sed -n 's/.*"bundle": *"\\([^"]*\\)".*/\\1/p' 1.mission.json)" > 2.read; exit 3"""
     asked = scenario(tmp_path, home, agent_command={"2": ["sh", "-c", reads]}, capture=False, speedup=20, timeline=[])
     status, left = run(asked, "--backend", "process")
@@ -91,7 +91,7 @@ def test_agent_as_a_process_reads_keys_of_other_agents(home: KeyDirectory, tmp_p
 
 @pytest.mark.parametrize("tells", ["error", "version"])
 def test_virtual_agent_that_repeats_its_input_reveals_no_secret(home: KeyDirectory, tmp_path: Path, tells: str) -> None:
-    """The agent refuses its mission with a copy of its input, or puts it into its status."""
+    """The agent refuses its mission with a copy of its input, or puts its input into its status."""
     says = {
         "error": "{'error': 'no: ' + str(given.get('bundle'))[-190:]}",
         "version": "{'sent': [], 'timer': None, 'trace': [], 'answer': str(given)}",
@@ -112,7 +112,7 @@ def test_virtual_agent_that_repeats_its_input_reveals_no_secret(home: KeyDirecto
 @pytest.mark.lab
 @pytest.mark.any_user
 def test_captured_keys_forge_only_blocks_of_their_vehicle(home: KeyDirectory, tmp_path: Path) -> None:
-    """Play the run with processes, and check that its directory also contains no secret."""
+    """Play the run with processes. The test also checks that the run directory contains no secret."""
     forged = [{"at_s": 60, "forge": {"message": "Commit Block", "sender": sender}} for sender in (3,)]
     forged += [{"at_s": 80, "forge": {"message": "Commit Block", "sender": 2}}]
     asked = scenario(tmp_path, home, speedup=20, timeline=forged, capture=False)

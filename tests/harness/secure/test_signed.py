@@ -1,4 +1,4 @@
-"""Test characteristic 4 with signatures: forged or edited blocks are found without the author's trace."""
+"""Test characteristic 4 with signatures: the checker finds forged and edited blocks without the author's trace."""
 
 import base64
 import hashlib
@@ -54,7 +54,7 @@ def genuine(home: Path, *options: Path | str) -> dict[str, Any]:
 
 
 def recompute(export: dict[str, Any]) -> None:
-    """Recompute all hashes of an edited export."""
+    """Compute all hashes of an export again after its blocks were edited."""
     below = bytes.fromhex(export["inception"]["chain_hash"])
     for block in export["chain"]:
         made = Block(block["agent_id"], block["timestamp_us"], base64.b64decode(block["event_data"]))
@@ -72,7 +72,7 @@ def edit_exports(home: Path, edit: Callable[[dict[str, Any]], None]) -> None:
 
 
 def edited(home: Path, edit: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    """Return the verdict after an edit of a block of agent 3 in agent 1's export, with new hashes."""
+    """Edit a block of agent 3 in agent 1's export, and compute its hashes again. Return the verdict."""
     path = home / "1.chain.json"
     export = json.loads(path.read_text())
     edit(next(block for block in export["chain"] if block["agent_id"] == 3))
@@ -138,7 +138,7 @@ def _shuffle(export: dict[str, Any]) -> None:
 
 
 def _keep(export: dict[str, Any], chain: list[dict[str, Any]]) -> None:
-    """Keep only these blocks, also in the list `completed`."""
+    """Keep only these blocks in the chain and in the list `completed`."""
     kept = {block["block_hash"] for block in chain}
     export["chain"], export["blocks_to_be_committed"], export["reconcile_stack"] = chain, [], []
     export["completed"] = [name for name in export["completed"] if name in kept]
@@ -189,7 +189,7 @@ ATTACKER = KeySet.derived(b"an attacker".ljust(32), (1, 2, 3))
 
 
 def signed_by(attacker: KeySet, export: dict[str, Any], event_data: bytes) -> None:
-    """Replace the events of all blocks, and sign blocks and export with the attacker's keys."""
+    """Replace the events of all blocks. Sign the blocks and the export with the attacker's keys."""
     agent = Agent(export["agent_id"], (1, 2, 3), base64.b64decode(export["inception"]["block_data"]))
     mission = attacker.public.mission
     chain, signatures = [], {}
@@ -254,7 +254,7 @@ def test_block_that_a_captured_key_signs_is_found_in_other_exports(home: Path, r
 
 
 def test_block_that_its_maker_denies_stays_signed_elsewhere(run: Path, home: Path) -> None:
-    """Vehicle 1 signs an export without one of its blocks, which vehicle 2 holds."""
+    """Vehicle 1 signs an export that lacks one of its blocks. Vehicle 2 holds this block."""
     keys = KeySet.derived(hashlib.sha256(b"keys of seed 1").digest(), (1, 2, 3), seals=True)
     path = home / "1.chain.json"
     export = json.loads(path.read_text())

@@ -1,4 +1,4 @@
-"""Test that each row of the table of attacks shows the real result."""
+"""Test that each row of the table of attacks shows the result of the attack."""
 
 import re
 from pathlib import Path

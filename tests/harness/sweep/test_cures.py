@@ -1,4 +1,4 @@
-"""Play each cell of the table of protocol corrections in docs/appendix/livelock-measurements.md."""
+"""Play the scenario of each cell of the table of protocol corrections in docs/appendix/livelock-measurements.md."""
 
 from pathlib import Path
 from typing import Any
@@ -13,18 +13,20 @@ from tests.harness.scenario.test_scenarios import SCENARIOS
 PAGE = Path(__file__).parents[3] / "docs/appendix/livelock-measurements.md"
 SEED = 1
 SIZES = range(4, 9)
-"""Sizes of swarms in which all other agents refuse one agent."""
+"""Numbers of agents of swarms in which all other agents refuse one agent's blocks."""
 
 
 def rows() -> list[tuple[str, list[str]]]:
-    """Return each correction with the cells of its table row."""
+    """Return each correction with the other cells of its table row."""
     table = PAGE.read_text(encoding="utf-8").partition("<!-- cures: begin -->\n")[2].partition("<!-- cures: end -->")[0]
     cells = [[cell.strip() for cell in line.strip("|\n").split("|")] for line in table.splitlines()[2:]]
     return [(cure, played) for cure, *played in cells]
 
 
 def refused(agents: int, *, partition: bool) -> dict[str, Any]:
-    """Return a scenario in which some agents commit blocks that the others miss, and agent 1 then completes a block."""
+    """Return a scenario in which some agents commit blocks that the other agents miss. Agent 1 then completes a
+    block.
+    """
     alone = range(2, 2 + (agents + 1) // 2)
     heals_s = 20.0 * len(alone) + 16
     script = [{"at_s": 20.0 * place + 1, "agent": agent} for place, agent in enumerate(alone)]
@@ -46,7 +48,10 @@ def refused(agents: int, *, partition: bool) -> dict[str, Any]:
 
 
 def outcome(document: dict[str, Any], cure: str) -> str:
-    """Return the result of a run in the words of the page: "round", or the number of chains of idle agents."""
+    """Return the result of a run in the words of the page.
+
+    This is "round" for an endless cycle, and otherwise the number of different chains of the idle agents.
+    """
     document = {key: value for key, value in document.items() if key not in ("expect", "about", "stagger")}
     for part in cure.split("`")[1::2]:
         for key, value in yaml.safe_load(part).items():
@@ -56,7 +61,7 @@ def outcome(document: dict[str, Any], cure: str) -> str:
 
 
 def in_short(outcomes: list[str]) -> str:
-    """Return one word if all results are the same, or otherwise all of them."""
+    """Return the common result if all results are the same. Otherwise, return all results."""
     return outcomes[0] if len({*outcomes}) == 1 else ", ".join(outcomes)
 
 

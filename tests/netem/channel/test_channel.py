@@ -1,4 +1,4 @@
-"""Test the shared radio channel with cases that can be calculated by hand, and with general properties."""
+"""Test the shared radio channel with cases that can be calculated by hand, and with properties that always hold."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from netem.radio import Place
 
 WIFI_1 = PRESETS["wifi_1"]
 QUIET = replace(WIFI_1, shadowing_db=0.0)
-"""802.11 at 1 Mbit/s without shadowing: an answer of 47 bytes takes 1080 us, and the range is 461 m."""
+"""802.11 at 1 Mbit/s without shadowing. An answer of 47 bytes takes 1080 us, and the range is 461 m."""
 ANSWER = 47
 AIRTIME_S = 1080e-6
 DIFS_S = 50e-6
@@ -24,14 +24,14 @@ def place(east_m: float, up_m: float = 0.0) -> Place:
 
 
 def channel(radio: Radio, *metres: float, seed: int = 1) -> Channel:
-    """Return a channel between vehicles on a line, at these distances from its beginning."""
+    """Return a channel between vehicles on a line. The numbers are their distances from its beginning in metres."""
     made = Channel(range(1, len(metres) + 1), radio, seed)
     made.move([place(east_m) for east_m in metres], 0.0)
     return made
 
 
 def sent(radio: Radio, metres: Sequence[float], *sends: tuple[int, float], seed: int = 1) -> list[EndedTransmission]:
-    """Send answers, each by (sender, seconds), and return all transmissions."""
+    """Send answers, each given as (sender, seconds), and return all transmissions."""
     made = channel(radio, *metres, seed=seed)
     for sender, at_s in sends:
         assert isinstance(made.send(sender, at_s, ANSWER), int)
@@ -121,8 +121,8 @@ def test_station_counts_no_slots_during_several_frames_of_others(seed: int) -> N
 def starts_between_two_frames(energy_dbm: float, seed: int) -> float:
     """Return the time at which station 2 begins a frame that it queues at 1.0005 s.
 
-    Stations 0 and 1 are hidden from each other. Both begin a frame at 1 s, and that of station 0 is much longer. At
-    station 2, each frame has -80.1 dBm and their sum -77.1 dBm, and the station can receive neither.
+    Stations 0 and 1 are hidden from each other. Both begin a frame at 1 s. The frame of station 0 is much longer.
+    Station 2 receives each frame with -80.1 dBm and both together with -77.1 dBm, and it can decode neither.
     """
     made = channel(replace(QUIET, energy_dbm=energy_dbm), 0, 800, 400, seed=seed)
     made.send(0, 1.0, 10 * ANSWER)

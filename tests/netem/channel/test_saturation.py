@@ -28,11 +28,14 @@ pytestmark = pytest.mark.any_user
 DATA_BYTES = 100
 FRAMES = 15_000
 SIGMAS = 4.0
-"""Standard errors between the model and the formula: one of 16,000 seeds would exceed them."""
+"""Maximum difference between the model and the formula in standard errors. One of 16,000 seeds would exceed it."""
 
 
 def alone_and_busy(n: int, window: int) -> tuple[float, float, float]:
-    """Return the frames sent alone, the busy times and all frames, per slot that follows an idle slot."""
+    """Return three expected numbers for each slot that follows an idle slot.
+
+    They are the number of frames that are sent alone, the number of busy times, and the number of all frames.
+    """
     again = 1 / window
     alone, busy = [0.0], [0.0]  # in the busy times that follow one with this number of senders
     for senders in range(1, n + 1):
@@ -53,7 +56,10 @@ def binomial(n: int, p: float, k: int) -> float:
 
 
 def saturated(radio: WifiRadio, n: int) -> list[tuple[float, int]]:
-    """Return, for each busy time, the seconds until the next one and the number of senders."""
+    """Simulate stations that always have a frame to send.
+
+    Return, for each busy time, the seconds until the next busy time, and the number of stations that sent.
+    """
     channel = Channel(range(1, n + 1), radio, seed=1)
     for station in range(n):
         channel.send(station, 0.0, DATA_BYTES)
@@ -72,7 +78,7 @@ def saturated(radio: WifiRadio, n: int) -> list[tuple[float, int]]:
 
 
 def ratio(parts: Sequence[float], wholes: Sequence[float]) -> tuple[float, float]:
-    """Return the sum of the parts over the sum of the wholes, and its standard error."""
+    """Return the sum of the parts divided by the sum of the wholes, and the standard error of this ratio."""
     found = sum(parts) / sum(wholes)
     squares = sum((part - found * whole) ** 2 for part, whole in zip(parts, wholes, strict=True))
     return found, math.sqrt(squares) / sum(wholes)

@@ -1,4 +1,6 @@
-"""Fill floating point and vector registers while signals and child processes occur, and print the results."""
+"""Use floating point and vector registers while signals and child processes interrupt the program. Print the
+results.
+"""
 
 import hashlib
 import math

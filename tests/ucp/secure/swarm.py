@@ -1,4 +1,4 @@
-"""Run agents with keys without a network. The test passes each agent's datagrams to the others."""
+"""Run agents with keys without a network. The test delivers the datagrams of each agent to the other agents."""
 
 from ucp.events import LoggableEvent
 from ucp.secure.bundle import Bundle, KeySet

@@ -1,4 +1,4 @@
-"""Test key files: a written file is read back, a wrong one is rejected, and no message shows a secret."""
+"""Test key files: written files are read back, wrong files are rejected, and no error message shows a secret."""
 
 import json
 import os

@@ -1,5 +1,7 @@
-"""Budgets limit the keys that an outsider can make an agent derive, and the signatures that an insider can make it
-verify.
+"""Test the budgets that protect an agent.
+
+They limit the keys that an attacker without keys can make the agent derive, and the signatures that an attacker with
+keys can make it verify.
 """
 
 from dataclasses import replace
@@ -22,7 +24,9 @@ BOOT = make_boot(1, bytes(8))
 
 
 class CountingAgent(SecuredAgent):
-    """Agent 1. It counts the signatures that it verifies, and the keys of others that it derives."""
+    """Agent 1. The class counts the signatures that the agent verifies, and the keys of other agents that it
+    derives.
+    """
 
     def __init__(self) -> None:
         self.verified = self.derived = 0
@@ -39,7 +43,7 @@ class CountingAgent(SecuredAgent):
 
     @property
     def epoch(self) -> int:
-        """The epoch of the clock."""
+        """The number of the agent's current epoch."""
         return self.session.epochs.bundle.epoch
 
     def hears(self, datagram: bytes, now: float = 0.0) -> bool:

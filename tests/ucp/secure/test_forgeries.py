@@ -1,4 +1,4 @@
-"""Test ten kinds of forged datagrams, with fewer of each than `python -m benchmarks.forgeries` sends."""
+"""Test ten classes of forged datagrams. `python -m benchmarks.forgeries` sends more datagrams of each class."""
 
 import pytest
 

@@ -1,4 +1,7 @@
-"""A vehicle that lost its replay windows, its clock or its disk accepts no recorded datagrams, and is not mute."""
+"""Test vehicles that lost their replay windows, their clock or their disk.
+
+Such a vehicle accepts no recorded datagrams, and other vehicles accept its datagrams.
+"""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -19,7 +22,7 @@ from ucp.secure.session import Session
 
 EPOCH_S = KEYS.public.epoch_s
 LOST_CLOCK_S = -1_795_000_000.0
-"""The mission second that a clock of 1970 shows."""
+"""The mission second of a clock that shows the year 1970."""
 QUERY = RequestForBlock(bytes(32))
 SEQUENCES = count(100)
 
@@ -32,7 +35,7 @@ def born(agent_id: int, started_us: int = 1, bundle: Bundle | None = None, now: 
 
 
 def rebooted(agent_id: int, started_us: int = 9, now: float = 0.0) -> SecuredAgent:
-    """Return an agent that flew before, and lost all except its bundle."""
+    """Return an agent that took part in the mission before, and lost everything except its bundle."""
     return born(agent_id, started_us, KEYS.bundle(agent_id).used(), now)
 
 
@@ -47,7 +50,9 @@ def hears(listener: SecuredAgent, datagram: bytes, now: float) -> bool:
 
 
 def settle(clocks: dict[SecuredAgent, float], *, lost: Iterable[SecuredAgent] = ()) -> None:
-    """Deliver all datagrams to all other agents, until no agent sends any. Each agent has its own mission second."""
+    """Deliver all datagrams to all other agents until no agent sends any. Each agent has its own clock, in mission
+    seconds.
+    """
     for _ in range(10):
         sent = [(agent, agent.datagrams_to_send()) for agent in clocks]
         for sender, datagrams in sent:
@@ -94,7 +99,9 @@ def test_fresh_bundle_late_in_the_mission_proves_no_first_start() -> None:
 
 
 def test_vehicle_without_clock_is_heard_and_hears_others() -> None:
-    """Its clock shows 1970. The bundle has the epoch in which the vehicle was lost, five epochs before the present."""
+    """The vehicle's clock shows 1970. Its bundle has the epoch in which the vehicle was lost, five epochs before the
+    present.
+    """
     now = 9.5 * EPOCH_S
     two, three = born(2), born(3)
     for each in (two, three):
@@ -118,7 +125,7 @@ def test_epochs_pass_although_the_clock_shows_1970() -> None:
 
 
 def test_vehicle_with_an_earlier_boot_is_heard_after_an_echo() -> None:
-    """It lost its clock and its disk. Its boot is therefore earlier than that of its last incarnation."""
+    """The vehicle lost its clock and its disk. Its boot is therefore earlier than that of its last incarnation."""
     two, before, after = born(2), born(1, started_us=77), rebooted(1, started_us=3)
     recorded = query(before)
     assert hears(two, query(before), 0.0)
@@ -199,7 +206,7 @@ def test_recorded_echo_does_not_replace_a_later_boot() -> None:
 
 
 def test_delayed_echo_does_not_replace_a_later_boot() -> None:
-    """The attacker has kept the echo from the receiver, until another incarnation was accepted."""
+    """The attacker holds the echo back until the receiver has accepted a later incarnation."""
     one, before = born(1), born(2, started_us=3)
     assert hears(one, query(born(2, started_us=5)), 0.0)
     assert not hears(one, query(before), 0.0)

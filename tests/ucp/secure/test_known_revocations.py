@@ -1,4 +1,6 @@
-"""Revocations unite: a revoked agent stays revoked, whatever the order of the authority's messages."""
+"""Test how an agent combines revocations: a revoked agent stays revoked, whatever the order of the authority's
+messages.
+"""
 
 import base64
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Test that captured datagrams can be decrypted as scapy layers with a vehicle's keys, and not without keys."""
+"""Test that scapy layers decrypt captured datagrams with a vehicle's keys, and cannot decrypt them without keys."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""Test encrypted event data: the method is HPKE (RFC 9180), and only the depot can decrypt them."""
+"""Test encrypted event data: the method is HPKE (RFC 9180), and only the depot can decrypt the data."""
 
 import base64
 from pathlib import Path

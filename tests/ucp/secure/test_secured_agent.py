@@ -1,4 +1,4 @@
-"""Test an agent with keys: it handles authentic new datagrams, and records why it drops others."""
+"""Test an agent with keys: it accepts new authentic datagrams, and records why it drops other datagrams."""
 
 from collections import Counter
 
@@ -18,7 +18,7 @@ EPOCH_S = KEYS.public.epoch_s
 
 
 def vote_on(proposer: SecuredAgent, *others: SecuredAgent, now: float = 0.0) -> list[bytes]:
-    """Return the votes of the other agents on a block that the first agent proposes."""
+    """Return the votes of the other agents on a block that the first agent has proposed."""
     (proposal,) = complete_a_block(proposer, now)
     return [answer for other in others for answer in receive(other, proposal, now)]
 

@@ -1,4 +1,4 @@
-"""Compare the window of accepted sequence numbers (RFC 6479) with a set of all numbers."""
+"""Compare the window of accepted sequence numbers (RFC 6479) with a set of all accepted numbers."""
 
 from random import Random
 

@@ -1,4 +1,4 @@
-"""Test that simulated runs, recorded runs and `prove` number the states that they reach in the same way."""
+"""Test that simulated runs, recorded runs and `prove` identify the states that they reach in the same way."""
 
 import json
 from pathlib import Path

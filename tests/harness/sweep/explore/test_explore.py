@@ -1,4 +1,4 @@
-"""Test the search for a violation, its reduction to a small scenario, and the file that repeats it."""
+"""Test the search for a violation, the reduction of the run to a small scenario, and the file that repeats the run."""
 
 import dataclasses
 import signal
@@ -25,7 +25,7 @@ def planted(result: Result, number: str) -> Result:
 
 
 def one_commit_is_lost(asked: Scenario, seed: int) -> Result:
-    """Return a violation if chains differ, for which one lost Commit Block is enough."""
+    """Return a violation of characteristic 6 if chains differ. One lost Commit Block is enough for this."""
     result = simulated(asked, seed)
     return planted(result, "6") if result.figures["distinct_chains"] != 1 else result
 

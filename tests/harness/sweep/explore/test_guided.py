@@ -1,5 +1,7 @@
-"""Test the random search: it finds more than seeds alone, gives the same result on any number of cores, and continues
-the next night.
+"""Test the guided random search.
+
+It finds more than seeds alone, gives the same result on any number of cores, and continues the search of an earlier
+night.
 """
 
 import dataclasses
@@ -103,7 +105,7 @@ def test_trial_records_ends_of_timers_and_failed_votes() -> None:
 
 
 def test_run_with_a_new_pattern_of_failed_votes_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The run is stored although all its agent states are known."""
+    """The search keeps the run, although all its agent states are known."""
     limits, ((document, seed), *_) = initial_documents(ordinary(), range(1))
     patterns = iter((("voting", "phase one", "voting"),) * 2 + (("voting", "voting"),))
     monkeypatch.setattr(

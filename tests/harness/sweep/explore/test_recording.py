@@ -1,4 +1,4 @@
-"""Test that a recorded run, played from its script, gives the same run again."""
+"""Test that the script of a recorded run gives the same run again."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Test the reduction of scenarios: nothing can be removed from the result, with any number of processes."""
+"""Test the reduction of scenarios: no part of the result can be removed, whatever the number of processes."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Judge runs without a simulation: the figures follow from loss rate and seed."""
+"""Judge runs without a simulation. The figures of a run follow from its loss rate and its seed."""
 
 import tempfile
 from collections.abc import Callable
@@ -28,7 +28,7 @@ def matrix(
 
 
 def played(asked: Matrix, jobs: int, judge: Judge, directory: Path | None = None) -> Finished:
-    """Play the matrix into `directory`, or into a temporary one."""
+    """Play the matrix into `directory`. By default, use a temporary directory."""
 
     def plays(scenario: Scenario, seed: int) -> JudgedRun:
         return JudgedRun(RunOutcome(mission_s=scenario.duration_s + 100, settled=True), judge(scenario, seed))
@@ -38,7 +38,7 @@ def played(asked: Matrix, jobs: int, judge: Judge, directory: Path | None = None
 
 
 def judge(scenario: Scenario, seed: int) -> Result:
-    """Return a good verdict without loss. With loss, seed 2 violates characteristic 3."""
+    """Return good verdicts without loss. With loss, return a violation of characteristic 3 for seed 2."""
     loss = scenario.network.loss
     assert isinstance(loss, float)
     verdict: Verdict = "violated" if loss and seed == 2 else "holds"

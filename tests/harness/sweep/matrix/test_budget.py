@@ -1,4 +1,6 @@
-"""`--budget`: uncertain cells come first, no run begins late, and the output lists the omitted runs."""
+"""Test `--budget`: uncertain cells come first, no run begins after the time is over, and the output lists the omitted
+runs.
+"""
 
 from collections import Counter
 from collections.abc import Callable
@@ -19,7 +21,7 @@ LOSS = (0.0, 0.1, 0.2)
 
 
 def ticking(seconds: list[float]) -> Callable[[], float]:
-    """Return a clock that goes on by one second at each call."""
+    """Return a clock whose time increases by one second at each call."""
 
     def clock() -> float:
         seconds[0] += 1
@@ -29,7 +31,9 @@ def ticking(seconds: list[float]) -> Callable[[], float]:
 
 
 def order(most: float, chains: Callable[[float, int], int], late: int = 0) -> list[MatrixTask]:
-    """Return the tasks in the order in which they begin. Each result is known after `late` further tasks."""
+    """Return the tasks in the order in which they begin. The result of a task is known after `late` more tasks have
+    begun.
+    """
     asked, runs, begun = matrix(loss=LOSS, seeds=20), dict[MatrixTask, Run](), list[MatrixTask]()
     for task in informative(asked.tasks, runs, most, ticking([0.0])):
         begun.append(task)

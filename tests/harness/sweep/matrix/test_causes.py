@@ -1,4 +1,6 @@
-"""Causes of a changed night: the first changed handler run of each changed run, and the commits of a worse figure."""
+"""Test the causes of a changed night: the first changed handler run of each changed run, and the commits of a worse
+figure.
+"""
 
 import json
 import subprocess
@@ -50,7 +52,9 @@ def test_first_changed_handler_run_is_the_one_with_the_new_setting() -> None:
 
 
 def test_changed_runs_list_their_first_changed_handler_runs(tmp_path: Path) -> None:
-    """The code of a later night differs. Here it is the scenario, because a test has only one code."""
+    """A later night has different code. This test changes the scenario instead, because it can use only one version of
+    the code.
+    """
 
     def night(name: str, **keys: Any) -> Finished:
         asked = matrix(loss=(0.0,), seeds=3, agents=[3], scenario=SMALL | keys)
@@ -73,12 +77,16 @@ def test_changed_runs_list_their_first_changed_handler_runs(tmp_path: Path) -> N
 
 
 FIGURES = {"a": 20, "b": 20, "c": 22, "d": None, "e": 50, "f": 50}
-"""Subject of each commit -> number of reconciles of the run, None if the commit cannot be played."""
+"""The number of reconciles of the run at each commit, by the commit's subject. None means that the commit cannot
+run.
+"""
 
 
 @pytest.fixture
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """Make a repository whose code is a number, and play a run by reading it. Return subject -> commit."""
+    """Create a repository whose code is a number. To play a run, the test reads this number. Return each commit by its
+    subject.
+    """
     path, commits = tmp_path / "repository", {}
     path.mkdir()
 
@@ -112,7 +120,7 @@ def night(finished: Finished, commit: str) -> MatrixRecord:
 
 
 def regression(good: str, bad: str) -> tuple[MatrixRecord, MatrixRecord]:
-    """Return a night with a worse figure and its baseline, of these commits."""
+    """Return the record of a night with a worse figure, and its baseline. The two nights have these commits."""
     asked = matrix(seeds=[1, 3, 4])
     baseline = night(played(asked, 1, judge), good)
     now = played(asked, 1, busier)

@@ -75,7 +75,7 @@ def test_lost_scheduler_is_one_sentence_and_the_matrix_can_continue(tmp_path: Pa
 
 
 def refused(address: str) -> str:
-    """Return the sentence of an error that ends the command with exit status 3."""
+    """Run the command, which must end with exit status 3. Return the sentence of its error."""
     with pytest.raises(MachineError) as error, cluster([1], abs, address) as outcomes:
         list(outcomes)
     assert "\n" not in str(error.value)
@@ -150,7 +150,7 @@ def of_processes(directory: Path, **keys: Any) -> Path:
 
 @pytest.mark.lab
 def test_killed_worker_loses_no_run_of_processes(tmp_path: Path, dask: Cluster) -> None:
-    """Each worker plays whole runs in its own directory, and their directories come back with the results."""
+    """Each worker plays whole runs in its own directory. The run directories are sent back with the results."""
     address = dask.start_scheduler()
     workers = {name: dask.start_worker(address, name) for name in ("one", "two")}
     asked, out = of_processes(tmp_path), tmp_path / "out"

@@ -17,7 +17,7 @@ from tests.harness.unsupported import refusing_to_start
 
 
 def written(directory: Path, **keys: Any) -> Path:
-    """Play a small matrix: two loss rates, three seeds, ten minutes."""
+    """Play a small matrix with two loss rates and three seeds. Each run takes ten minutes."""
     scenario = {"agents": 4, "duration_s": 600, "events": {"source": "random"}}
     path = directory / "matrix.yaml"
     path.write_text(json.dumps({"name": "small", "scenario": scenario, "loss": [0.0, 1.0], "seeds": 3, **keys}))

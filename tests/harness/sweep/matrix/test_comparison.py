@@ -32,7 +32,7 @@ WORSE = {
 
 
 def cell(loss: float = 0.15, **estimates: Estimate) -> Cell:
-    """Return a summary in which each figure is 0.5 (0.4 to 0.6), except the given ones."""
+    """Return a summary of a cell. Each figure without a given estimate is 0.5, with the interval 0.4 to 0.6."""
     usual = Estimate(n=10, mean=0.5, low=0.4, high=0.6)
     known = {name: estimates.get(name, usual) for name in BY_NAME}
     return Cell(loss=loss, agents=5, backend="sim", runs=10, failed=0, estimates=known, verdicts={}, violated={})
@@ -72,14 +72,14 @@ def test_cells_are_compared_at_the_same_point_only() -> None:
 
 
 def busier(scenario: Scenario, seed: int) -> Result:
-    """Judge like `judge`, with more reconciles if there is loss."""
+    """Judge like `judge`, but with more reconciles if there is loss."""
     result = judge(scenario, seed)
     result.figures["reconciles"] += 30 if scenario.network.loss else 0  # type: ignore[operator]
     return result
 
 
 def night(directory: Path, **keys: Any) -> Path:
-    """Write a file matrix.json with the results of a night."""
+    """Write the matrix.json of a night with these results."""
     directory.mkdir()
     matrix_outputs.write(played(matrix(**{"seeds": [1, 3, 4], **keys}), 1, judge), directory)
     return directory / "matrix.json"
@@ -167,7 +167,7 @@ def test_baseline_of_another_version_is_named_and_not_compared(tmp_path: Path) -
 
 
 def rarely_busier(scenario: Scenario, seed: int) -> Result:
-    """Judge like `judge`, with one reconcile more for seed 3."""
+    """Judge like `judge`, but with one more reconcile for seed 3."""
     result = judge(scenario, seed)
     result.figures["reconciles"] += seed == 3  # type: ignore[operator]
     return result
@@ -188,7 +188,7 @@ def test_single_changed_run_is_named_and_no_regression(tmp_path: Path) -> None:
 
 
 def slightly_busier(scenario: Scenario, seed: int) -> Result:
-    """Judge like `judge`, with one or two reconciles more, which is less than seeds differ."""
+    """Judge like `judge`, but with one or two more reconciles. Seeds differ by more than that."""
     result = judge(scenario, seed)
     result.figures["reconciles"] += 1 + seed % 2  # type: ignore[operator]
     return result

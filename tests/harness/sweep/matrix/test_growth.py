@@ -40,9 +40,10 @@ def played_record(asked: Matrix) -> MatrixRecord:
 
 
 def judge(scenario: Scenario, seed: int) -> Result:
-    """Return figures: each agent completes a block in 200 s, and there are 3 N^1.5 B messages.
+    """Return figures that follow known laws.
 
-    40 and more agents never settle.
+    Each agent completes a block in 200 s. N agents with B blocks send 3 N^1.5 B messages. Swarms of 40 and more agents
+    never settle.
     """
     agents = len(scenario.roster)
     blocks = round(agents * scenario.duration_s / 200)

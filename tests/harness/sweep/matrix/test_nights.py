@@ -1,4 +1,4 @@
-"""Test `--nights`: the results of finished nights are stored once, and other files are left out and reported."""
+"""Test `--nights`: each finished night is stored once, and other files in the directory are skipped and reported."""
 
 import json
 from pathlib import Path

@@ -48,7 +48,9 @@ def test_in_noise_nineteen_intervals_of_twenty_hold_the_exponent(variables: list
 
 
 def test_the_interval_is_that_of_a_worked_example() -> None:
-    """The logarithms are x 1..5 and y 2, 4, 5, 4, 5, with slope 0.6, standard error sqrt(0.08) and t 3.1824."""
+    """The logarithms are x = 1 to 5 and y = 2, 4, 5, 4, 5. The slope is 0.6, the standard error sqrt(0.08), and t is
+    3.1824.
+    """
     law = fit(AGENTS, [([math.exp(x)], math.exp(y)) for x, y in zip(range(1, 6), (2, 4, 5, 4, 5), strict=True)])
     assert law
     found = law.exponents["agents"]

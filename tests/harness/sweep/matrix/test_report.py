@@ -31,7 +31,7 @@ def breaks(scenario: Scenario, seed: int) -> Result:
 
 
 def tiles(finished: Finished, name: str) -> dict[str, _heatmap.HeatmapTile]:
-    """Return the tiles of one figure by the page section to which they link."""
+    """Return the tiles of one figure. The key of a tile is the page section to which it links."""
     (figure,) = [one for one in known_figures(finished.record.cells) if one.metric.name == name]
     grids = _heatmap.heatmap(finished.record, figure).grids
     return {str(tile.href): tile for grid in grids for _, row in grid.rows for tile in row}

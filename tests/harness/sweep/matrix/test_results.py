@@ -1,4 +1,4 @@
-"""Test results.jsonl: each run is played once, even if the matrix is interrupted several times."""
+"""Test results.jsonl: each run is played only once, even if the matrix is interrupted several times."""
 
 import json
 import re
@@ -18,7 +18,7 @@ Count = list[tuple[object, int]]
 
 
 def counting(seen: Count, until: int | None = None) -> Callable[[Scenario, int], Result]:
-    """Return a judge that records its runs, and is interrupted after a number of them."""
+    """Return a function that judges and records runs. It is interrupted after a number of runs."""
 
     def counted(scenario: Scenario, seed: int) -> Result:
         if len(seen) == until:

@@ -1,4 +1,6 @@
-"""Test many tasks on all processor cores: order, failures, and no remaining processes."""
+"""Test how tasks are distributed over all processor cores: their order, their failures, and the end of all
+processes.
+"""
 
 import os
 import signal

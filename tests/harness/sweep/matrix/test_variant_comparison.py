@@ -1,4 +1,4 @@
-"""Test the comparison of a protocol variant with the original by the same seeds."""
+"""Test the comparison of a protocol variant with the original protocol. Both use the same seeds."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ def matrix(tmp_path: Path) -> Path:
 
 
 def compared(matrix: Path, variant: Path, out: Path) -> dict[float, dict[str, Any]]:
-    """Return the row of each label for each loss rate."""
+    """Return the row with each label, for each loss rate."""
     done = harness("matrix", matrix, "--variant", variant, "--out", out, "--jobs", 1, "--json")
     assert done.returncode == 0, done.stderr
     cells = json.loads(done.stdout)["cells"]
