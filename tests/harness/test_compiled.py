@@ -38,7 +38,10 @@ def python(tree: Path, *arguments: str, **environment: str) -> subprocess.Comple
 
 
 def in_use(tree: Path, before: str = "", **environment: str) -> str:
-    """Return which modules a process in this directory uses, compiled ones or sources. `before` is code that runs first."""
+    """Return which modules a process in this directory uses: compiled modules or their sources.
+
+    The code `before` runs before the import.
+    """
     program = f"{before}\nfrom harness import compiled\nimport harness.play.simulation.air as air\n"
     ended = python(tree, "-c", f"{program}print(compiled.in_use, air.__file__, sep='|')", **environment)
     modules, _, file = ended.stdout.strip().partition("|")

@@ -71,8 +71,8 @@ def test_a_partition_heals_at_the_end_of_its_block(pytester: pytest.Pytester) ->
 @pytest.mark.lab
 @pytest.mark.any_user
 def test_processes_pass_the_same_test(pytester: pytest.Pytester) -> None:
-    """The partition is shorter than in virtual time. Thus the speedup can be lower, so that a busy machine does not
-    delay a vote too long.
+    """The partition is shorter, so a lower speedup is enough. At this speedup, a busy machine does not delay a vote too
+    long.
     """
     pytester.makepyfile(STORY.replace("run_for(600)", "run_for(200)"))
     run(pytester, "--ucp-backend", "process", "--ucp-speedup", "20").assert_outcomes(passed=1)

@@ -2,8 +2,9 @@
 
     python -m tests.sitl.recorded TELEMETRY.tlog OUT.tlog.gz
 
-shortens a telemetry log. It keeps all messages about the position of the first 50 s, and later such messages every 2 s.
-It also keeps each change of the mode, of the arming and of the mission item.
+shortens a telemetry log. Messages about the position, the system status and the mission item are kept completely for
+the first 50 s, and then every 2 s until 420 s. The result also has each change of the mode, of the arming and of the
+mission item, all text messages, the reached mission items and the home positions.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ def places(tlog: Path) -> Iterator[tuple[float, tuple[float, float, float]]]:
 
 @pytest.mark.parametrize("vehicle_type", TYPES)
 def test_mission_in_auto_mode_follows_the_computed_track(vehicle_type: VehicleType, tmp_path: Path) -> None:
-    """At every second, the vehicle is within a metre of the computed path."""
+    """At every second, the vehicle is within a metre of the position that is computed for this second."""
     tlog = tmp_path / "3.tlog"
     pilot = flown(vehicle_type, "mission", tlog)
     assert pilot.state.armed is (vehicle_type == "rover")

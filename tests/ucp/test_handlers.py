@@ -41,7 +41,7 @@ RUNS = {
     "asking": {"network": {"loss": 0.25}, "settings": {"asks_after_commit": True}},
 }
 HELD_ALREADY = ("reconcile_phase_3", "Reconcile Finalize")
-"""The handler and the event of an agent whose mutual successor is already in its chain.
+"""An action that a handler declares for an agent whose mutual successor is already in its chain.
 
 Correct agents never reach this state.
 """
@@ -117,7 +117,9 @@ def test_undeclared_action_of_a_handler_raises_an_error() -> None:
 
 
 def test_each_algorithm_has_one_handler_in_one_table() -> None:
-    """The pause between two commits in Algorithm 20 (Section 4.2) also ends with a timer, which has its own handler."""
+    """Only the handler of Algorithm 20 is in two tables. The timer for the pause between two commits (Section 4.2) also
+    calls it.
+    """
     assert [handler.algorithm for handler in HANDLERS.values()] == list(range(1, 21))
     tabled = [handler.name for table in (ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT) for handler in table.values()]
     assert sorted(tabled) == sorted([*HANDLERS, "reconcile_finalize"])
