@@ -1,6 +1,7 @@
 """The names of the backends in scenarios, in records and on the command line. `harness.play` implements them.
 
-The module is in no room, because the pytest plugin always imports it, and the import must be fast.
+The names have a module of their own, because the pytest plugin always imports them and importing `harness.play` would
+take too long.
 """
 
 from typing import Literal, get_args

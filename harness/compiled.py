@@ -4,10 +4,10 @@ A release wheel holds the driver of virtual time, the checker and the prover twi
 that mypyc compiled from these sources (`docs/generate/compiled_modules.py`). Both give the same results. The agent in
 `ucp/` is never compiled, because its handlers can be replaced and debugged.
 
-Compiled modules call each other without Python's look-ups, so a process uses all of them or none. It uses none if
-`UCP_PURE` is 1, if a source is not the one that was compiled, or if another Python compiled them. A developer can
-therefore edit a source at any time, and the edited source runs. The extension modules lie in a directory of their own.
-Beside the sources, Python would always prefer them.
+Compiled modules call each other without Python's look-ups, so a process uses all of them or none. It uses none if the
+environment variable `UCP_PURE` is 1, if a source file differs from the compiled one, or if a different Python compiled
+the modules. A developer can therefore edit a source at any time, and the edited source runs. The extension modules are
+in a separate directory. If an extension module were next to its source, Python would always load the extension module.
 """
 
 import json
@@ -31,7 +31,9 @@ in_use = "sources"
 
 
 class CompiledModules:
-    """Finds the compiled modules before Python finds their sources. `files` are the extension modules by name."""
+    """An import finder that finds the compiled modules before Python finds their sources. `files` maps the name of each
+    module to the file of its extension module.
+    """
 
     def __init__(self, files: Mapping[str, Path]) -> None:
         self._files = files
@@ -52,7 +54,9 @@ def digest_of(source: Path) -> str:
 
 
 def use_compiled_modules() -> None:
-    """Let later imports load the compiled modules. Set `in_use`."""
+    """Make later imports load the compiled modules, and set `in_use`. If compiled modules exist but cannot be used,
+    `in_use` states the reason.
+    """
     global in_use
     try:
         manifest = json.loads((DIRECTORY / MANIFEST).read_bytes())

@@ -53,7 +53,8 @@ class MachineError(HarnessError):
 def extra(name: str, purpose: str) -> Iterator[None]:
     """Import the optional packages of the extra `name` inside the context.
 
-    Raises MachineError with the install command if a package is missing. `purpose` is the subject of its sentence.
+    Raises MachineError with the install command if a package is missing. `purpose` names the command or option that
+    needs the package. It is the subject of the error message.
     """
     try:
         yield

@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
 
 LARGE_BYTES = 16 * 1024 * 1024
-"""Size of all traces of a run together, in bytes. In larger runs, handler runs that only received a message are not
-read if the caller allows this.
+"""Size of all traces of a run together, in bytes. If the traces are larger and the caller allows it, the reader omits
+handler runs that only received a message.
 """
 _AGENT_ID = re.compile("[1-9][0-9]{0,4}")
 
@@ -59,8 +59,9 @@ ReportProgress = Callable[[str], None]
 
 
 class RecordedRun(NamedTuple):
-    """A handler run in a trace. `agent_id` is the agent. `life` is the incarnation of the agent, which is 1 until the
-    first restart. `line` is the line number in the trace, counted from 1.
+    """A handler run in a trace. `agent_id` is the ID of the agent that ran the handler. `life` is the number of the
+    agent's incarnation: 1 until its first restart, then 2, and so on. `line` is the line number in the trace, counted
+    from 1.
     """
 
     agent_id: int
@@ -83,16 +84,17 @@ class HeldBlock(NamedTuple):
 
 
 class RunArchive:
-    """The files of a run: those in a run directory, in a directory of exports, or single export files.
+    """The files of a run, read from run directories, directories of exports, or single export files.
 
-    Each file is read once, at its first use. `directory` is the first of the given directories with a run.json. If no
-    directory has a run.json, it is the first given directory, or None if there is no directory. `exports` and `traces`
-    contain the readable files by agent. `problems` contains a sentence for each damaged file, and `gaps` one for each
-    missing file. If `skim` is true, large traces are read without the handler runs that only received a message. `keys`
-    are public keys that the user trusts. They are used instead of the keys in the directory. `traces` are the traces by
-    agent, if the caller still has them in memory. The trace files are not read then. `report_progress` receives a text
-    before each long step of reading and judging. Raises RunDirectoryError if a path does not exist, or is a directory
-    with other content.
+    The object reads each file once, at its first use. `directory` is the first given directory that has a run.json,
+    otherwise the first given directory. It is None if the caller names only files.
+
+    - `skim`: if true, omit from large traces the handler runs that only received a message.
+    - `keys`: public keys that the user trusts. The object uses them instead of the keys in the directory.
+    - `traces`: the traces by agent, if the caller has them in memory. The object then reads no trace files.
+    - `report_progress`: a function that receives a text before each long step of reading and judging.
+
+    Raises RunDirectoryError if a path does not exist, or is a directory with other content.
     """
 
     def __init__(
@@ -125,7 +127,7 @@ class RunArchive:
 
     @property
     def record(self) -> RunRecord:
-        """The readable content of run.json. If a part of the file is missing or damaged, its field is empty."""
+        """The readable content of run.json. The field of a missing or damaged part is empty."""
         return self._record_file.record if self._record_file else RunRecord()
 
     @property
@@ -135,7 +137,9 @@ class RunArchive:
 
     @property
     def record_error(self) -> RunDirectoryError | None:
-        """The error because of which no part of an existing run.json can be read. None without such an error."""
+        """The reason why no part of the existing run.json can be read. None if the file does not exist, or if at least
+        a part of it can be read.
+        """
         return self._record_file.error if self._record_file else None
 
     @property
@@ -145,8 +149,8 @@ class RunArchive:
 
     @cached_property
     def origin(self) -> RunRecord:
-        """The content of the run.json that belongs to the exports, even if the user named only single files of the run
-        directory.
+        """The content of the run.json that belongs to the exports. The object also finds this file if the user named
+        only single files of the run directory.
         """
         if self.directory is not None:
             return self.record
@@ -200,7 +204,8 @@ class RunArchive:
         """Yield every handler run, trace by trace, in order of agent IDs.
 
         The method reads traces line by line and does not store them, so it needs little memory for traces of any
-        length. Raises RunDirectoryError at the first damaged line. `traces` has the lines before it.
+        length. Raises RunDirectoryError at the first damaged line. The property `traces` also contains the handler runs
+        before the damaged line.
         """
         for path in self._trace_files:
             for line in read_trace_lines(path):
@@ -209,7 +214,7 @@ class RunArchive:
     def blocks(self) -> Iterator[HeldBlock]:
         """Yield every block that an agent holds in its export, in order of agent IDs.
 
-        `problems` has a sentence for each export that cannot be read.
+        The property `problems` contains a sentence for each export that cannot be read.
         """
         for agent_id, export in self.exports.by_agent.items():
             places = {"chain": export.chain, "deque": export.blocks_to_be_committed, "stack": export.reconcile_stack}
@@ -219,7 +224,9 @@ class RunArchive:
 
     @cached_property
     def epoch_us(self) -> int | None:
-        """The timestamp of mission second 0 on which most trace headers agree. None if no header can be read."""
+        """The timestamp of mission second 0, in microseconds, on which most trace headers agree. None if no header can
+        be read.
+        """
         epochs = Counter(
             epoch for path in self._trace_files if type(epoch := read_clock(path).get("epoch_us")) is int
         ).most_common(1)
@@ -310,7 +317,7 @@ class RunArchive:
     @property
     def anchor(self) -> str | None:
         """The source that confirms the public keys: `--keys` if the user gave keys, or run.json if it contains the
-        fingerprint of the keys. None without such a source.
+        fingerprint of the keys. None if neither confirms the keys.
         """
         if self._trusted_keys is not None:
             return "--keys"

@@ -1,8 +1,8 @@
 """Read files of unknown origin with a size limit: whole files, or JSON Lines one line at a time.
 
-Records may come from other people and other machines. A file may be damaged, compressed, endless or not a regular file.
-Readers in this package therefore limit the number of bytes that they read, and report a problem as a sentence instead
-of an exception.
+A file may come from another person or another machine. It may be damaged, compressed, endless, or not a regular file.
+The readers in this package therefore limit the number of bytes that they read, and report each problem as a sentence
+instead of an exception.
 """
 
 import io
@@ -26,9 +26,11 @@ _CHUNK_BYTES = 256 * 1024
 class BoundedFile(io.BufferedReader):
     """The content of a file as a binary stream.
 
-    Gzip data is decompressed. The packed parts of a file (`harness.archive.packed_parts`) come from its gzip file.
+    Gzip data is decompressed. If parts of the file were packed (`harness.archive.packed_parts`), the stream reads them
+    from the gzip file.
 
-    `problem` is the reason why the content ends early, or empty. It is known after the stream was read to its end.
+    `problem` is the reason why the content ends early, or an empty text. Read `problem` only after the end of the
+    stream.
     """
 
     def __init__(self, path: Path, most_bytes: int = MAX_BYTES) -> None:
@@ -86,7 +88,9 @@ class _LimitedContent(io.RawIOBase):
         return self._unpacked(most) if self.packed else self._read(most)
 
     def _read(self, most: int) -> bytes:
-        """Return up to `most` bytes of a file that is no gzip data. Its packed parts read as NUL."""
+        """Return up to `most` bytes of a file that is not gzip data. Packed parts, which the file contains as NUL
+        bytes, come from the gzip file if it has them.
+        """
         begin = self._file.tell()
         data: bytes = self._file.read(most)
         plain = data.find(b"\0")
@@ -127,7 +131,7 @@ class _PackedParts:
         self._position = 0
 
     def read(self, begin: int, most: int) -> bytes:
-        """Return up to `most` bytes from the position `begin`. Return no bytes if the file lacks or damages them."""
+        """Return up to `most` bytes from the position `begin`. Return no bytes if they are missing or damaged."""
         if self._file is not None and self._file.problem:
             self.close()  # parts were added while their file was read
         try:
@@ -159,8 +163,8 @@ MAX_LINES_BYTES = 32 * 1024 * 1024
 """Maximum size of a JSON Lines file in bytes. The tracks of 50 vehicles take 1.6 MB for a mission of 20 minutes."""
 MAX_LINE_BYTES = 4 * 1024 * 1024
 MAX_LINE_WEIGHT = 200_000
-"""Maximum weight of a line (see `ucp.plain_file`). A line with the conditions of 10,000 links has half of this
-weight.
+"""Maximum weight of a line, which measures the memory that its JSON values need (see `ucp.plain_file`). A line with the
+conditions of 10,000 links has half of this weight.
 """
 
 Record = TypeVar("Record", bound=BaseModel)

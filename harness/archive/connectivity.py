@@ -1,9 +1,9 @@
 """Find out which vehicles were connected at each time, from the network changes in `network.jsonl`.
 
 A link joins two vehicles that receive each other directly. A pair that loses all messages has no link. Two kinds of
-changes are recorded. For a change in the scenario, the record contains the requested network conditions. For a change
-by the movement of vehicles, the record contains the changed radio losses of pairs. A pair has no link while either of
-these causes a loss of 1.
+changes are recorded. If the scenario changes the network, the file contains the requested network conditions. If
+vehicles move, the file contains the pairs whose radio loss changed, with the new losses. A pair has no link while the
+conditions or the radio cause a loss of 1.
 """
 
 from bisect import bisect_right
@@ -34,9 +34,10 @@ Components = tuple[frozenset[int], ...]
 
 @dataclass(frozen=True, slots=True)
 class Topology:
-    """The groups of connected living vehicles from mission second `at_s` on. The largest group is the first element.
+    """The groups of connected living vehicles from mission second `at_s` on. The largest group is the first element of
+    `components`.
 
-    `what` names the change after which the groups exist.
+    `what` names the network change that led to these groups.
     """
 
     at_s: float
@@ -48,7 +49,7 @@ class Topology:
 class LossRates:
     """The mean and the highest loss rate (0 to 1) of the links between living vehicles, from mission second `at_s` on.
 
-    Links with a loss of 1 are not counted, because they are no links.
+    Pairs with a loss of 1 have no link, so they are not counted.
     """
 
     at_s: float
@@ -57,7 +58,9 @@ class LossRates:
 
 
 QUALITY_LIMITS = (0.05, 0.25, 0.6, 1.0)
-"""Limits between the grades of link quality. In grade 0, the loss is below the first limit. In grade 4, it is 1."""
+"""Loss rates that separate the five grades of link quality. In grade 0, the loss rate is below the first limit. In
+grade 4, the loss rate is 1.
+"""
 
 
 SAME_LOSS = 0.05
@@ -141,8 +144,8 @@ class NetworkReplay:
         self._out_of_range: set[Pair] = set()
         self._cut_off: set[Pair] = set()
         self._scripted: dict[Pair, tuple[float, float]] = {}
-        """Pair of vehicles -> the losses that the scenario requests for both directions: first from the lower to the
-        higher ID. The losses by the radio model are added to these losses.
+        """Pair of vehicles -> the losses that the scenario requests for the two directions. The direction from the
+        lower to the higher ID comes first. The losses by the radio model are added to these losses.
         """
         self._radio_losses: dict[Pair, float] = {}
 
@@ -320,7 +323,7 @@ def _toggle(times: dict[Key, list[float]], keys: Iterable[Key], at_s: float) -> 
 
 
 def _is_on(times: Sequence[float], at_s: float) -> bool:
-    """Return true if a condition is on at mission second `at_s`. The condition is off at first, and switches on or off
-    at each of `times`.
+    """Return true if a condition is on at mission second `at_s`. At first, the condition is off. It switches on at the
+    first of `times`, off at the second, and so on.
     """
     return bisect_right(times, at_s) % 2 == 1

@@ -8,7 +8,8 @@ capture/7.pcapng    all frames that vehicle 7 sent or received, if captures were
 network.jsonl       each change of conditions as the kernel applied it, and the kernel's counters at the end
 tracks.jsonl        positions of the vehicles, in metres north, east and up from the centre of the field
 replay.yaml         the scenario with the changes that the user made by hand (harness.play.interventions)
-channel.jsonl       each message on a shared channel, and the vehicles that lost it (channel.log: its process)
+channel.jsonl       each message on a shared channel, and the vehicles that lost it; channel.log is the output of the
+                    process that simulates the channel
 rogue.jsonl         datagrams that the rogue node sent, if the timeline injects any; rogue.log is its output
 lag.jsonl           delays of programs that the machine woke late, and the load of each agent (harness.archive.lag)
 lab.log             output of the lab
@@ -58,8 +59,8 @@ class RunDirectory:
         self.rogue_log = self.path / "rogue.log"
         self.lag = self.path / LAG_FILE
         self.keys: Mapping[int, Path] = {}
-        """The directory with the keys of each vehicle during the run. The directory lies outside of the run directory,
-        because a run directory holds no secrets.
+        """The directory with the keys of each vehicle during the run. This directory is not inside the run directory,
+        because a run directory must not contain secrets.
         """
         self.keys_fingerprint: str | None = None
         """Fingerprint of the public keys in the run directory. None without keys."""

@@ -25,7 +25,7 @@ class SealedError(MalformedEventsError):
 @dataclass(frozen=True)
 class EventData:
     """A decoder for the event data of one mission. `sealed` is true if the data are encrypted. `depot` contains the key
-    if the key is known.
+    of the depot, or is None if the key is unknown.
     """
 
     sealed: bool = False
@@ -63,7 +63,7 @@ class EventData:
         return self.opened(block.event_bytes, block.agent_id, block.timestamp_us)
 
     def opened(self, event_data: bytes, agent_id: int, timestamp_us: int) -> bytes:
-        """Return these event data in decrypted form. `agent_id` and `timestamp_us` belong to the block that contains
+        """Decrypt these event data, and return them. `agent_id` and `timestamp_us` belong to the block that contains
         the data.
 
         Raises SealedError.

@@ -28,9 +28,9 @@ SUFFIX = ".chain.json"
 BEFORE_FINAL_RECONCILE = "before_final_reconcile"
 """Name of the directory in a run directory that contains the exports from before the final reconcile."""
 MAX_EXPORT_BYTES = 32 * 1024 * 1024
-"""Maximum size of an export in bytes. It corresponds to about 17,000 blocks."""
+"""Maximum size of an export in bytes. An export of this size contains about 17,000 blocks."""
 MAX_ERRORS = 20_000
-"""Maximum number of errors in a file that are described. Each description takes a kilobyte."""
+"""Maximum number of errors that are described for one file. Each description takes a kilobyte."""
 
 MAX_SIGNATURE = 4 * (64 // 3 + 1)
 """Length of 64 bytes in base64, in characters."""
@@ -253,8 +253,9 @@ def parse_export(path: Path, document: Any) -> Export:
 def read_exports(paths: Iterable[Path]) -> Exports:
     """Read the exports of one mission. In the result, `errors` contains a sentence for each unusable file.
 
-    If the exports belong to several missions, the mission with the most exports is used. If several missions have the
-    most, the mission of the first file is used. If an agent has two different exports, the later one is used.
+    If the exports belong to several missions, use the mission with the most exports. If several missions have this
+    highest number of exports, use the one to which the first file belongs. If an agent has two different exports, use
+    the later one.
     """
     exports = Exports()
     read: list[tuple[Path, Export]] = []

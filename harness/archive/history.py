@@ -27,7 +27,7 @@ PHASES: dict[str, PhaseName] = {
     "reconcile_phase_3": "phase 3",
     "reconcile_finalize": "finalize",
 }
-"""Handler -> the phase of a reconcile that it begins."""
+"""Handler -> the phase of a reconcile that the handler begins."""
 
 CUT_SHORT = "cut short"
 COMMITTED_BY = {
@@ -42,7 +42,7 @@ REASONS = {
     "vote_timer_expiration": "vote not approved",
     "receive_request_next_in_sequence": "chain diverged",
 }
-"""Handler -> the reason why it begins a reconcile."""
+"""Handler -> the reason why the handler begins a reconcile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class BlockCommit:
 
 @dataclass(frozen=True, slots=True)
 class Phase2Tie:
-    """A tie at the end of reconcile phase 2, in which several answers have the same highest number of votes. `branch`
+    """A tie at the end of reconcile phase 2: several candidate blocks have the same highest number of votes. `branch`
     is the branch that the handler of Algorithm 15 took.
     """
 
@@ -117,29 +117,27 @@ class ActivityStart(NamedTuple):
 
 
 HistoryEvent = ActivityStart | AgentVote | AgentReconcile | Phase2Tie | BlockCommit
-"""A change of an agent's history that one handler run causes."""
+"""One entry in the history of an agent. A handler run can cause several entries."""
 
 
 @dataclass(frozen=True, slots=True)
 class BroadcastMessage:
-    """A broadcast message with its receivers.
-
-    `seq` is its sequence number. `receipts` contains the agent and the mission second of each handler run that the
-    message triggered.
-    """
+    """A broadcast message with its receivers."""
 
     sender: int
     at_s: float
     name: str
     block: str | None
     receipts: list[tuple[int, float]] = field(default_factory=list)
+    """The ID of the agent and the mission second of each handler run that the message triggered."""
     seq: int = 0
+    """The sequence number of the message."""
 
 
 @dataclass(frozen=True, slots=True)
 class MissionHistory:
-    """The history of all agents, by agent and in order of time. `messages` is None if the caller did not request
-    messages.
+    """The history of all agents. Each list is sorted by agent, and then by time. `messages` is None if the caller did
+    not request messages.
     """
 
     votes: list[AgentVote]

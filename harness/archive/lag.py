@@ -46,10 +46,10 @@ class MeasuredLag:
         self._ends = {computer: [line.until_s for line in lines] for computer, lines in self._lines.items()}
 
     def explains(self, agent_id: int, from_s: float, until_s: float) -> float | None:
-        """Return the measured delay of a timer that expired at `from_s` and whose handler ran at `until_s`, in seconds
-        of wall time.
+        """Return the delays of the machine and of the agent that were measured between `from_s`, when a timer expired,
+        and `until_s`, when its handler ran. The result is their sum, in seconds of wall time.
 
-        Return None if the delays of the agent were not measured all the time.
+        Return None if the delays were not measured during all of this time.
         """
         agent = str(agent_id)
         computer = agent if agent in self._ends else None

@@ -1,10 +1,11 @@
 """Pack the parts of a file that another process still appends to, and free their disk space.
 
-A packed part becomes a member of the gzip file `NAME.gz`, and a hole in the file `NAME`. The hole keeps the size of the
-file and the positions in it, so the process that appends to the file notices nothing. Any program can therefore write
-the file, and a killed program leaves all of its lines. Two alternatives were rejected. A writer that packs its own
-lines would have to flush the packer after each line, and every agent in any language would have to do so. A pipe to a
-packer loses the lines that the packer has not read when it is killed.
+A packed part is appended to the gzip file `NAME.gz`. In the file `NAME`, a hole replaces the part. The hole leaves the
+size of the file and all positions in it unchanged, so the process that appends to the file is not affected. Any program
+can therefore write the file, and all lines of a killed program remain. Two alternatives were rejected. Agents could
+compress their own lines, but then every agent in every language would have to compress, and flush after each line.
+Agents could write to a pipe, but if the process that reads the pipe and compresses is killed, the lines in the pipe are
+lost.
 
 The holes are at the beginning of the file. `BoundedFile` reads them from the gzip file.
 """
@@ -21,23 +22,25 @@ from typing import BinaryIO
 PART_BYTES = 1024 * 1024
 """Size of a part. It is a multiple of the block size of all file systems."""
 KEPT_BYTES = 2 * PART_BYTES
-"""Size of the end of a file that stays plain, because its writer may remove an incomplete line."""
+"""Number of bytes at the end of a file that are not packed, because the writer of the file may still remove an
+incomplete line.
+"""
 _TRIED_BYTES = 64 * 1024
 _HOLE = bytes(64)
-"""The first bytes of a file whose first part is packed. A text file has no NUL."""
+"""The first bytes of a file whose first part is packed. A text file contains no NUL bytes."""
 _LEVEL = 1
-"""Level of compression. Higher levels take three times as long for a tenth of the size."""
+"""Gzip level of compression. Higher levels take three times as long, and reduce the size only by a tenth."""
 _KEEP_SIZE, _PUNCH_HOLE = 1, 2
 """Flags of fallocate(2)."""
 
 
 def packed_name(path: Path) -> Path:
-    """Return the path of the gzip file that has the packed parts of the file at `path`."""
+    """Return the path of the gzip file that contains the packed parts of the file at `path`."""
     return path.with_name(f"{path.name}.gz")
 
 
 def has_packed_parts(descriptor: int) -> bool:
-    """Return true if the first part of a file is packed. A copy of the file may have NUL in place of the hole."""
+    """Return true if the first part of a file is packed. In a copy of the file, NUL bytes may replace the hole."""
     return os.pread(descriptor, len(_HOLE), 0) == _HOLE
 
 
@@ -110,8 +113,9 @@ def pack_whole(path: Path) -> None:
 def _opened(path: Path, flags: int) -> BinaryIO:
     """Open a file of an agent. Raises OSError if it is not a regular file.
 
-    In a run in containers, `path` is a link of the harness. The agent could replace its file by a link, which must not
-    lead to a file of this machine.
+    If agents run in containers, `path` is a symbolic link that the harness made, and this function follows it. The
+    agent could replace its own file by a second link. The function does not follow the second link, because it could
+    lead to any file on this machine.
     """
     own = path.parent / path.readlink() if path.is_symlink() else path
     descriptor = os.open(own, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -122,8 +126,8 @@ def _opened(path: Path, flags: int) -> BinaryIO:
 
 
 def _packed_file(path: Path, file: BinaryIO) -> BinaryIO:
-    """Open the gzip file of the packed parts for appending. If the file `file` has no packed parts, the gzip file is
-    new.
+    """Open the gzip file of the packed parts for appending. If `file` has no packed parts yet, also remove any old
+    content of the gzip file.
     """
     packed = packed_name(path).open("ab", buffering=0)
     if not hole_at_begin(file.fileno()):

@@ -21,7 +21,8 @@ from ucp.short_value import shown
 
 Model = TypeVar("Model", bound=BaseModel)
 Place = tuple[dict[Any, Any] | list[Any], Any]
-"""A part of a document: the object or list that contains the part, and the key or index of the part there."""
+"""The place of a part in a document: the object or list that contains the part, and the key or index of the part in it.
+"""
 
 MAX_ROUNDS = 100
 """Maximum number of validations. Each validation removes the invalid parts that it finds, and the depth of a document
@@ -131,7 +132,9 @@ def _remove(places: Sequence[Place]) -> None:
 
 MAX_BYTES = 40 * 1024 * 1024
 MAX_WEIGHT = 2_000_000
-"""Maximum weight of a run record (see `ucp.plain_file`). A record with 100,000 scripted fates stays below it."""
+"""Maximum weight of a run.json, which measures the memory that its values need (see `ucp.plain_file`). A file whose
+scenario has 100,000 scripted message fates has less weight.
+"""
 
 
 class DamagedRecordError(RunDirectoryError):

@@ -1,4 +1,4 @@
-"""Find the scenario to play, in a scenario file or in the record of a run directory."""
+"""Load the scenario that a command plays, from a scenario file or from the run.json of a run directory."""
 
 from pathlib import Path
 

@@ -59,8 +59,8 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -
 class _LivingChains:
     """The chains of the living agents, with counts of the blocks in them.
 
-    Each beginning of a chain (prefix) has a number, and equal prefixes of different chains have the same number. A
-    common prefix is therefore found by comparing numbers.
+    A prefix consists of the first blocks of a chain. Each prefix gets a number, and equal prefixes of different chains
+    get the same number. The class therefore compares numbers to find a common prefix.
     """
 
     def __init__(self, agents: Iterable[int]) -> None:

@@ -2,7 +2,7 @@
 
 A trace of a process contains every received datagram, so the traces of a large swarm take gigabytes. Packed, they take
 about a sixth. The harness packs finished parts during the run (`harness.archive.packed_parts`), and the rest after it.
-All readers take `7.trace.jsonl`, also if a part of it is packed, and `7.trace.jsonl.gz`.
+All readers accept `7.trace.jsonl.gz`, and they accept `7.trace.jsonl` even if a part of it is packed.
 """
 
 from collections.abc import Callable
@@ -41,8 +41,8 @@ def is_packed(path: Path) -> bool:
 
 
 def has_rest(path: Path) -> bool:
-    """Return true if the file at `path` has only the packed parts of a trace, and a plain file has the rest of the
-    trace.
+    """Return true if the file at `path` contains only the packed parts of a trace, and a second, plain file contains
+    the rest of the trace.
     """
     return is_packed(path) and path.with_name(path.name.removesuffix(".gz")).exists()
 
@@ -53,8 +53,8 @@ def open_trace(path: Path) -> BoundedFile:
 
 
 def packable_traces(agents: Path) -> list[Path]:
-    """Return the traces of an active run of which `pack_parts` can pack a part. The list is empty while all traces
-    together are small, and on a file system that cannot free parts.
+    """Return the traces of an active run that have a part that `pack_parts` can pack. The list is empty while all
+    traces together are small. It is also empty if the file system cannot free a part of a file.
     """
     traces = _plain_traces(agents)
     if _are_small(traces) or not can_free_parts(agents):
@@ -82,7 +82,9 @@ def pack_traces(agents: Path, report_progress: Callable[[str], None]) -> None:
 
 
 def _plain_traces(agents: Path) -> list[Path]:
-    """Return each plain trace once: in a run in containers, by its link in `agents`."""
+    """Return the path of each uncompressed trace once. If agents run in containers, this is the path of the symbolic
+    link to the trace.
+    """
     traces = [path for path in agents.rglob(f"*{SUFFIX}") if path.exists()]
     linked = {path.resolve() for path in traces if path.is_symlink()}
     return sorted(path for path in traces if path.is_symlink() or path.resolve() not in linked)

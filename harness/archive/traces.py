@@ -1,8 +1,8 @@
 """Read traces (`ucp-trace/2` and `/1`). A trace contains the handler runs of one agent, and the changes of the blocks
 that it held.
 
-If a trace ends in the middle of a line, its agent was killed. The lines before it are used. Other damage is reported in
-`problem`, and the lines before the damage are used.
+If a trace ends in the middle of a line, its agent was killed. The lines before the incomplete line are used. Other
+damage is reported in `problem`, and the lines before the damage are used.
 """
 
 import json
@@ -129,8 +129,8 @@ class TraceGap(NamedTuple):
 class Trace:
     """The trace of one agent, including all its restarts.
 
-    `starts` contains the index in `runs` at which each incarnation after the first begins. `asides` contains the
-    entries that are no handler runs, each with the number of runs before it. A trace from the field
+    `starts` contains, for each incarnation after the first, the index in `runs` of its first handler run. `asides`
+    contains the entries that are no handler runs. Each has the number of handler runs before it. A trace from the field
     (`harness.field.ingest`) may have `gaps`. The trace of a run has no gaps, because reading ends at the first damaged
     line.
     """
@@ -144,11 +144,13 @@ class Trace:
     """True if the file ends in the middle of a line. This line is not read."""
     gaps: list[TraceGap] = field(default_factory=list)
     jumps: list[int] = field(default_factory=list)
-    """Positions of handler runs before which the time decreases or increases by a large amount. At these positions, the
-    agent's clock was probably set.
+    """Indices in `runs` of the handler runs before which the time decreases, or increases by a large amount. The
+    agent's clock was probably set before these handler runs.
     """
     lines: tuple[Sequence[int], Sequence[int]] | None = None
-    """The line numbers of `runs` and of `asides` in the file. None if the file has no other lines."""
+    """The line numbers in the file of the entries in `runs`, and those of the entries in `asides`. None if the file has
+    no other lines, apart from headers.
+    """
 
     def incarnations(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:
         """Yield the handler runs of each incarnation (the time between two restarts), together with their line numbers,
@@ -252,7 +254,7 @@ class HeldBlocks:
     def __init__(self) -> None:
         self.places: dict[str, Counter[str]] = {place: Counter() for place in PLACES}
         self.size = dict.fromkeys(PLACES, 0)
-        """Place -> number of blocks there."""
+        """Name of a place, such as the chain -> number of blocks in this place."""
         self.copies: Counter[str] = Counter()
         self.completed: dict[str, None] = {}
         self.not_in_chain: set[str] = set()

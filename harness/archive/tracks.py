@@ -46,7 +46,9 @@ class VehicleTracks:
 
 
 def between(before: PositionFix, after: PositionFix, at_s: float) -> PositionFix:
-    """Return the position of a vehicle between two known positions, if it flies straight at constant speed."""
+    """Return the position of a vehicle between two known positions. The function assumes that the vehicle flies
+    straight at constant speed.
+    """
     share = (at_s - before.at_s) / (after.at_s - before.at_s)
     return PositionFix(
         at_s,

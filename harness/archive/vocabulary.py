@@ -92,7 +92,7 @@ COUNTS_VOTES = frozenset(
 
 IGNORED_KINDS: frozenset[Kind] = frozenset(("branch", "tally", "timer"))
 """Kinds of unknown names that do not prevent the comparison of a step. A step with an unknown name of another kind
-cannot be compared. Names of timers are among them, because the handler determines the timer.
+cannot be compared. Timer names belong to this list, because the handler determines the timer.
 """
 
 MAX_SHOWN = 40

@@ -13,15 +13,15 @@ _NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 @dataclass(frozen=True, slots=True)
 class JunitCase:
-    """A test case in a JUnit XML file. The test case passed if `skipped` is None and `wrong` is empty.
-
-    The first line of `wrong` is a complete message. `skipped` is a reason. `note` is the output of a passed case.
-    """
+    """A test case in a JUnit XML file. The test case passed if `skipped` is None and `wrong` is empty."""
 
     name: str
     wrong: Sequence[str] = ()
+    """The lines of the failure message. The first line is a complete message by itself."""
     skipped: str | None = None
+    """The reason why the test case was skipped."""
     note: str = ""
+    """The output of a passed test case."""
 
 
 def to_xml(suite: str, classname: str, started_at: str, wall_s: float | None, cases: Iterable[JunitCase]) -> str:

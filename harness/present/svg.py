@@ -130,7 +130,7 @@ def frame(title: str, across: Axis, up: Axis, across_texts: Iterable[str], up_te
 
 
 def line(points: Iterable[tuple[float, float]], number: int) -> Markup:
-    """Draw a line through these points. `number` is the number of the line, and selects its colour and its dashes."""
+    """Draw a line through these points. `number` selects the colour and the dashes of the line."""
     dash = DASHES[number % len(DASHES)]
     return Markup('<path class="line" d="M{}" stroke="{}" stroke-width="2" stroke-linejoin="round"{}/>').format(
         "L".join(f"{n(x)} {n(y)}" for x, y in points),

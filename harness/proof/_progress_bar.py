@@ -17,39 +17,40 @@ Ended = Literal["complete", "flaw", "memory", "time", "interrupted"]
 
 @dataclass(frozen=True)
 class ExplorationProgress:
-    """The progress of an exploration: the numbers of known states, explored states and transitions, and the search
-    depth.
-
-    After all states are explored, `asked` is the question about the whole graph that is now being answered.
-    """
+    """The progress of an exploration."""
 
     states: int
+    """Number of known states."""
     looked_at: int
+    """Number of explored states."""
     transitions: int
     depth: int
+    """Number of instants from the initial state to the states that are being explored."""
     seconds: float
     asked: str | None = None
+    """The question about the whole graph that is now being answered. None until all states are explored."""
 
 
 @dataclass(frozen=True)
 class ExplorationFigures:
     """The size of an exploration. Except `steps` and the times, all numbers are the same for any number of processor
     cores.
-
-    `local_states` and `zones` count the local states and zones that occur in explored states. `steps` is the number of
-    steps that real agents computed in all processes. `seconds` is wall time, and `processor_s` is the processor time of
-    all processes.
     """
 
     states: int
     looked_at: int
     transitions: int
     local_states: int
+    """Number of the local states that occur in explored states."""
     steps: int
+    """Number of steps that real agents computed in all processes."""
     zones: int
+    """Number of the zones that occur in explored states."""
     depth: int | None
     seconds: float
+    """Wall time of the exploration, in seconds."""
     processor_s: float
+    """Processor time of all processes, in seconds."""
 
 
 class LimitReachedError(Exception):

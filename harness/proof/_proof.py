@@ -58,8 +58,7 @@ OF_OTHERS = {
 }
 """Properties that an attacker with captured keys must not be able to violate."""
 RUN_LOOKED_FOR_S = 60.0
-"""Maximum number of seconds of the search for a run of the whole swarm that shows a violation found in a single agent.
-"""
+"""Maximum number of seconds to search for a run of the whole swarm that shows the violation of a single agent."""
 CYCLES_LOOKED_FOR_S = 60.0
 """Maximum number of seconds to search for livelocks in an incomplete graph."""
 PLAYED = {
@@ -97,38 +96,46 @@ class Limits:
 
 @dataclass
 class Proof:
-    """The result of a proof within bounds, with a violation if the prover found one.
+    """The result of a proof within bounds.
 
-    `complete` is true if all states within the bounds were explored. `flaw` is a violation, and `example` is a scenario
-    that shows it. `exit_status` is 0 if every property holds, 1 if a property does not hold, and 4 if a limit was
-    reached first. `liveness` is None if it was not examined, because some states are unknown or the network is `any`.
-    `whole_ended` states how the examination of the whole graph ended. With the network `any`, `way` lists the steps of
-    a single agent that lead to the violation. In this case, no run of the whole swarm with the violation may be known.
+    `complete` is true if all states within the bounds were explored. `exit_status` is 0 if every property holds, 1 if a
+    property does not hold, 4 if the proof reached a limit first, and 130 if the user interrupted the proof.
     """
 
     bounds: Bounds
     figures: ExplorationFigures
     ended: Ended
     flaw: PropertyViolation | None
+    """The first violation of a property that the prover found. None if it found none."""
     liveness: ConvergenceResult | None = None
+    """The result of the questions about the whole graph. None if they were not examined, because some states are
+    unknown or the network is `any`.
+    """
     whole_ended: Ended = "complete"
+    """How the examination of the whole graph ended."""
     example: ViolationExample | None = None
+    """A scenario that shows a violation. None without a violation. With the network `any`, also None if the prover
+    knows no run of the whole swarm with the violation.
+    """
     fork: ViolationExample | None = None
-    """The nearest state in which all agents are idle and their chains differ. This state violates no property, and it
-    does not change until an agent starts a vote.
+    """A scenario that leads to the nearest state in which all agents are idle and their chains differ. This state
+    violates no property, and it does not change until an agent starts a vote. None if no such state is known.
     """
     reluctant: ViolationExample | None = None
-    """The nearest state that needs more than one further vote until all chains are equal. None if no such state is
-    known.
+    """A scenario that leads to the nearest state that needs more than one further vote until all chains are equal. None
+    if no such state is known.
     """
     forms: list[str] = field(default_factory=list)
-    """The forms of all livelocks. Each is described by the timers of its states."""
+    """The forms of all livelocks. The description of a form lists the timers that run in the states of the livelock."""
     livelocks: list[Livelock] = field(default_factory=list)
-    """One livelock of each form, played as a run. The exploration that found the livelocks may be incomplete."""
+    """One livelock of each form, with the scenario that shows it. The exploration that found the livelocks may be
+    incomplete.
+    """
     way: list[str] = field(default_factory=list)
+    """With the network `any`, the steps of a single agent that lead to the violation."""
     shown: dict[str, ViolationExample | None] = field(default_factory=dict)
-    """Characteristic in `OF_CAPTORS` -> the nearest violation that an attacker can cause. None with the network
-    `any`.
+    """Characteristic that an attacker can violate (see `OF_CAPTORS`) -> a scenario that shows the nearest such
+    violation. With the network `any`, the value is None.
     """
 
     @property
@@ -147,14 +154,16 @@ class Proof:
 
     @property
     def decided(self) -> bool:
-        """True if every property was decided, that is, if neither a limit nor a violation ended the search early."""
+        """True if every property was decided: neither a limit, the user nor a violation ended the search early, and no
+        question was left open.
+        """
         whole = self.whole_ended == "complete" and (self.liveness is None or self.liveness.decided)
         return self.complete and whole and not self.left_open
 
     @property
     def left_open(self) -> bool:
-        """True if states have no path to one chain, but perhaps only because they represent states with smaller
-        zones.
+        """True if the proof cannot decide whether every state has a path to one chain. A state seems to have no such
+        path. But with `zones_contained`, it also represents states with smaller zones, and this may be the only reason.
         """
         return self.bounds.zones_contained and self.liveness is not None and self.liveness.lost is not None
 
@@ -238,7 +247,7 @@ def prove(
     """Explore every state that agents can reach within `bounds`, check each state, and return the result.
 
     - `limits`: memory, time and worker processes of the proof. The proof stops when a limit is reached.
-    - `out`: the new file of the scenario that shows a violation. Without it, a new file under `runs/`.
+    - `out`: the path of the new scenario file that shows a violation. By default, a new file under `runs/`.
     - `watch`: a function that is called repeatedly with the progress.
 
     Raises HarnessError if the file cannot be written, if an agent violates an assumption of the state reduction, or if
@@ -281,7 +290,7 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Ex
 
 
 def _with_instants(bounds: Bounds) -> Bounds:
-    """Return bounds that differ only in the network, which loses and duplicates messages instead of being `any`.
+    """Return the same bounds with a network that loses and duplicates messages, instead of the network `any`.
 
     With these bounds, each path is a possible run. With the network `any`, this is not certain.
     """

@@ -35,9 +35,10 @@ class Bounds:
 
     - `network`: `lossless`; `lossy`, where any agent may lose any message; `any`, where messages may also be late,
       repeated and out of order.
-    - `faults`: some of `reboot` and `death`, each at most once, and `duplicate`.
+    - `faults`: any of `reboot`, `death` and `duplicate`. A reboot and a death happen at most once in a run.
     - `timers_any`: timers may expire in any order, regardless of their durations.
-    - `coincidences`: the maximum number of pairs of moments that are equal by chance. None means any number.
+    - `coincidences`: the maximum number of coincidences. In a coincidence, two independent events happen at the same
+      moment by chance. None means any number.
     - `settings`: protocol settings of all agents, by name.
     - `quirks`: deliberate mistakes of all agents, by name (see `ucp.quirks`).
     - `reduced`: treat states that behave alike as one state. `prove` does so only if `why_not_reduced` gives no reason.
@@ -50,8 +51,8 @@ class Bounds:
       receive each message.
     - `clocks_any`: at each comparison of two blocks, either of them may be the older one.
     - `losses`: the maximum number of lost messages that would have had an effect. None means any number.
-    - `zones_contained`: a state represents all states with the same agents whose possible timer values are among its
-      own.
+    - `zones_contained`: a state also represents each state in which all agents have the same local states, and whose
+      possible timer values are a subset.
     - `crossing`: messages of several agents may cross. If false, all consequences of an action end before the next
       action.
 
@@ -143,8 +144,8 @@ class Bounds:
             raise BoundsError("--clocks any excludes --quirk and --captured: leave them out")
 
     def why_not_reduced(self) -> str | None:
-        """Return the reason why the prover must not merge states that behave alike. Return None for the released core,
-        where it may merge them.
+        """Return the reason why the prover must not merge states that behave alike. Return None if the prover may merge
+        such states.
         """
         if edited := edited_files():
             return f"it assumes the released core, and {', '.join(edited)} was edited"
@@ -156,8 +157,8 @@ class Bounds:
 
     @property
     def nameless(self) -> bool:
-        """True if states are stored without agent IDs. Each agent then counts itself as agent 1. False with a captured
-        agent and with the network `any`, because messages then depend on the sender's ID.
+        """True if states are stored without agent IDs. Each agent then counts itself as agent 1. False if an agent is
+        captured or the network is `any`, because messages then depend on the sender's ID.
         """
         return self.reduced and self.captured is None and self.network != "any"
 

@@ -1,9 +1,9 @@
 """Run the same proof for the original agent core, to find the violations that a modified core adds.
 
 `prove` reports all violations, and the published protocol itself has some. After a change of the core, only the new
-violations are relevant. The original is the `ucp` of a commit or of a second checkout. A separate process explores it
-with the installed prover, so both proofs check the same properties. The process receives its bounds on standard input
-and prints the result as JSON:
+violations are relevant. The original is the `ucp` of a commit or of a second checkout. A separate process explores the
+original core with the installed prover, so both proofs check the same properties. The process receives its bounds on
+standard input and prints the result as JSON:
 
     python -m harness.proof.original
 """
@@ -26,7 +26,7 @@ from harness.run.code_state import ROOT, GitBisection, run_python
 
 MODULE = "harness.proof.original"
 INSTALLED = "installed"
-"""The name that stands for the core of this installation without a variant."""
+"""The name that a user gives for the agent core of this installation without a variant."""
 EXIT_S = 60.0
 """Seconds that the process may take in addition to the time limit, to start and to write its result."""
 

@@ -1,5 +1,5 @@
-"""Name blocks and chains in output. If the name of a block is known, it is for example `3.12`. Otherwise the first
-digits of its hash are used.
+"""Name blocks and chains in output. A block with a known name is shown by this name, such as `3.12`. Any other block is
+shown by the first digits of its hash.
 
 The names come from the exports of a run. Without exports, they come from the order of each agent's first proposals,
 because an agent proposes its blocks in the order in which it completed them. This requires a capture that begins before

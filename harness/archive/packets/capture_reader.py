@@ -1,8 +1,9 @@
 """Read one packet capture file. It contains the datagrams that one vehicle, or a separate observer, sent or received.
 
-The capture of a run names its vehicle in a comment (`ucp-harness run --capture`). A capture from the field has no
-comment. It belongs to the sender of its outbound datagrams. If it has none, it belongs to the vehicle in its file name,
-such as `7.pcap`. If the name has no vehicle either, the capture comes from a separate observer.
+A capture that `ucp-harness run --capture` made names its vehicle in a comment. A capture from the field has no comment.
+The vehicle of such a capture is the sender of the outbound datagrams in the file. If the file has no outbound
+datagrams, the vehicle is the one whose ID is the name of the file, such as `7.pcap`. If the name is no ID either, the
+capture belongs to a separate observer.
 """
 
 import hashlib
@@ -164,8 +165,8 @@ class Capture:
             return None
 
     def direction(self, sender: int, direction: int) -> int:
-        """Return the direction of a datagram. If the file contains no directions, datagrams of the vehicle itself count
-        as outbound.
+        """Return the direction of a datagram. If the file contains no directions, datagrams that the vehicle itself
+        sent count as outbound.
         """
         return direction or (OUTBOUND if sender == self.vehicle else INBOUND)
 

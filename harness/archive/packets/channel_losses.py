@@ -9,8 +9,8 @@ from harness.archive.packets.capture_reader import ListenerName
 from harness.archive.packets.transmissions import Transmission
 
 ChannelLosses = Mapping[tuple[int, int], Mapping[str, list[int]]]
-"""(Sender, sequence number) -> reason -> vehicles that lost the message. If the reason is in DROPS, no vehicles are
-listed.
+"""(Sender, sequence number) -> reason -> vehicles that did not receive the message for this reason. The set is empty
+for the reasons in DROPS.
 """
 
 DROPS = ("queue", "too_long")

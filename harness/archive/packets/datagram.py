@@ -1,8 +1,8 @@
 """Extract the UCP datagram from a captured frame, and summarise its message.
 
 A frame with a wrong checksum was damaged, and the receiver's kernel dropped it. One wrong checksum is an exception: a
-UDP checksum that covers only the addresses. The sender's kernel writes it and expects the network card to complete it,
-but a virtual network has no card. Such a frame is intact.
+UDP checksum that covers only the addresses. The sender's kernel writes such a checksum and expects the network card to
+replace it by the complete checksum, but a virtual network has no card. Such a frame is intact.
 
 Agents of a run use one port. In the field they may use a different port, so a payload that begins like a UCP message is
 accepted from any port.

@@ -15,12 +15,14 @@ from harness.archive.packets.transmissions import Transmission
 Outcome = Literal["answered", "response lost", "request lost", "no answer"]
 Subject = tuple[str, bytes | None]
 _Asked = tuple[float, int]
-"""The time of a request and its number."""
+"""The mission second of a request, and its position in the order of sending."""
 
 
 class RequestOutcome(NamedTuple):
     """The result of a request at the vehicle `by`. `response` is the first answer of this vehicle, or None without an
-    answer. The outcome is "answered" unless captures show that the requesting agent did not receive the response.
+    answer. If the vehicle answered, `outcome` is "answered", or "response lost" if the captures show that the
+    requesting agent did not receive the answer. Without an answer, `outcome` is "request lost" if the vehicle did not
+    receive the request, otherwise "no answer".
     """
 
     by: int

@@ -23,7 +23,7 @@ from ucp.messages import (
 )
 
 _NAMED = 10
-"""Maximum number of receivers whose IDs are listed. If there are more, only their number is printed."""
+"""Maximum number of receivers whose IDs are listed. If a message has more receivers, only their number is printed."""
 _OUTCOMES: tuple[Outcome, ...] = ("answered", "response lost", "no answer", "request lost")
 _INDENT = " " * 16
 

@@ -1,8 +1,9 @@
 """Read packet capture files frame by frame, in the formats pcapng and pcap with any byte order. The files may come from
 any source.
 
-scapy is not used for this. Its reader ignores the comment and the statistics of a section, does not report where a file
-is damaged, and does not limit the lengths in a file. Formats: draft-ietf-opsawg-pcapng, draft-ietf-opsawg-pcap.
+The package scapy is not used to read these files. The reader of scapy ignores the comment and the statistics of a
+section, does not report where a file is damaged, and does not limit the lengths in a file. Formats:
+draft-ietf-opsawg-pcapng, draft-ietf-opsawg-pcap.
 """
 
 import struct

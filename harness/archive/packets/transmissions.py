@@ -87,7 +87,7 @@ class _Listeners:
 
 
 def join(captures: Captures) -> list[Transmission]:
-    """Combine all captures to messages, in the order of sending."""
+    """Combine the datagrams of all captures, and return each transmission once, in the order of sending."""
     by_number = {capture.number: capture for capture in captures.used}
     listeners = _Listeners(captures.used)
     transmissions = [

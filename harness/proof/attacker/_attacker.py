@@ -68,8 +68,8 @@ class Attacker:
         self._forgeries: dict[tuple[int, ForgeryMaterial], tuple[int, ...]] = {}
 
     def forged_messages(self, locals_: tuple[int, ...]) -> Iterator[tuple[AgentAction, ...]]:
-        """Yield the attacker's actions that have an effect: each message, combined with each set of receivers that it
-        affects.
+        """Yield the attacker's actions that have an effect. An action sends one message to one set of receivers, and
+        the message must affect each receiver.
         """
         messages = dict.fromkeys(
             message for place, material in self.material(locals_) for message in self._to(locals_[place], material)
@@ -90,8 +90,8 @@ class Attacker:
         return step.local != local or bool(step.sent or step.started)
 
     def material(self, locals_: tuple[int, ...]) -> Iterator[tuple[int, ForgeryMaterial]]:
-        """Yield the index of each living agent, with the blocks and hashes from which the attacker can form messages to
-        this agent.
+        """Yield the index of each living agent together with the blocks and hashes that the attacker can use in
+        messages to this agent.
         """
         knowledge = {place: self._known_from(local) for place, local in enumerate(locals_) if local != DEAD}
         blocks = self._own.union(*(agent.committed for agent in knowledge.values()))
@@ -122,9 +122,9 @@ class AttackerKnowledge:
 
     The attacker can send each message to each agent any number of times.
 
-    The blocks with the given `ordinals` (in the order of their timestamps) are in the name of the captured vehicle. The
-    attacker has these blocks from the beginning. It repeats proposals of other agents. It need not repeat their
-    queries, because each agent can receive the originals.
+    Blocks are numbered in the order of their timestamps. The blocks with the numbers `ordinals` name the captured
+    vehicle as their author, and the attacker has them from the beginning. The attacker repeats the proposals of other
+    agents. The attacker need not repeat their queries, because each agent can receive the original queries.
     """
 
     def __init__(self, bounds: Bounds, ordinals: Iterable[int]) -> None:
@@ -145,7 +145,7 @@ class AttackerKnowledge:
             self._blocks.add(message.block)
 
     def material(self, agent_id: int) -> ForgeryMaterial:
-        """Return the blocks and hashes from which the attacker can form messages to an agent."""
+        """Return the blocks and hashes that the attacker can use in messages to an agent."""
         others = [asked for sender, proposals in self._proposals.items() if sender != agent_id for asked in proposals]
         return ForgeryMaterial(frozenset(self._blocks), frozenset(self._named), frozenset(others), self._times_us)
 

@@ -1,4 +1,4 @@
-"""List the messages that an attacker can send to an agent: one message for each kind of effect on the agent.
+"""List messages that an attacker can send to an agent, with one message for each possible effect on the agent.
 
 The effect of a message depends only on three properties: whether the agent holds a hash, which of two timestamps is
 older, and whether the answer is yes or no. docs/explanation/proof.md explains why these messages are enough. A test
@@ -28,8 +28,8 @@ from ucp.state import AgentState
 class PendingQuestions(NamedTuple):
     """The open queries and requests of an agent, for which it still waits for answers.
 
-    `vote` is the block and the chain hash of the agent's proposal. The other fields are the chain hash or block hash of
-    its query in phases 1, 2 and 3.
+    `vote` contains the block hash and the chain hash of the agent's proposal. `contains` and `successor` are the chain
+    hashes in its queries of phases 1 and 2. `block` is the block hash in its request of phase 3.
     """
 
     vote: tuple[bytes, bytes] | None = None
@@ -100,7 +100,9 @@ def _commits(state: AgentState, blocks: Iterable[Block]) -> Iterator[Message]:
 
 
 def _questions(state: AgentState, others: Iterable[PendingQuestions]) -> Iterator[Message]:
-    """Yield forged queries to this agent. The attacker sends only queries for whose answers another agent waits."""
+    """Yield forged queries to this agent. The attacker only sends a query if another agent waits for answers to the
+    same query.
+    """
     chain = state.chain
     for waits in sorted(others, key=repr):
         if waits.vote is not None:

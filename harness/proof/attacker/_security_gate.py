@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 BOOT = b"in a proof".ljust(16, b"\0")
 ATTACKERS_BOOT = b"later than that".ljust(16, b"\0")
-"""The boot of the attacker. It is later than all other boots, so agents drop the datagrams of the captured vehicle
-itself.
+"""The boot identifier in the attacker's datagrams. It is later than the boot identifier of the captured vehicle, so
+agents drop the datagrams that the captured vehicle itself sends.
 """
 
 

@@ -31,7 +31,7 @@ class AttackEntries:
         """Mission second at which each block was completed. The first element is the inception block."""
 
     def completed(self, agent_id: int, ordinal: int, at_s: float) -> None:
-        """Record that an agent completed a block. `ordinal` is its number among all blocks of the path."""
+        """Record that an agent completed a block. `ordinal` is the number of the block among all blocks of the path."""
         self._count[agent_id] += 1
         self._names[self._local.blocks.completed_by(agent_id, ordinal)] = f"{agent_id}.{self._count[agent_id]}"
         self._completed_s.append(at_s)
@@ -45,8 +45,8 @@ class AttackEntries:
             below = self._chains[chain_hash] = (*below, block.block_hash)
 
     def lie(self, receiver: int, number: int, at_s: float) -> list[Document]:
-        """Add a message of the attacker, and return a list with its timeline entry. The method `word` completes the
-        entry later.
+        """Add a message of the attacker, and return a list with its timeline entry. The entry is incomplete until the
+        method `word` completes it.
 
         If the previous message has the same content and time, the receiver is added to its entry, and the list is
         empty.

@@ -64,8 +64,8 @@ SCHEMA = "ucp-coverage/1"
 
 @dataclass(frozen=True)
 class CoverageShare:
-    """The number of existing states, inputs or branches that runs reached. It also has the number that they reached
-    outside the bounds.
+    """The number of existing states, inputs or branches that runs reached, and the number that runs reached outside the
+    bounds.
     """
 
     reached: int
@@ -99,8 +99,8 @@ def not_taken(reached: ReachedStates) -> list[Branch]:
 
 
 def to_json(reached: ReachedStates, there: ExistingStates | None) -> dict[str, object]:
-    """Return the coverage as a JSON document. If the existing states and pairs (`there`) are given, the document also
-    contains the share of them that the runs reached.
+    """Return the coverage as a JSON document. `there` contains the existing states and pairs. If it is given, the
+    document also contains the share of them that the runs reached.
     """
     missing = not_taken(reached)
     document = {

@@ -29,7 +29,9 @@ BRANCHES: tuple[Branch, ...] = tuple(
 """All branches in the agent contract."""
 
 MOST = 2_000_000
-"""Maximum number of local states, and of pairs, that are stored. More would need too much memory."""
+"""Maximum number of local states that are stored, and also the maximum number of pairs. A larger number would need too
+much memory.
+"""
 KEPT = 20_000
 """Maximum number of cached `HeldBlockOrder` objects."""
 
@@ -46,7 +48,7 @@ class ReachedStates:
     steps: int = 0
     """Number of handler runs that were examined."""
     untold: str | None = None
-    """The reason why some steps are unknown. None if all are known."""
+    """The reason why some steps are unknown. None if all steps are known."""
 
     def add(self, other: "ReachedStates") -> None:
         """Add the states, pairs and branches of another object to this one."""
@@ -111,8 +113,8 @@ class CoverageWatcher:
 
 
 def _given(run: HandlerRun | None, held: HeldBlockOrder) -> tuple[Any, ...] | None:
-    """Return the form in which an input is counted, for an agent that held the blocks in `held`. Return None for an
-    input that does not exist in any proof.
+    """Return a description of an input that does not depend on the run. `held` contains the blocks that the agent held
+    before the input. Return None for an input that does not exist in any proof.
     """
     if run is None:
         return None

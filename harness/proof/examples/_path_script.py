@@ -2,8 +2,8 @@
 
 Scripted events, message fates and timer delays make the simulation take the same path. A message takes LATENCY_S. An
 *instant* is a moment at which one or more agents act. If the path requires a different order of arrivals, or if the
-next instant follows soon, a fate gives the message a different delay. A message that is lost on the path has the fate
-`drop`. A timer expires on time, unless messages of the previous instant arrive later.
+next instant follows soon, a message fate in the scenario changes the delay of the message. If the path loses a message,
+the message gets the fate `drop`. A timer expires on time, unless messages of the previous instant arrive later.
 """
 
 from collections import Counter, defaultdict
@@ -35,8 +35,8 @@ that they arrive before it.
 """
 SETTLES_S = 60
 NO_CLOCKS = "if ties of phase 2 go as no clocks make them go"
-"""A text about contradictory ties: each of two blocks would have to be older than the other, or an agent's clock would
-have to go back.
+"""A text for paths whose ties contradict each other. On such a path, each of two blocks would have to be older than the
+other, or the clock of an agent would have to go back.
 """
 
 Document = dict[str, Any]
@@ -58,8 +58,8 @@ class _BroadcastOnPath:
 
 @dataclass
 class _AgentOnPath:
-    """An agent on a path through the state graph. For each running timer, `timers` contains its number among all timers
-    that the agent started, and its expiry.
+    """An agent on a path through the state graph. For each running timer, `timers` contains the number of the timer
+    among all timers that the agent started, and the time of its expiry.
     """
 
     agent_id: int
@@ -263,7 +263,7 @@ class PathScript:
     def _in_round_order(
         self, message_round: MessageRound, flights: Sequence[_BroadcastOnPath]
     ) -> list[_BroadcastOnPath]:
-        """Return the broadcasts in the order in which the round `message_round` lists them."""
+        """Return the broadcasts in the order in which `message_round` lists them."""
         left, ordered = list(flights), []
         for place, message in message_round.air:
             sender = self._agents[place].agent_id
@@ -275,7 +275,7 @@ class PathScript:
     def _hear(
         self, message_round: MessageRound, air: Sequence[_BroadcastOnPath], acted_s: float
     ) -> list[_BroadcastOnPath]:
-        """Deliver the messages of the round `message_round` to each agent, and return the answers."""
+        """Deliver the messages in `message_round` to each agent, and return the answers."""
         answers: dict[int, list[_BroadcastOnPath]] = {}
         received: set[int] = set()
         for place, heard in enumerate(message_round.heard):

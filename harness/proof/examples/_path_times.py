@@ -83,8 +83,8 @@ def _longest_paths(at_least: Sequence[float], later: Sequence[tuple[int, int, fl
 
 
 def _bounds(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: bool) -> list[tuple[int, int, float]]:
-    """Return the constraints on the times of steps, each as (step, second step, minimum number of seconds between
-    them).
+    """Return the constraints on the times of steps, each as (first step, second step, minimum number of seconds between
+    these steps).
     """
     later: list[tuple[int, int, float]] = [(number - 1, number, apart_s) for number in range(1, count)]
     for run in runs:
@@ -98,7 +98,8 @@ def _bounds(count: int, runs: Sequence[TimerRun], apart_s: float, *, punctual: b
 
 
 class BlockAges:
-    """The required order of the ages of all blocks on a path. Their timestamps are chosen to satisfy this order.
+    """The required order of the ages of all blocks on a path. The method `date` chooses timestamps that satisfy this
+    order.
 
     Blocks are identified by their ordinals in the states of the path. These ordinals change along the path.
     """
@@ -110,7 +111,7 @@ class BlockAges:
         """Index of an event -> indices of the events whose blocks are older than the block of this event."""
 
     def completed(self, ordinal: int) -> None:
-        """Record that the next event completes the block with this number."""
+        """Record that the next event completes the block with this ordinal."""
         assert ordinal == len(self._events) + 1, "blocks are numbered as they are completed"
         self._older[len(self._events)] = set()
         self._events.append(len(self._events))

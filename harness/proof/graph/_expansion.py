@@ -14,16 +14,16 @@ from harness.proof.questions._attractor import ByTimer
 
 NumberOf = Callable[[State], int]
 _Following = dict[Actions, dict[int, None]]
-"""Actions of an instant -> the numbers of the possible successors, in order."""
+"""Actions of an instant -> the numbers of the possible successor states, in order."""
 
 
 class StateExpansion(NamedTuple):
     """The successors of one state of the swarm. `transitions` is the number of transitions from this state.
 
     The other fields contain only successors without a lost message and without a new block. For each timer that may
-    expire next, `by_timer` contains the possible successors: the timer expires alone, or timers that must expire at the
-    same moment expire before it or together with it. `crossing` contains the successors in which several timers expire
-    at the same moment.
+    expire next, `by_timer` contains the possible successors. In a successor, the timer has expired alone, or after or
+    together with other timers that must expire at the same moment. `crossing` contains the successors in which several
+    timers expire at the same moment.
     """
 
     transitions: int
@@ -32,8 +32,8 @@ class StateExpansion(NamedTuple):
 
 
 def expanded(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
-    """Return the successors of a state. For each successor in order, the function `number_of` is called, which returns
-    its number.
+    """Return the successors of a state. The function calls `number_of` for each successor in order to get the number of
+    the successor.
     """
     lossy = swarm.bounds.network == "lossy"
     transitions = 0
@@ -77,8 +77,8 @@ def _quiet(
 
 @contextmanager
 def cycles_left_alone() -> Iterator[None]:
-    """Switch off Python's garbage collection of reference cycles. Processes that are forked inside the context keep it
-    off.
+    """Switch off Python's garbage collection of reference cycles. In processes that are forked inside the context, this
+    garbage collection stays off.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -92,9 +92,10 @@ def cycles_left_alone() -> Iterator[None]:
 class StateStore(Sequence[State]):
     """The states of a swarm as bytes, numbered in the order in which they were added.
 
-    The function `contains` returns true if its first zone contains its second zone. A state whose zone is contained in
-    the zone of a stored state with the same agents then gets the number of the stored state: each run from the one
-    state is also a run from the other. Without this function, only equal states have the same number.
+    The function `contains` takes two zones, and returns true if the first one contains the second one. A new state
+    whose zone is contained in the zone of a stored state with the same agents then gets the number of the stored state.
+    This is correct because each run from the new state is also a run from the stored state. Without `contains`, only
+    equal states have the same number.
     """
 
     def __init__(self, agents: int, contains: Callable[[int, int], bool] | None = None) -> None:

@@ -20,27 +20,31 @@ NO_PARENT = -1
 
 @dataclass
 class StateGraph:
-    """The explored states by number, and the predecessor of each state. If `ended` is "complete", the graph contains
-    all reachable states.
-
-    `quiet` and `crossing` contain the fields `by_timer` and `crossing` of each state's `StateExpansion`. If `exact` is
-    false, a state can represent states whose zones its zone contains.
+    """The explored states by number, and a predecessor of each state. If `ended` is "complete", the graph contains all
+    reachable states.
     """
 
     swarm: ModelSwarm
     exact: bool = False
+    """If false, a state can also represent states with smaller zones, which are contained in its own zone."""
     states: StateStore = field(init=False)
     parents: "array[int]" = field(default_factory=lambda: array("q"))
+    """For each state, the state from which it was first reached."""
     quiet: SuccessorStore = field(default_factory=SuccessorStore)
+    """For each state, the field `by_timer` of its `StateExpansion`."""
     crossing: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    """State -> the field `crossing` of its `StateExpansion`."""
     transitions: int = 0
     depth: int = 0
     seconds: float = 0.0
     looked_at: int = 0
     ended: Ended = "complete"
     flawed: int | None = None
+    """The number of the first state with a violation. None if no state has one."""
     shown: dict[str, int] = field(default_factory=dict)
-    """Characteristic -> first state in which an attacker has violated it although the agents are correct."""
+    """Characteristic -> the number of the first state in which an attacker has violated this characteristic although
+    the agents are correct.
+    """
     workers_bytes: float = 0.0
     workers_s: float = 0.0
     workers_steps: int = 0

@@ -1,9 +1,9 @@
 """Explore states in worker processes on all processor cores.
 
 The workers are forked processes. Each worker starts with the agents and steps that are known at the fork. From then on,
-it numbers new local states and zones itself, so the numbers of processes differ. A message between two processes uses
-the receiver's number of a state if the sender knows it. Otherwise it uses the sender's number. The first such message
-also contains the definition of the state.
+it numbers new local states and zones itself, so the numbers of processes differ. If a process mentions a state to
+another process and knows the receiver's number of this state, it uses this number. Otherwise it uses its own number.
+The first time, it also sends the definition of the state.
 
 The main process distributes the states in order, and adds their successors in the same order. The result is therefore
 the same as with one process.
@@ -41,7 +41,7 @@ Above this number, the worker forgets these states and reports them again.
 """
 
 Definitions = list[tuple[int, Any]]
-"""Numbers of the sending process, with their definitions."""
+"""State numbers of the sending process, each with the definition of the state."""
 
 
 class StateBatch(NamedTuple):
@@ -298,7 +298,7 @@ class Workers:
         return sum(other.steps for other in self._handles)
 
     def pays_off(self, waiting: int) -> bool:
-        """Return true if enough states are waiting that using the workers saves time."""
+        """Return true if so many states are waiting that the use of the workers saves time."""
         return self._size > 1 and waiting >= WORTH_WORKERS
 
     def expansions(
@@ -324,8 +324,8 @@ class Workers:
     def _answers(
         self, give: Give, states: Sequence[State], check: Check, first: int = 0
     ) -> Iterator[tuple[_WorkerHandle, int, SuccessorBatch | NeededVotes]]:
-        """Yield the answers of the workers in the order of the tasks. Each answer has its worker and the number of its
-        first state. `states` may grow during the loop.
+        """Yield the answers of the workers in the order of the tasks. Each answer comes with its worker, and with the
+        number of the first state of its task. `states` may grow during the loop.
         """
         if not self._handles:
             with signals_blocked():  # a Ctrl-C inside a fork must not end it halfway

@@ -2,8 +2,8 @@
 sent.
 
 A message may be lost, duplicated, delayed for any time and overtaken. An agent can therefore receive each sent message
-at any moment, any number of times. Otherwise it does not depend on the other agents, with one exception: no agent can
-mention a block before it is completed.
+at any moment, any number of times. Otherwise an agent does not depend on the other agents, with one exception: no agent
+can mention a block before the block is completed.
 
 The local states of each agent and the sent messages are collected together until no new ones appear. The result
 contains every local state and message of every possible run. It may contain more, because some of these messages may
@@ -35,7 +35,9 @@ Said = tuple[int, int]
 
 @dataclass
 class SingleAgentFigures:
-    """The numeric results of an exploration of single agents. `said` counts the different messages of all senders."""
+    """The numeric results of an exploration of single agents. `said` is the number of different messages of all
+    senders.
+    """
 
     bounds: Bounds
     states: int = 0
@@ -95,7 +97,7 @@ def collect(
 
 
 def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator[tuple[int, ...]]:
-    """Yield each distribution of the blocks among the agents: a tuple that contains the author of each block.
+    """Yield each distribution of the blocks among the agents, as a tuple that contains the author of each block.
 
     Distributions that differ only by an exchange of agents are yielded once. The captured agent is never exchanged.
     """
@@ -131,8 +133,8 @@ class _BlockDistribution:
         the captured vehicle.
         """
         self._lied: dict[int, tuple[ForgeryMaterial, int]] = {}
-        """Agent -> the data of the last forged messages to it, and the number of its states in which the exploration
-        has delivered these messages.
+        """Agent -> two values: the data from which the last forged messages to the agent were made, and the number of
+        the agent's states in which the exploration has delivered these messages.
         """
         self._looked_at = 0
         """Number of states in which the exploration has tried the agent's own actions (the actions without a received

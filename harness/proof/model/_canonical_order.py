@@ -17,7 +17,7 @@ from harness.proof.model._snapshot import NAMES_OF_OTHERS
 from harness.proof.model._zones import ZoneTable
 
 Places = tuple[int, ...]
-"""The previous position of the agent at each position of a state."""
+"""For each position of a state, the previous position of the agent that is now there."""
 
 
 class OrderedAgents(NamedTuple):
@@ -43,7 +43,8 @@ several states.
 class CanonicalOrder:
     """A sorter that puts agents into their canonical order.
 
-    `name_of` returns the ID by which the agent at one position knows the agent at another position.
+    Agents use IDs for each other. `name_of` returns the ID that the agent at one position uses for the agent at another
+    position.
     """
 
     def __init__(self, local: LocalStates, zones: ZoneTable, name_of: Callable[[int, int], int]) -> None:
@@ -103,8 +104,8 @@ class CanonicalOrder:
         return timers
 
     def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range]) -> Iterator[Places]:
-        """Yield all orders of the agents in which their descriptions ascend. Agents with equal descriptions are yielded
-        in every order.
+        """Yield all orders of the agents in which the descriptions of the agents are sorted in ascending order. Agents
+        with equal descriptions are yielded in every order.
         """
         known, pattern = self._local.known, self._local.pattern
         bounds = self._zones.bounds(zone) if zone else [()]
@@ -167,8 +168,8 @@ class CanonicalOrder:
     ) -> bool:
         """Return true if these agents with equal descriptions differ only in their blocks.
 
-        In this case these agents have no timers and have counted no agent, and each vote count of the other agents
-        contains all of these agents or none.
+        They differ only in their blocks if they have no timers and have counted no agent, and if each vote count of the
+        other agents contains all of these agents or none.
         """
         if timers[group[0]]:
             return False
@@ -186,7 +187,7 @@ class CanonicalOrder:
         return [{self._place_of(other, place) for other in snapshot[name]} for name in NAMES_OF_OTHERS]
 
     def _place_of(self, name: int, place: int) -> int:
-        """Return the position of an agent. `place` is the position of an agent that knows it by this ID."""
+        """Return the position of the agent for which the agent at `place` uses this ID."""
         return name - 2 if name - 2 < place else name - 1
 
     def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:

@@ -10,12 +10,14 @@ from ucp.state import AgentState
 
 @dataclass(frozen=True, slots=True)
 class PropertyViolation:
-    """A violation: its kind, and a sentence that describes it.
+    """A violation: its kind, and a sentence that describes it. `handler` is the handler of a wrong step.
 
     The kind is a characteristic ("2", "3", "4"), "hang", "crash" or "steps". With an attacker, there are three further
-    kinds. "name": an agent accepted a message in the name of a vehicle that did not send it. "revoked": an agent
-    accepted a message of a revoked vehicle. "honest": an agent holds a block in the name of an honest vehicle that did
-    not complete it. `handler` is the handler of a wrong step.
+    kinds:
+
+    - "name": an agent accepted a message in the name of a vehicle that did not send it.
+    - "revoked": an agent accepted a message of a revoked vehicle.
+    - "honest": an agent holds a block in the name of an honest vehicle that did not complete it.
     """
 
     kind: str
@@ -24,7 +26,7 @@ class PropertyViolation:
 
 
 FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
-"""Kinds of violations that only the step shows, not the state after it."""
+"""Kinds of violations that are found in a step of an agent. The state after the step does not show them."""
 
 
 def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> PropertyViolation | None:

@@ -31,8 +31,8 @@ from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 State = tuple[int, ...]
 """A global state: the number of completed blocks, the remaining faults, the zone, and the local states.
 
-The number for the remaining faults has a bit for each fault and for the capture, and contains the remaining numbers of
-forged messages, coincidences and losses.
+The remaining faults are encoded in one number. It has a bit for each fault and for the capture. It also contains the
+remaining numbers of forged messages, coincidences and losses.
 """
 MOST_KNOWN = 200_000
 """Maximum number of cached instants. Above it, the cache is emptied."""
@@ -52,8 +52,8 @@ BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
 
 
 class SwarmTransition(NamedTuple):
-    """A transition between two states of the swarm: its actions, the new state, and the previous positions of the
-    agents.
+    """A transition between two states of the swarm. `state` is the new state, and `places` contains the previous
+    positions of the agents.
 
     `last_round` is the last round of messages in the transition.
     """
@@ -69,10 +69,11 @@ class SwarmTransition(NamedTuple):
 
 
 class _InstantResult(NamedTuple):
-    """The states of all agents after one instant: simultaneous actions, and all messages that they cause.
+    """The states of all agents after one instant. An instant consists of simultaneous actions and all messages that
+    these actions cause.
 
-    `running` contains the previous number of each running timer. `started` and `ending` describe the events that led to
-    this result.
+    `running` contains the previous number of each running timer. `started` contains the timers that each agent started.
+    `ending` is the last round of messages.
     """
 
     agents: tuple[int, ...]
@@ -82,8 +83,8 @@ class _InstantResult(NamedTuple):
 
 
 class _InstantResults(NamedTuple):
-    """All possible results of one instant, as far as they do not depend on exact timer values: expired timers, new
-    blocks, remaining faults, and agents.
+    """The parts of all possible results of one instant that do not depend on exact timer values: the expired timers,
+    the number of completed blocks, the remaining faults, and the states of the agents.
     """
 
     ended: tuple[int, ...]
@@ -121,8 +122,8 @@ class ModelSwarm:
 
     @property
     def contains(self) -> Callable[[int, int], bool] | None:
-        """A function that returns true if its first zone contains its second zone. None if only equal states count as
-        one.
+        """A function that takes two zones, and returns true if the first one contains the second one. None if only
+        equal states count as one state.
         """
         return self.zones.contains if self.bounds.zones_contained else None
 
@@ -133,8 +134,8 @@ class ModelSwarm:
         return [action for actions in self._firsts(state) for action in actions]
 
     def _firsts(self, state: State) -> list[list[AgentAction]]:
-        """Return the timer expiries that may happen next: for each timer, a list of actions, one for each possible
-        result.
+        """Return the timer expiries that may happen next. The result contains a list for each timer. The list has one
+        action for each possible result of the expiry.
         """
         running = self._running(state[AGENTS:])
         if not self.bounds.timers_any:
@@ -209,8 +210,8 @@ class ModelSwarm:
             yield from self._of_the_attacker(self.attacker, state)
 
     def _of_the_attacker(self, attacker: Attacker, state: State) -> Iterator[Actions]:
-        """Yield the actions of the attacker: the capture of a vehicle, and later each forged message with any set of
-        receivers.
+        """Yield the actions of the attacker. First it can capture a vehicle. After that, it can send each forged
+        message to any set of receivers.
         """
         assert self.bounds.captured is not None, "the attacker has the keys of a vehicle"
         if state[LEFT] >> ONCE.index("captured") & 1:
@@ -379,7 +380,7 @@ class ModelSwarm:
         )
 
     def name_of(self, other: int, place: int) -> int:
-        """Return the ID by which the agent at position `place` knows the agent at position `other`."""
+        """Return the ID that the agent at position `place` uses for the agent at position `other`."""
         return self._instants.name_of(other, place)
 
     def order_matters(self, local: int, place: int, message_round: MessageRound, heard: Sequence[int]) -> bool:
@@ -399,7 +400,7 @@ class ModelSwarm:
         """Yield the characteristics that the attacker has violated although all honest agents follow the protocol.
 
         Such a violation exists if an agent accepted a message that the captured vehicle never sent, or holds a block in
-        its name that it never completed.
+        the name of the captured vehicle that the captured vehicle never completed.
         """
         if _lies(state) < self.bounds.lies:
             yield "1"

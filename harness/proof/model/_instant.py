@@ -20,8 +20,8 @@ from harness.proof.model._local_steps import LocalStates
 from harness.proof.model._snapshot import AgentStep, Started
 
 ReceivedMessages = tuple[tuple[int, int], ...]
-"""The messages that reach an agent in one round, in the order of the senders. Each is (ID of the sender for this agent,
-message).
+"""The messages that reach an agent in one round, in the order of the senders. Each message is a pair: the ID that this
+agent uses for the sender, and the number of the message.
 """
 
 
@@ -38,10 +38,14 @@ without limit, and exceed this maximum.
 
 
 class AgentAction(NamedTuple):
-    """An action of one agent: "timer" with the timer's number, "complete" with the block's number, or a fault.
+    """An action of one agent. `what` is one of these:
 
-    It can also be an action of the attacker: the agent is "captured", or receives a "lie", a forged message with this
-    number. If a timer has several possible results because any block may be the older one, `result` selects the result.
+    - "timer": the timer `number` expires. If this has several possible results because any block may be the older one,
+      `result` selects the result.
+    - "complete": the agent completes the block `number`.
+    - the name of a fault.
+    - "captured": the attacker captures the agent.
+    - "lie": the agent receives the attacker's forged message `number`.
     """
 
     place: int
@@ -74,7 +78,7 @@ class MessageRound(NamedTuple):
 
 
 class FinalMessageRound(NamedTuple):
-    """The last round of messages in an instant. Each round refers to the round before it.
+    """The last round of messages in an instant. It refers to the round before it, and so on.
 
     `lost` is the number of lost messages. A message counts once for each receiver that loses it. The number is 0 if
     losses are not counted.
@@ -96,8 +100,8 @@ number of lost messages.
 
 _Key = TypeVar("_Key")
 _Outcome = tuple[AgentStep, tuple[int, ...]]
-"""A step of an agent, and an order of the received messages with this result. The order lists the indices of the
-messages that the agent receives.
+"""A step of an agent, and an order of received messages that leads to this step. The order consists of the indices of
+the messages.
 """
 
 
@@ -136,8 +140,8 @@ class InstantOutcomes:
     def outcomes(
         self, locals_: tuple[int, ...], actions: Sequence[AgentAction], most_lost: int, *, with_rounds: bool
     ) -> dict[AgentStates, FinalMessageRound]:
-        """Return the possible results of these actions. If the same result can be reached in several ways, keep the way
-        with the fewest lost messages.
+        """Return the possible results of these actions. If several sequences of messages lead to the same result, keep
+        the one with the fewest lost messages.
 
         If `with_rounds` is true, the result includes the rounds of messages.
         """

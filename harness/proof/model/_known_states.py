@@ -25,23 +25,21 @@ Names = tuple[int, ...]
 """The IDs that one agent uses for the other agents, in the order of the other agents."""
 
 WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us": -1}
-"""Parts of the state that no handler reads if no block is ever lost, with their initial values."""
+"""Parts of the state that no handler reads as long as no block is lost -> their initial values."""
 
 
 @dataclass(frozen=True, slots=True)
 class KnownLocalState:
-    """A known state of the agent with the ID `agent_id`.
-
-    `waits` is true if the agent is in a reconcile. `chain` contains the numbers of the blocks in its chain. `deceived`
-    is true if the agent holds a block in the name of the captured vehicle that the captured vehicle never completed.
-    """
+    """A known state of the agent with the ID `agent_id`."""
 
     agent_id: int
     snapshot: Snapshot
     running: tuple[int, ...]
     idle: bool
     waits: bool
+    """True if the agent is in a reconcile."""
     chain: tuple[int, ...]
+    """The numbers of the blocks in the agent's chain."""
     flaw: PropertyViolation | None
     anonymous: int
     """A number that is equal for states that differ only in the identity of voters and responders.
@@ -50,6 +48,7 @@ class KnownLocalState:
     """
     names_others: bool
     deceived: bool
+    """True if the agent holds a block in the name of the captured vehicle that the captured vehicle never completed."""
 
 
 class KnownStates:
@@ -136,7 +135,7 @@ class KnownStates:
         """Return new IDs for the other agents that put the counted agents first, and the sender after them. Return None
         if no change is needed.
 
-        If IDs make no difference, the behaviour of an agent is the same except for these IDs
+        If states are stored without agent IDs, an agent behaves in the same way with the new IDs
         (docs/explanation/proof.md).
         """
         known = self.known[local]
@@ -164,6 +163,6 @@ class KnownStates:
 
 
 def _back(names: Names) -> Names:
-    """Return the renaming of agents that undoes this renaming."""
+    """Return the new IDs that undo this renaming of agents."""
     before = {name: other for other, name in enumerate(names, FIRST_OTHER)}
     return tuple(before[name] for name in sorted(names))

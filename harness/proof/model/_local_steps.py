@@ -153,8 +153,8 @@ class LocalStates(KnownStates):
         return ends
 
     def older(self, local: int, timer: int, result: int) -> tuple[int, frozenset[int]]:
-        """Return the block that must be the oldest candidate for this result of a timer expiry, and the candidates that
-        must be newer.
+        """A timer expiry has this result only if one candidate block is older than others. Return the candidate that
+        must be the oldest, and the candidates that must be newer.
 
         Block 0 is the inception block. The set of candidates is empty if the agent does not compare ages.
         """
@@ -204,8 +204,9 @@ class LocalStates(KnownStates):
         return step
 
     def _got_in(self, local: int, message: int) -> PropertyViolation | None:
-        """Return a violation if the agent accepts a forged message: of a revoked vehicle, in the name of a third
-        vehicle, or with a block in the receiver's own name. Otherwise return None.
+        """Return a violation if the agent accepts a message that it must reject: a message of a revoked vehicle, a
+        forged message in the name of a third vehicle, or a message with a forged block in the receiver's own name.
+        Otherwise return None.
         """
         known, said = self.known[local], self.messages[message]
         revoked = self.agents.revoked[known.agent_id]
@@ -314,9 +315,8 @@ class LocalStates(KnownStates):
     def _check_counts(
         self, agent_id: int, before: Snapshot, give: Give, after: Snapshot, results: tuple[tuple[int, ...], Started]
     ) -> None:
-        """Repeat the step with other counters and another time. Repeat the step with other counters and another time.
-        Raise UncoveredError if the step depends on the time, on the number of earlier reconciles or messages, or on the
-        order of dictionaries.
+        """Repeat the step with other counters and another time. Raise UncoveredError if the step depends on the time,
+        on the number of earlier reconciles or messages, or on the order of dictionaries.
         """
         for count, now_s in OTHER_COUNTS:
             agent = self._counting[agent_id]

@@ -19,7 +19,9 @@ from ucp.quirks import wrong_handlers
 
 INITIAL_DATA = b"proof"
 AT_ONCE_S = 0.05
-"""Seconds. A shorter timer expires before any answer can arrive, because a message takes 2 to 50 ms."""
+"""Number of seconds. A timer with a shorter duration expires before any answer can arrive, because a message takes 2 to
+50 ms.
+"""
 MOST_AT_ONCE = 100
 
 

@@ -3,8 +3,8 @@ shape.
 
 A shape identifies a block by its position among the blocks that the agent holds, sorted by timestamp and then by hash.
 Blocks that the agent does not hold are only counted. Like the reductions of `_local_steps.py`, a shape omits parts that
-are written before they are read. A vote is reduced to the fact whether more agents approve than disapprove. The block
-under construction is omitted, because within the bounds of a proof each event fills a block. Shapes can therefore
+are written before they are read. Of a vote, a shape only contains whether more agents approve than disapprove. The
+block under construction is omitted, because within the bounds of a proof each event fills a block. Shapes can therefore
 compare the states of any run of any mission with the states that exist within bounds.
 """
 
@@ -21,14 +21,16 @@ from ucp.state import AgentState
 Shape = tuple[Any, ...]
 
 LEFT_OUT = frozenset(("current_block", "completed", "newest_block_timestamp_us", "voters", "reconcile_responders"))
-"""Parts that a shape omits in addition to those that a snapshot omits: parts for making blocks, and the members of
-tallies.
+"""Parts that a shape omits in addition to those that a snapshot omits: the parts that are used to make blocks, and the
+members of tallies.
 """
 
 ELSEWHERE = -1
 """The ordinal that stands for a block that the agent does not hold."""
 ON_TOP = "on top"
-"""The name that stands for the chain hash of the agent's chain with the message's block on top."""
+"""A name in a shape. It stands for the chain hash that the agent's chain would have after appending the block in the
+message.
+"""
 
 
 class HeldBlockOrder:
@@ -56,7 +58,7 @@ class HeldBlockOrder:
         )
 
     def number(self, shape: Shape) -> int:
-        """Return a number for a shape: 64 bits of its hash, which are equal on all machines.
+        """Return 64 bits of the hash of a shape, as a number. The number is equal on all machines.
 
         `shape` describes the rest of a state with these blocks, or such a state together with an input.
         """
@@ -113,8 +115,8 @@ class HeldBlockOrder:
 
 
 def shape_of(state: AgentState | ReferenceState, held: HeldBlockOrder) -> Shape:
-    """Return the shape of a state without the held blocks. It identifies the state together with the shape of
-    `held`.
+    """Return the shape of a state without the held blocks. This shape and the shape of `held` together identify the
+    state.
     """
     shape: list[Any] = [state.reconcile_in_progress]
     for timer in state.timers:

@@ -1,5 +1,5 @@
-"""Store the complete state of an agent as a snapshot whose equal parts are shared, and describe steps between
-snapshots.
+"""Store the complete state of an agent as a snapshot, and describe steps between snapshots. Snapshots share equal
+parts.
 
 The key of a snapshot omits only parts that never affect the agent's behaviour: the time of its last input, counters
 that are only reported, and its pending output. All other attributes of `ucp.state.AgentState` are in the key, including
@@ -21,14 +21,16 @@ from ucp.timers import Timer
 REPORTED = frozenset(("now", "sent", "reconciles", "chain_changed_at", "_sequence"))
 """Counters and notes that are needed only for a trace or for the sequence number of a datagram.
 
-They grow without limit, so they cannot be part of a state. Each step begins with the counters at zero, at `NOW_S`. An
-unreduced proof repeats each step with other counters and at other times, and refuses an agent whose step depends on
-them.
+They grow without limit, so they cannot be part of a state. At the beginning of each step, the counters are zero, and
+the mission second is `NOW_S`. An unreduced proof repeats each step with other counters and at other times, and refuses
+an agent whose step depends on them.
 """
 COUNTS = ("reconciles", "_sequence", "chain_changed_at")
 """The counters in `REPORTED` that are numbers and that no input sets."""
 FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing", "_seal", "sealed"))
-"""Attributes that never change, or that are other names of included parts. Explored agents do not encrypt events."""
+"""Attributes that never change, or that refer to the same objects as included parts. Explored agents do not encrypt
+events.
+"""
 HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
 LEFT_OUT = REPORTED | FIXED | HANDED_OVER
 

@@ -8,8 +8,8 @@ and plus the longest duration, so their number is finite.
 
 The number of zones can still be large. If two groups of agents repeat cycles whose periods differ by 0.1 s, their
 relative times shift by 0.1 s in each round, and each round has new zones. Most of these zones are contained in the zone
-of the first round (`ZoneTable.contains`, option `--zones contained`). Widening the zones would need fewer states, but
-its paths need not be runs.
+of the first round (`ZoneTable.contains`, option `--zones contained`). With widened zones, a proof would need fewer
+states, but its paths might be impossible as runs.
 """
 
 from collections.abc import Sequence
@@ -109,7 +109,8 @@ class ZoneTable:
         return self._permuted[key]
 
     def adrift(self, zone: int) -> int:
-        """Return the zone with the same differences between timers and any remaining time until the first expiry.
+        """Return the zone in which the differences between timers are the same as in this zone, and the remaining time
+        until the first expiry is arbitrary.
 
         If no other event can happen before the first expiry, the time until then makes no difference.
         """
@@ -125,8 +126,9 @@ class ZoneTable:
         """Return the number of independent events that must coincide so that these timers expire next and at the same
         moment.
 
-        This is the number of differences between timers that are variable in the zone but fixed when these timers
-        expire. The timers must be able to expire at the same time.
+        Timers whose differences are fixed form a group. When these timers expire at the same moment, groups merge. The
+        result is the number by which the number of groups decreases. The timers must be able to expire at the same
+        time.
         """
         key = zone, ended
         if key not in self._coincidences:

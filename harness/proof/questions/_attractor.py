@@ -16,9 +16,9 @@ reached.
 class BackwardReachableStates:
     """A growing set of states: the goals, and all states from which the swarm reaches a goal.
 
-    The durations of timers determine which timer expires next, but in a zone several timers may be possible. All of
-    these must lead to a goal, unless timers expire in `any_order`. If timers must expire at the same moment, only the
-    transit times of messages determine their order, so one order that leads to a goal is enough.
+    The durations of timers determine which timer expires next, but in a zone, several timers may be the next one. Each
+    of these timers must lead to a goal, unless timers expire in `any_order`. If timers must expire at the same moment,
+    only the transit times of messages determine their order, so one order that leads to a goal is enough.
     """
 
     def __init__(self, by_timer: Sequence[ByTimer], any_order: bool, check: Check = lambda: None) -> None:
@@ -26,13 +26,13 @@ class BackwardReachableStates:
         self._any_order = any_order
         self._inside = bytearray(len(by_timer))
         self._open = array("q", map(len, by_timer))
-        """The number of timers of each state that do not lead to a goal yet."""
+        """For each state, the number of its timers that are not yet known to lead to a goal."""
         self._whose = array("q", (number for number, choices in enumerate(by_timer) for _ in choices))
         """The state to which each timer belongs. The timers of all states are numbered consecutively."""
         self._leads = bytearray(len(self._whose))
         self._ends = _ends(by_timer, check)
-        """The predecessors of state n are in `_before`, from `_ends[n]` up to `_ends[n + 1]`. They are stored as
-        timers.
+        """The predecessors of state n are in `_before`, from `_ends[n]` up to `_ends[n + 1]`. Each is stored as the
+        number of the timer whose expiry leads to state n.
         """
         self._before = array("q", bytes(8 * self._ends[-1]))
         filled = self._ends[:]

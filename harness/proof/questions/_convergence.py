@@ -26,10 +26,11 @@ It raises LimitReachedError when the limit of memory or time is reached.
 class ConvergenceResult:
     """The result of the search: endless cycles, and states from which the swarm does not reach one common chain.
 
-    - `forks`: number of idle states with several different chains. `fork` is the nearest of these states.
+    - `forks`: number of idle states with several different chains. `fork` is the one of these states that is nearest to
+      the initial state.
     - `cycles`: cycles as lists of their states, the nearest first.
-    - `astray`: for 0, 1, 2, ... further votes, the number of states from which the swarm still cannot become idle with
-      one chain. The list ends at 0 states, or at one vote for each agent.
+    - `astray`: numbers of states. Element n is the number of states from which the swarm cannot become idle with one
+      chain even after n further votes. The list ends with 0, or at one vote for each agent.
     - `lost`: the nearest state from which one vote for each agent is not enough.
     - `reluctant`: the nearest state for which one vote is not enough.
     - `flaw`: a violation after further votes. It ended a path that might have led to one chain.

@@ -38,11 +38,15 @@ class ExtraVotes:
         self._swarm = swarm
         self._check = check
         self._enough: dict[State, int] = {}
-        """State -> a number of votes that is enough. `_too_few` contains numbers that are not enough."""
+        """State -> a number of further votes that makes all chains equal. `_too_few` contains numbers of votes that are
+        not enough.
+        """
         self._too_few: dict[State, int] = {}
         self._explored = 0
         self._flaw: PropertyViolation | None = None
-        """The first violation after further votes. It ends its path, because a wrong agent takes no further step."""
+        """The first violation after further votes. The violation ends the path on which it was found, because a wrong
+        agent takes no further step.
+        """
 
     def needed(self, fork: State) -> int | PropertyViolation | None:
         """Return the smallest number of votes that makes all chains equal. If one vote per agent is not enough, return
@@ -58,12 +62,13 @@ class ExtraVotes:
     def _a_vote_leads(self, fork: State, votes: int, instants: int = 0) -> bool:
         """Return true if one vote, followed by at most `votes - 1` further votes, leads to equal chains.
 
-        `instants` is the number of instants on the path so far. It is limited because the search is recursive.
+        `instants` is the number of instants on the path so far. This number is limited because the search is recursive.
         """
         return any(self._leads(after, votes - 1, instants + 1) for after in self._after_a_vote(fork))
 
     def _after_a_vote(self, fork: State) -> Iterator[State]:
-        """Yield the possible states after a vote of one agent. Of several agents in equal states, only one is tried.
+        """Yield the possible states after a vote of one agent. If several agents are in equal states, only one of them
+        votes.
 
         The agents with the rarest chain are tried first.
         """
@@ -139,7 +144,7 @@ class ExtraVotes:
                 )
 
     def _explore_all(self, state: State, votes: int, instants: int) -> None:
-        """Explore all successors of a state. Record for each one whether this number of votes is enough."""
+        """Explore all successors of a state. Record for each successor whether this number of votes is enough."""
         states, numbers = [state], {state: 0}
 
         def number_of(after: State) -> int:

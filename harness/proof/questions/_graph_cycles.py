@@ -38,8 +38,9 @@ def _cyclic_parts(graph: StateGraph, check: Check) -> Iterator[list[int]]:
 
 
 def _with_exact_zones(graph: StateGraph, part: Sequence[int], check: Check) -> StateGraph:
-    """Return the graph of all states that are reached from a part of a graph, whose agents are always in states that
-    occur in this part. Only equal states are one state. The first states of the result are those of `part`.
+    """Explore a part of a graph again, starting from its states. Include only states whose agents are in local states
+    that occur in the part. Return the new graph, in which only equal states are one state. The first states of the
+    result are those of `part`.
     """
     exact = StateGraph(graph.swarm, exact=True)
     for number in part:

@@ -17,8 +17,8 @@ from harness.proof.model._global_states import AGENTS
 from harness.proof.model._known_states import DEAD
 
 MAX_FORMS = 12
-"""Maximum number of forms that are played. Forms that are possible with real clocks come first, then the forms nearest
-to the initial state.
+"""Maximum number of forms for which an example is played. Forms that are possible with real clocks come first. Within
+each group, the forms nearest to the initial state come first.
 """
 MAX_PLAYED = 5
 """Maximum number of cycles of one form that are played to find one that the simulation confirms."""
@@ -133,10 +133,9 @@ def show(graph: StateGraph, cycles: Sequence[list[int]], path: Path, name: str) 
 
 
 def _nearest(graph: StateGraph, alike: Sequence[list[int]]) -> list[_CycleExample]:
-    """Return some cycles of one form. The best example is first.
-
-    Cycles that are possible with real clocks come first, then those with the fewest coincidences, then those with the
-    fewest blocks whose completion time is fixed.
+    """Return some cycles of one form, with the best example first. A cycle that is possible with real clocks is better
+    than one that is not. Otherwise, a cycle with fewer coincidences is better, and then a cycle with fewer blocks whose
+    completion time is fixed.
     """
     tried: list[tuple[bool, int, int, _CycleExample]] = []
     for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MAX_PLAYED]:

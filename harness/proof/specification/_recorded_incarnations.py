@@ -67,19 +67,18 @@ Item = Any
 
 @dataclass
 class EncodedIncarnation:
-    """The encoded steps of an agent between two restarts. `lines` contains the trace line of each step.
-
-    `whole` is true if no steps are missing at the end. `unread` is the reason why the lines after these steps could not
-    be encoded, or None if all lines are encoded.
-    """
+    """The encoded steps of an agent between two restarts."""
 
     agent_id: int
     number: int
     steps: list[Item] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
+    """The number of the trace line of each step."""
     handlers: list[str] = field(default_factory=list)
     whole: bool = True
+    """True if no steps are missing at the end."""
     unread: str | None = None
+    """The reason why the lines after these steps could not be encoded. None if all lines are encoded."""
 
 
 class ChainNumbers:
@@ -185,7 +184,7 @@ class _IncarnationEncoder:
         )
 
     def _came(self, run: HandlerRun) -> tuple[Item, bool]:
-        """Encode the input of a handler run. Also return true if the agent must drop the input. Raises ValueError if
+        """Return the encoded input of a handler run, and true if the agent must drop this input. Raises ValueError if
         the input is invalid.
         """
         trigger = run.trigger

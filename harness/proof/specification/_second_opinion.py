@@ -18,8 +18,8 @@ from ucp.clock import MICROSECONDS
 
 MEGABYTE = 1e6
 AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
-"""Deliberate mistakes (quirks) that the specification also supports. In these two places the printed algorithms of the
-thesis contradict its text.
+"""The two deliberate mistakes (quirks) that the specification also supports. At these places, the printed algorithms of
+the thesis contradict the text of the thesis.
 """
 INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
 """Name of an invariant in the specification -> key of the violation that `prove` reports."""
@@ -27,12 +27,9 @@ INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4":
 
 @dataclass(frozen=True)
 class SecondOpinion:
-    """The results of both explorations: with the real agent, and with TLC. `states` and `specified` are the numbers of
-    states. They are None if an exploration is incomplete.
+    """The results of both explorations: with the real agent, and with TLC.
 
-    States that differ only in remaining timer durations count as one state. `specified` is therefore at most the number
-    of states that TLC counts. `only_real` and `only_specified` are the numbers of states that only one of the two
-    explorations found.
+    States that differ only in remaining timer durations count as one state.
     """
 
     bounds: Bounds
@@ -40,10 +37,17 @@ class SecondOpinion:
     flaw: str | None
     violated: str | None
     states: int | None = None
+    """Number of states that the real agent reaches. None if this exploration is incomplete."""
     specified: int | None = None
+    """Number of states of the specification. It is at most the number of states that TLC counts. None if the
+    exploration with TLC is incomplete.
+    """
     distinct: int | None = None
+    """Number of states that TLC counts."""
     only_real: int | None = None
+    """Number of states that only the exploration with the real agent found."""
     only_specified: int | None = None
+    """Number of states that only the exploration with TLC found."""
     livelock: bool | None = None
     specified_livelock: bool | None = None
     """True if the specification has an endless cycle without losses. None if the network loses messages."""

@@ -19,7 +19,9 @@ from harness.run.parallel import sigterm_as_ctrl_c
 
 MODULES = Path(ucp.__file__).parent / "contract" / "spec"
 JAVA = ("java", "-XX:+UseSerialGC", "-XX:TieredStopAtLevel=1", "-Xss64m")
-"""The Java command. Its compiler options are those for short programs, because TLC usually runs for a few seconds."""
+"""The Java command. The options of the command make Java start quickly, because TLC usually runs for only a few
+seconds.
+"""
 TLC = ("tlc2.TLC", "-nowarning", "-deadlock", "-workers", "1", "-metadir", "states")
 MOST_SHOWN = 300
 
@@ -38,17 +40,18 @@ class CheckerError(MachineError):
 
 @dataclass(frozen=True)
 class TlcResult:
-    """The result of TLC. If `violated` names an invariant, TLC stopped there, and the search is incomplete. `output` is
-    the complete printed output.
-
-    `states` is the file with all different states and transitions. It exists if `checked` was called with `dump`.
-    """
+    """The result of TLC."""
 
     generated: int
     distinct: int
     violated: str | None
+    """The name of the violated invariant. TLC stopped at this violation, so the search is incomplete. None without a
+    violation.
+    """
     output: str
+    """The complete printed output of TLC."""
     states: Path
+    """The file with all different states and transitions. It exists only if `checked` was called with `dump`."""
 
 
 def command(memory_mb: int = 1024) -> list[str]:

@@ -22,13 +22,15 @@ from harness.scenario import Scenario
 from ucp.agent import HANDLERS
 
 STEPS_AT_ONCE = 20_000
-"""Number of handler runs after which a batch is complete. Its last trace may exceed this number."""
+"""Number of handler runs at which a batch is complete. A trace is never divided, so a batch may contain more handler
+runs.
+"""
 MEMORY_MB = 2048
 
 Constants = tuple[tuple[str, object], ...]
 
 AT_END = "what it triggered has yet to run"
-"""The difference that TLC reports if triggered handlers have not run after the last step."""
+"""The difference that TLC reports if a handler was triggered but had not run by the last step."""
 
 _REJECTED = re.compile(r'<<\s*"rejected",\s*(\d+),\s*(\d+),\s*\{([^}]*)\}\s*>>')
 _WHAT = re.compile(r'"([^"]*)"')
@@ -241,8 +243,8 @@ def _config(constants: Constants) -> str:
 
 
 def _rejected(constants: Constants, batch: _EncodedStepBatch) -> dict[int, tuple[int, tuple[str, ...]]]:
-    """Return the rejected agents of a batch by number, counted from 1. Each has its first rejected step and the
-    differing parts of this step. Raises CheckerError.
+    """Return the first rejected step of each rejected agent, with the parts of the step that differ. The key is the
+    number of the agent in the batch, counted from 1. Raises CheckerError.
     """
     records = {"Lives": module(batch.lives, batch.chains)}
     with looked_at("Recorded", _config(constants), others=records, memory_mb=MEMORY_MB) as said:

@@ -40,11 +40,11 @@ class SearchResult:
 
 
 def search(scenario: Scenario, seeds: range, jobs: int, judge: Judge, *, shown: bool = False) -> SearchResult:
-    """Run the scenario with one seed after another until a run violates a check. If a swarm only needs more time, this
-    is no violation.
+    """Run the scenario with one seed after another until a run violates a check. A run in which the swarm only needed
+    more time violates no check.
 
-    The result is the first seed with a violation, regardless of the number of `jobs`. Ctrl-C ends the search early.
-    Raises HarnessError if the scenario cannot be played.
+    The result contains the first of the `seeds` whose run violates a check, regardless of the number of `jobs`. Ctrl-C
+    ends the search early. Raises HarnessError if the scenario cannot be played.
     """
     searched = SearchResult()
 
@@ -113,7 +113,7 @@ class SearchProgress:
 
     on_violation: Callable[[ViolatingRun], None] = field(default=lambda violation: None)
     on_step: Callable[[int, str], None] = field(default=lambda runs, words: None)
-    """Gets the number of runs so far, and a text with the size of the current scenario."""
+    """A function that gets the number of runs so far, and a text with the size of the current scenario."""
     shown: bool = False
 
 
@@ -130,9 +130,9 @@ def explore(
 ) -> Explored:
     """Play a scenario in virtual time with one seed after another. Reduce the first run that violates a check.
 
-    - `out`: the new file of the smallest scenario. Without it, a new file under `runs/`.
-    - `source`: the name of the scenario in that file. Without it, the scenario's `name`.
-    - `jobs`: number of runs at the same time. Without it, the number of cores.
+    - `out`: the path of the new file for the smallest scenario. By default, a new file under `runs/`.
+    - `source`: the name by which comments in that file mention the original scenario. By default, its `name`.
+    - `jobs`: number of runs at the same time. By default, the number of processor cores.
     - `judge`: plays and checks one run.
     - `max_runs`: number of runs after which shrinking stops.
     - `watcher`: functions that are called when a violation is found and when it becomes smaller.

@@ -104,8 +104,8 @@ class _EventRecorder(MemoryRecorder):
 
 
 class _RecordingScript(FateScript):
-    """A script for the fates of messages. It also records each message that is lost, either because of the script or by
-    chance.
+    """A script that decides which messages are lost or delayed. The object also records each message that is lost,
+    either because of the script or by chance.
     """
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _EventRecorder) -> None:

@@ -20,7 +20,9 @@ UNPLAYED = ("about", "speedup", "expect")
 FLIGHT = ("vehicles", "flight", "network.radio")
 """Keys that only determine which messages are lost because of distance. They have no other effect in virtual time."""
 NEVER_IN_BURSTS = {"p": 0.0, "r": 1.0}
-"""A model of loss in bursts that never loses a message. It draws the same random numbers as a model with losses."""
+"""Parameters with which the model of burst losses never loses a message. The model then draws the same random numbers
+as with losses.
+"""
 
 
 def document_of(scenario: Scenario) -> Document:
@@ -90,9 +92,11 @@ def fate_by_count(lost: LostMessage) -> Document:
 
 
 def fate_by_time(lost: LostMessage, slack_s: float) -> Document:
-    """Return a fate that loses all messages of this type from this sender to this receiver at about this time.
+    """Return a message fate. Because of it, the network loses all messages of this type from this sender to this
+    receiver at about this time.
 
-    The fate still matches this message when other messages disappear from the run.
+    The fate matches the message by its time. It therefore still matches this message when other messages disappear from
+    the run.
     """
     window = {"from_s": max(0.0, round(lost.at_s - slack_s, 3)), "until_s": round(lost.at_s + slack_s, 3)}
     return {"message": lost.message, "sender": lost.sender, "receiver": lost.receiver, **window, "drop": True}
@@ -165,8 +169,8 @@ def keep_agents(document: Document, kept: Collection[int]) -> Document:
 
 
 def _network(network: Document, kept: Collection[int]) -> Document:
-    """Return a network section that only contains conditions for the kept agents: as receivers, or at both ends of a
-    link.
+    """Return a network section with only two kinds of conditions: those of kept receivers, and those of links between
+    kept agents.
     """
     receivers = {name: value for name, value in network.get("receivers", {}).items() if int(name) in kept}
     links = [_filter_lists(link, ("from", "to"), kept) for link in network.get("links", [])]
@@ -281,9 +285,7 @@ def move_times(document: Document, to: Callable[[float], float]) -> Document:
 
 
 def _move_fate_times(fate: Document, to: Callable[[float], float]) -> Document:
-    """Change the arrival times in a delivery rule. If the rule has no arrival times, keep the times at which the rule
-    applies.
-    """
+    """Change the arrival times in a delivery rule. A rule without arrival times is not changed."""
     if "arrivals" not in fate:
         return fate
     return {

@@ -1,7 +1,7 @@
 """Reduce a document step by step (delta debugging), and write the smallest scenario that still violates a check.
 
-The result does not depend on the number of processes. Candidates are considered in their order. If a candidate
-succeeds, the results of later candidates are discarded.
+The result does not depend on the number of processes. The search considers the results of candidate scenarios in a
+fixed order. If a candidate still violates the check, the search discards the results of later candidates.
 """
 
 import json
@@ -21,8 +21,8 @@ from harness.sweep.explore._scenario_document import Document, at
 T = TypeVar("T")
 
 WORTH_FORKING_S = 0.03
-"""Seconds. Runs that take less time are not run in parallel, because starting processes would take longer than the
-runs.
+"""Minimum duration, in seconds, of runs that are run in parallel. If runs take less time, starting processes would take
+longer than the runs.
 """
 
 
@@ -91,8 +91,8 @@ class Shrinker:
                 continue
 
     def fewest(self, items: Sequence[T], with_items: Callable[[Sequence[T]], Document]) -> None:
-        """Remove smaller and smaller parts of `items`, until the violation does not occur without any of the remaining
-        items (ddmin, Zeller 2002).
+        """Remove parts of `items`, first large and then smaller ones, as long as the violation still occurs (ddmin,
+        Zeller 2002). In the end, the violation needs each of the remaining items.
         """
         kept = list(items)
         if not kept or self.first([with_items([])]) is not None:
@@ -110,8 +110,8 @@ class Shrinker:
 
 
 def _leaving_out(items: Sequence[T], parts: int) -> Iterator[list[T]]:
-    """Divide `items` into `parts` parts. For each part, yield all items outside this part. // The last part comes
-    first, because fewer items depend on later items.
+    """Divide `items` into `parts` parts. For each part, yield all items outside this part. The last part comes first,
+    because fewer items depend on later items.
     """
     bounds = [len(items) * part // parts for part in range(parts + 1)]
     for part in reversed(range(parts)):

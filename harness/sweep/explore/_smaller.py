@@ -1,8 +1,9 @@
 """Define the steps that reduce a scenario. Steps that shorten runs come first, and then steps that simplify the
 scenario.
 
-Fates have two forms. A fate with a time still matches the same message if other messages disappear. A fate with a count
-still matches the same message if everything happens earlier. After each change of the form, all steps are tried again.
+The fate of a message identifies the message either by a time or by a count. A fate with a time still matches the same
+message if other messages disappear. A fate with a count still matches the same message if everything happens earlier.
+After each change of the form, all steps are tried again.
 """
 
 import math
@@ -165,8 +166,8 @@ def _use_defaults(shrinker: Shrinker) -> None:
 
 
 def _blocks_of_one_event(shrinker: Shrinker, record: Record) -> None:
-    """Change the scenario so that each block is completed by one event. The event occurs at the time at which the block
-    was completed in the recorded run.
+    """Change the scenario so that a single event completes each block. The event occurs at the time at which the agent
+    completed the block in the recorded run.
     """
     document = shrinker.best
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes

@@ -1,8 +1,8 @@
 """Carry out runs of a matrix on other machines, and copy their directories to this machine.
 
 On a cluster, a worker carries out a run with real programs in its own temporary directory. If the matrix keeps the
-directory of the run, the worker returns the directory together with the results. They are small, because large traces
-are packed. The largest files are left out if a directory is still too large for a message.
+directory of the run, the worker returns the directory together with the results. The directories are small, because
+large traces are packed. If a directory is still too large for a message, the worker omits its largest files.
 """
 
 import io
@@ -46,7 +46,9 @@ class AwayRun:
 
 @dataclass(frozen=True)
 class AwayPlayer:
-    """A function that carries out any run in a worker of a Dask cluster. On this machine, `play` would carry it out."""
+    """A function that carries out a run in a worker of a Dask cluster. `play` is the function that carries out a run on
+    the machine on which it is called.
+    """
 
     play: RunPlayer
 
@@ -68,7 +70,7 @@ class AwayPlayer:
 
 
 def _checked(play: RunPlayer) -> Callable[[MatrixTask], Run]:
-    """Return a function that checks whether this machine can carry out a run, and then carries it out."""
+    """Return a function that checks whether this machine can carry out a run, and then carries out the run."""
 
     def checked(task: MatrixTask) -> Run:
         play.refuse([task.point])

@@ -2,9 +2,9 @@
 
 A cell is a combination of values in the matrix. A further run is most useful in the cell whose results are least
 certain. First, every cell gets two runs. After that, the next run belongs to the cell with the widest confidence
-interval. Two intervals are considered: that of the share of runs with one chain, and that of the messages per block
-relative to their mean. Cells with similar runs therefore get few runs, and cells with different runs get most of the
-time.
+interval. The module considers two confidence intervals: that of the share of runs with one chain, and that of the
+number of messages per block, divided by its mean. Cells with similar runs therefore get few runs, and cells with
+different runs get most of the time.
 """
 
 import time

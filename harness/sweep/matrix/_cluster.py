@@ -29,8 +29,8 @@ def cluster(
     `work`. At the end of the context, unfinished tasks are cancelled. If the number of tasks is unknown, the next task
     is taken only when a thread of a worker is free.
 
-    Raises HarnessError for an invalid address. Raises MachineError if no scheduler answers, if it has no workers or
-    different versions, or if the connection is lost.
+    Raises HarnessError for an invalid address. Raises MachineError if no scheduler answers, if the scheduler has no
+    workers or runs different versions, or if the connection is lost.
     """
     total = len(tasks) if isinstance(tasks, Sized) else None
     with sigterm_as_ctrl_c(), progress_bar(what, total) as count, connected(address) as client:

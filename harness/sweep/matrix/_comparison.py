@@ -2,12 +2,11 @@
 
 In virtual time, equal code gives equal runs, so two nights differ only where the code differs. The runs of a cell are
 therefore compared in pairs with the same seed. A numeric result counts as changed if the confidence interval of the
-mean difference of the pairs does not contain 0. The intervals are so wide that without a real change, 95 % of the
-nights have no changed result: if m results are compared, the confidence level of each interval is 1 - 0.05 / m
-(Bonferroni).
+mean difference of the pairs does not contain 0. If m results are compared, the confidence level of each interval is 1 -
+0.05 / m (Bonferroni). Therefore, if nothing really changed, at least 95 % of the nights have no changed result.
 
-Runs of processes always differ, so a comparison in pairs is impossible. For them, a result counts as changed if its two
-95 % intervals do not overlap.
+Runs of processes always differ, so a comparison in pairs is impossible. A result of such runs counts as changed if the
+95 % intervals of the two nights do not overlap.
 
 The metric defines which direction is worse.
 """

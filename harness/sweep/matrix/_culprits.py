@@ -2,9 +2,9 @@
 earlier night and this night.
 
 A run in virtual time is always the same, so one run is enough: the run whose result changed most. A binary search finds
-the first commit with a different result. If this result is not the final one yet, the search continues after this
-commit. The search therefore also names commits that change the result without making it worse, with the result after
-the commit.
+the first commit with a different result. If a later commit changed the result again, the search continues after the
+found commit. The search therefore also finds commits that change the result without making it worse. Each found commit
+is named with the result after it.
 """
 
 import time

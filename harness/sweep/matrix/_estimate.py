@@ -54,7 +54,8 @@ def estimate_share(count: int, n: int) -> Estimate:
 def student_quantile(probability: float, degrees: int) -> float:
     """Return a quantile of Student's t distribution with `degrees` degrees of freedom. `probability` is above 0.5.
 
-    The method is bisection in angle = atan(t / sqrt(degrees)), in which the distribution is a finite sum.
+    The function uses bisection over angle = atan(t / sqrt(degrees)), because the distribution is a finite sum of
+    functions of this angle.
     """
     low, high = 0.0, math.pi / 2
     while (middle := (low + high) / 2) not in (low, high):
@@ -90,13 +91,15 @@ class Metric:
     name: str
     label: str
     of: Callable[[Figures], float | None]
-    """Returns the value of the result, or None if the run does not determine the result."""
+    """A function that returns the value of the result in a run. It returns None if the run does not determine the
+    result.
+    """
     unit: Literal["share of runs", "share", "number"] = "number"
     """The meaning of the value: "share of runs" for a property that some runs have, "share" for a share within each
     run, and "number" for any other number.
     """
     worse: Literal["lower", "higher"] | None = None
-    """The direction that counts as worse. None if neither direction is worse."""
+    """The direction of change that counts as worse: lower or higher values. None if neither direction is worse."""
 
     def estimate(self, runs: Iterable[Figures]) -> Estimate:
         values = [value for figures in runs if (value := self.of(figures)) is not None]

@@ -1,8 +1,8 @@
 """Draw growth.svg: small charts with logarithmic axes, on which a power law is a straight line.
 
 A dot is the mean of a cell. A line is a power law that is fitted to the runs of these cells, with its exponent beside
-it. Lines differ by colour and dashes. The legend names the lines over agents, and each exponent over blocks names its
-line.
+it. Lines differ in colour and dashes. If the horizontal axis shows agents, the legend names the lines. If it shows
+blocks, the text of each exponent names the line.
 """
 
 import math
@@ -52,7 +52,9 @@ PANELS = (
     GrowthPanel("Runs with one uniform chain", "uniform"),
 )
 ALSO_OVER_BLOCKS = ("messages", "bytes")
-"""Metrics that are also drawn over blocks if the matrix has three numbers of agents and three mission lengths."""
+"""Metrics that get a second chart, with the number of blocks on its horizontal axis, if the matrix has three numbers of
+agents and three mission lengths.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,8 @@ MOST_AGENTS, MOST_BLOCKS = 3, 3
 
 
 class CellCoverage(CellRecord):
-    """The coverage of the runs with one combination of values. It only contains runs that this command has
-    carried out.
+    """The coverage of the runs with one combination of values. Only the runs that this command has carried out are
+    included.
     """
 
     local_states: int

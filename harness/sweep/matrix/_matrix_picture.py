@@ -1,8 +1,8 @@
 """Draw matrix.svg: six charts side by side, with the loss rate as horizontal axis.
 
 There is a row of six charts for each number of agents, mission length and backend. Lines are means, bands are 95 %
-intervals, and dots mark the loss rates that were measured. Two lines in one chart also have different dashes, and their
-names beside them.
+intervals, and dots mark the loss rates that were measured. If a chart has two lines, they also have different dashes,
+and a name is next to each line.
 """
 
 import math

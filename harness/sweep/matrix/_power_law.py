@@ -16,8 +16,8 @@ from harness.sweep.matrix._estimate import CONFIDENCE, student_quantile
 
 Variable = Literal["agents", "blocks"]
 MAX_INFLATION = 100.0
-"""Maximum variance inflation factor, 1 / (1 - r^2), which a second variable causes for an exponent. Above it, the
-effects of the two variables cannot be separated.
+"""Maximum variance inflation factor, 1 / (1 - r^2). It is the factor by which a second variable increases the variance
+of an exponent. Above this limit, the effects of the two variables cannot be separated.
 """
 
 

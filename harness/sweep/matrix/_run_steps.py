@@ -1,11 +1,12 @@
-"""Fingerprints of the steps of a run, which find the first handler run at which a run differs from an earlier night.
+"""Compute fingerprints of runs, and use them to find the first handler run at which a run differs from the same run of
+an earlier night.
 
 The fingerprint of a run has two bytes for each handler run, in the order of mission time. The first two bytes that
 differ between two nights give the position of the first changed handler run. To find its name, the run is played again
 with the current code. The code of the earlier night is therefore not needed.
 
-Handler runs that only received a message are omitted. With an edited core, the simulation delivers more messages
-without effect, which would hide the first real change.
+Handler runs that only received a message are omitted. If the agent core is edited, the simulation delivers more
+messages that have no effect. The handler runs of these messages would hide the first real change.
 """
 
 import base64

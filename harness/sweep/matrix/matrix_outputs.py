@@ -9,8 +9,8 @@ report.html   a page for people, one file
 summary.md    table and findings in Markdown
 junit.xml     one test case for each cell
 
-All of them are made from results.jsonl, which is written during the runs (`_results_file`). runs/ holds the kept run
-directories of processes. cells/ holds the scenarios, with which any run can be played again.
+All of these files are made from results.jsonl, which is written during the runs (`_results_file`). runs/ holds the kept
+run directories of processes. cells/ holds the scenarios, with which any run can be played again.
 """
 
 import csv

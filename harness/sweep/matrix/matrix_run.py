@@ -39,8 +39,8 @@ MAX_NAMED = 50
 
 @dataclass(frozen=True)
 class Finished:
-    """A matrix whose runs have ended or were interrupted. It consists of the summarised results, and the runs in the
-    order of their values and seeds.
+    """The results of a matrix whose runs have all ended, or that was interrupted. The object contains the summarised
+    results and the single runs. The runs are in the order of their values and seeds.
     """
 
     record: MatrixRecord
@@ -79,10 +79,11 @@ def run_matrix(
 
     - `out`: the directory of `results.jsonl`. It is new or empty, or contains earlier results of the same matrix. Runs
       with a result are not played again. By default, a new directory under `runs/`.
-    - `spread`: the function that distributes runs. By default, the runs use all cores of this machine.
+    - `spread`: the function that distributes the runs. By default, it uses all processor cores of this machine.
     - `judge`: the function that plays and checks one run in virtual time. By default, the simulation is used.
-    - `budget_s`: no run begins after this time. The most uncertain cells come first. By default, all runs are played.
-    - `elsewhere`: if true, the runs are played on other machines, and each of these checks that it can play them.
+    - `budget_s`: the number of seconds after which no further run begins. The cells with the most uncertain results
+      come first. By default, all runs are played.
+    - `elsewhere`: if true, other machines play the runs. Each of these machines checks whether it can play its runs.
     - `covers`: if true, also measure the share of the protocol's states that the runs reach. This takes longer.
 
     Ctrl-C ends the matrix early, with the results of the runs that have ended. Raises HarnessError if the matrix cannot

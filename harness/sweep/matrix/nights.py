@@ -128,8 +128,8 @@ def _load(path: Path) -> MatrixRecord:
 
 
 LAST = 60
-"""Maximum number of files of nights that are read. The names of the files begin with the date, and the last files in
-alphabetical order are read.
+"""Maximum number of night files that are read. If there are more, the last ones in alphabetical order are read. These
+are the newest nights, because the file names begin with the date.
 """
 
 

@@ -1,7 +1,7 @@
 """Search for new behaviour: change scenarios at random, play them, and keep those whose runs reach new states.
 
-The hunt proceeds in rounds. A round depends only on the documents that were stored before it and on the random draws,
-and not on the speed of the machine. Any number of processes therefore gives the same result.
+The hunt proceeds in rounds. The results of a round depend only on the documents that were stored before the round, and
+on the random draws. They do not depend on the speed of the machine, so any number of processes gives the same results.
 """
 
 from collections import Counter
@@ -30,8 +30,8 @@ from harness.sweep.explore.guided._hunt_trial import (
 from harness.sweep.explore.guided._mutation import MutationLimits, mutate
 
 BITS = 1 << 28
-"""Size of the bit field in bits (32 MiB). If the field contains ten million numbers, it mistakes about one of 30 new
-numbers for a known number.
+"""Size of the bit field of a `DigestSet` in bits, which is 32 MiB. If the field contains ten million numbers, it
+mistakes about one of 30 new numbers for a known number.
 """
 
 
@@ -105,15 +105,15 @@ class KeptRun:
 
     @property
     def nearness(self) -> float:
-        """The expected benefit of this document for the search for an endless cycle. It is 0 if the run of the document
-        had no new pattern of failed votes.
+        """The expected benefit of changed copies of this document when the hunt searches for an endless cycle. It is 0
+        if the run of the document had no new pattern of failed votes.
         """
         return self.failed**2 / (1 + self.picked) / (100 + self.steps)
 
 
 @dataclass(frozen=True)
 class NewCoverage:
-    """The parts of a run's coverage that are new, because no earlier run reached them, and the findings of the run."""
+    """The findings of a run, and the part of its coverage that no earlier run had reached."""
 
     reached: ReachedStates
     found: tuple[FindingIdentity, ...]

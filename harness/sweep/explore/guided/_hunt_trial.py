@@ -89,8 +89,8 @@ LONGEST_GAP_S = 40.0
 
 
 Divergence = tuple[tuple[int, int], ...]
-"""The differences between the chains of a swarm, as a sorted list of pairs. There is one pair for each different chain:
-the number of agents that hold the chain, and the number of its blocks after the mutual chain.
+"""The differences between the chains of a swarm, as a sorted list of pairs. There is one pair for each different chain.
+A pair contains the number of agents that hold the chain, and the number of blocks that follow the mutual chain in it.
 """
 
 

@@ -27,12 +27,12 @@ TIMERS_S = tuple(
     getattr(Settings(), name) for name in ("vote_timeout_s", "phase1_timeout_s", "phase2_timeout_s", "phase3_timeout_s")
 )
 NEAR_S = 0.03
-"""Maximum number of seconds between two moments for the following change: a message that is sent at the first moment
-arrives after the second moment.
+"""Maximum number of seconds between a timer expiry and an event that a change places close to it. The messages that the
+event causes may arrive before or after the timer expires.
 """
 DELAYS_S = (0.0, 0.06, 0.2, 1.0, 4.99, 5.02, 9.99, 10.02, 15.0, 20.0)
-"""Delays for single messages in seconds. They are long enough for the message to arrive after the next message, after a
-timer expiry, or after a whole round.
+"""Delays for single messages in seconds. Depending on the delay, the message arrives at once, after the next message,
+after a timer expiry, or after a whole round.
 """
 LATE_S = (0.001, 0.01, 0.03, 0.06, 0.2, 0.5)
 """Delays for timers in seconds. They are long enough for the timer to expire after a message or after another timer.
@@ -129,8 +129,8 @@ def _align_two_events(document: Document, rng: Random) -> Document:
 
 
 def _align_with_timer(document: Document, timers_ended_s: Sequence[float], rng: Random) -> Document:
-    """Change the document so that events occur at the time of a timer expiry. These are new events of some agents, one
-    existing event, or all later events.
+    """Change the document so that events occur at about the time of a timer expiry. The moved events are one existing
+    event, or one existing event and all later events. Alternatively, the function adds new events of some agents.
     """
     moment = rng.choice(timers_ended_s)
 

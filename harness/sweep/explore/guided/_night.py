@@ -53,9 +53,9 @@ class NightProgress:
     """Functions that show the progress to the user."""
 
     on_progress: Callable[[int, int, int], None] = lambda runs, states, findings: None
-    """Gets the numbers of runs, agent states and findings."""
+    """A function that gets the numbers of runs, agent states and findings so far."""
     on_event: Callable[[str], None] = lambda words: None
-    """Gets a text about an event."""
+    """A function that gets a text about an event of the search, such as a new finding."""
 
 
 @dataclass

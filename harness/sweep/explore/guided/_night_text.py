@@ -12,8 +12,8 @@ from harness.sweep.explore.guided._night_page import unfinished_in_words
 
 REDRAW_EVERY_S = 0.1
 FIRST_LINE_S, LINES_GROW, LONGEST_S = 10.0, 1.5, 600.0
-"""Values for the intervals between progress lines if the output is no terminal: seconds before the first line, the
-factor by which each interval grows, and the maximum interval in seconds.
+"""If the output is no terminal, these values determine when progress lines are printed: the number of seconds before
+the first line, the factor by which each interval grows, and the maximum interval in seconds.
 """
 CLEAR_LINE = "\r\x1b[2K"
 

@@ -1,4 +1,4 @@
-"""List the runs behind each summary, failures first, with a command that plays one of them again."""
+"""List the runs of each summary, with failed runs first and a command that plays one of the runs again."""
 
 import shlex
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ class CellRuns:
 
 
 def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
-    """Return the runs of all summaries. `directory` is the directory of the page. Links start there."""
+    """Return the runs of all summaries. `directory` is the directory of the page. Links are relative to it."""
     by_point = [(point, list(runs)) for point, runs in groupby(finished.runs, key=lambda run: run.point)]
     room = MAX_ROWS // max(1, len(by_point))
     cells = []

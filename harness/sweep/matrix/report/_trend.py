@@ -26,8 +26,8 @@ LARGEST = 1e12
 
 
 def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures: int) -> Sequence[MatrixRecord]:
-    """Return the latest nights. All charts together must have at most `MAX_DOTS` dots. At least two nights are
-    returned, even if they have more dots.
+    """Return at least two of the latest nights. Return more than two only if all charts together then have at most
+    `MAX_DOTS` dots.
     """
     return nights[-max(2, MAX_DOTS // max(1, len(tonight.cells) * figures)) :]
 
