@@ -1,8 +1,8 @@
 """Control the packets between vehicles: network conditions, a virtual network, and the kernel mechanisms that apply the
 conditions.
 
-`__all__` lists the public names. A name is imported at its first use, because the first process of every lab imports
-this package. A lazy import keeps its start fast.
+`__all__` lists the public names. Python imports a public name only when a program first uses it. The first process of
+every lab imports this package, and this process therefore starts faster.
 """
 
 from typing import TYPE_CHECKING
@@ -38,7 +38,7 @@ _NAMES_OF = {
     "netem.medium": ("Medium",),
     "netem.radio": ("HardRange", "LogDistance", "Place"),
 }
-"""Module -> its public names. The module is imported when one of these names is first used."""
+"""Module -> its public names. Python imports the module when a program first uses one of these names."""
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 
 if not TYPE_CHECKING:  # a type checker would accept any name

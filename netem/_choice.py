@@ -1,4 +1,6 @@
-"""Choose the kernel mechanism (engine) that applies network conditions: the requested one, or the first that works."""
+"""Choose the kernel mechanism (engine) that applies network conditions. This is the engine that the caller requests.
+Without a request, it is the first engine that works on this machine.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,13 @@ from netem.tc import NetemEngine
 
 
 def choose(preference: str | None, fabric: VirtualSwitch, needs: Sequence[str] = ()) -> tuple[Engine, str]:
-    """Install the first suitable engine that works on this machine. Return the engine, and the reason for the choice.
+    """Install the first suitable engine that works on this machine. Return the engine, and a text with the reason for
+    the choice.
 
-    Without a preference, tc netem comes first, because it supports more. `needs` lists conditions other than loss and
-    partition. An engine is tested by installing it, because nothing else shows whether the kernel supports it. Raises
-    EngineError with the reason of each engine if none works.
+    If `preference` is None, the function tries tc netem first, because this engine supports more conditions. `needs`
+    lists the conditions other than loss and partition that the engine must support. The function installs each engine
+    to test it, because no other test shows whether the kernel supports the engine. Raises EngineError if no engine
+    works. The error has the reason for each engine.
     """
     engines: dict[str, type[Engine]] = {kind.name: kind for kind in (NetemEngine, NftablesEngine)}
     if preference is not None and preference not in engines:

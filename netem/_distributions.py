@@ -1,4 +1,4 @@
-"""Compute the quantiles of the delay distributions in tc-netem(8), in the form of netem's own tables.
+"""Compute tables of quantiles for the delay distributions of tc-netem(8). The tables have the format that netem reads.
 
 netem draws an entry of a table and multiplies it by the jitter. iproute2 contains such tables as files (normal.dist,
 pareto.dist, paretonormal.dist), but not every machine has them. This module therefore computes the tables.
@@ -12,8 +12,8 @@ from statistics import NormalDist
 from netem.link import Distribution
 
 SCALE = 8192
-"""Unit of a table entry. An entry is a multiple of 1/SCALE of a standard deviation. In the uniform distribution, it is
-a multiple of 1/SCALE of half the width.
+"""The value of a table entry that stands for one standard deviation above the mean. In the table of the uniform
+distribution, it stands for the largest deviation from the mean.
 """
 
 
@@ -21,8 +21,8 @@ a multiple of 1/SCALE of half the width.
 def table(distribution: Distribution, size: int) -> tuple[int, ...]:
     """Return `size` equally probable quantiles in ascending order, as signed 16-bit numbers.
 
-    The Pareto distribution has shape 3 and is shifted to mean 0. The distribution `paretonormal` is a quarter normal
-    and three quarters Pareto.
+    The Pareto distribution has shape 3 and is shifted to mean 0. A value of `paretonormal` is the sum of a quarter of a
+    normal value and three quarters of a Pareto value.
     """
     at = [(index + 0.5) / size for index in range(size)]
     normal = [NormalDist().inv_cdf(share) for share in at]

@@ -1,10 +1,10 @@
 """Build the virtual network: a bridge named `air`, and a network namespace with a cable (veth pair) for each vehicle.
 
-A vehicle has the interface `eth0` with its address and a default route (ArduPilot built with CAN needs a route for its
-multicast). The other end, `v<ID>`, is a port of the bridge in the lab's own namespace. There the engines handle each
-packet on its way to the vehicle. The namespaces of the vehicles have no names. They exist as long as this process holds
-them open or a process runs in them. An existing namespace, such as that of a container, can also belong to a vehicle.
-The cable then ends in this namespace.
+The end of the cable in the vehicle's namespace is the interface `eth0`. It has the vehicle's address and a default
+route, because ArduPilot built with CAN needs a route for its multicast packets. The other end, `v<ID>`, is a port of
+the bridge in the lab's own namespace. At this port the engines handle each packet for the vehicle. The namespaces of
+the vehicles have no names. They exist as long as this process holds them open or a process runs in them. A vehicle can
+also use a namespace that already exists, such as the namespace of a container. The cable then ends in this namespace.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ class VirtualSwitch:
         return _FIRST_PORT_INDEX + self.vehicles.index(vehicle)
 
     def inside(self, vehicle: int | None) -> AbstractContextManager[None]:
-        """Run code in the network of a vehicle inside the context. If `vehicle` is None, run it in the network of the
-        switch.
+        """Return a context manager. Code in its context runs in the network namespace of the vehicle. If `vehicle` is
+        None, the code runs in the namespace of the switch.
         """
         return _namespaces.inside(self.home if vehicle is None else self._namespaces[vehicle], self.home)
 
     def inodes(self) -> dict[int, int]:
-        """Return the inode number of each vehicle's network namespace, by vehicle."""
+        """Return vehicle ID -> inode number of the vehicle's network namespace."""
         return {vehicle: os.fstat(namespace).st_ino for vehicle, namespace in self._namespaces.items()}
 
     def _namespace(self, vehicle: int) -> NetlinkSocket:

@@ -42,7 +42,7 @@ def set_up(what: str, index: int) -> NetlinkRequest:
 
 
 def mtu(what: str, index: int, most_bytes: int) -> NetlinkRequest:
-    """Return a request that sets the largest packet of a link."""
+    """Return a request that sets the maximum packet size of a link in bytes."""
     return NetlinkRequest(
         f"{what}: MTU", RTM_NEWLINK, _IFINFOMSG.pack(0, 0, index, 0, 0) + number(_IFLA_MTU, most_bytes)
     )
@@ -65,9 +65,9 @@ def bridge(name: str, index: int) -> NetlinkRequest:
 def veth_pair(
     name: str, index: int, bridge: int, *, far_name: str, far_index: int, mac: str, network: int
 ) -> NetlinkRequest:
-    """Return a request for a cable from an active port of the bridge to a network namespace.
-
-    `network` is a file descriptor of the namespace, and `mac` is the address of the cable's far end.
+    """Return a request that creates a cable from the bridge to another network namespace. The near end becomes an
+    active port of the bridge. `network` is a file descriptor of the other namespace. `mac` is the Ethernet address of
+    the cable's end in that namespace.
     """
     far_end = (
         _IFINFOMSG.pack(0, 0, far_index, 0, 0),
@@ -90,8 +90,8 @@ def address(what: str, index: int, own: str, prefix_length: int, broadcast: str)
 
 
 def default_route(what: str, index: int) -> NetlinkRequest:
-    """Return a request for a default route without a gateway. With it, the kernel treats all addresses as neighbours on
-    this link.
+    """Return a request that adds a default route without a gateway. With this route, the kernel treats all addresses as
+    neighbours on this link.
     """
     kind = (_RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST)
     return NetlinkRequest(
@@ -111,7 +111,7 @@ def _forwards(port: bytes) -> bool:
 
 
 def flood_broadcasts(port: str, index: int, on: bool) -> NetlinkRequest:
-    """Return a request that starts or stops the forwarding of broadcasts from the bridge's other ports to this port."""
+    """Return a request that changes whether the bridge forwards broadcasts from its other ports to this port."""
     flag = nested(_IFLA_PROTINFO, attribute(_IFLA_BRPORT_BCAST_FLOOD, bytes([on])))
     return NetlinkRequest(
         f"set bcast_flood of {port}", RTM_SETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, index, 0, 0) + flag

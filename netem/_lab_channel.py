@@ -53,7 +53,9 @@ class LabConnection:
         return await asyncio.shield(self._inside)
 
     async def ask(self, what: str, **arguments: Any) -> Answer:
-        """Send a request. Return the result in the answer, and the socket that the answer contains or None."""
+        """Send a request. Return the result from the answer. Also return the socket that came with the answer, or None
+        if there was no socket.
+        """
         if self._end is not None:
             raise LabError(self._end)
         number = next(self._numbers)

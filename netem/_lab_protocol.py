@@ -1,8 +1,8 @@
-"""Define the messages between the harness and its virtual network: JSON objects with length prefixes on a Unix stream
-socket.
+"""Define the messages between the harness and its virtual network. Each message is a JSON object after a length prefix,
+on a Unix stream socket.
 
-Sockets accompany a message as SCM_RIGHTS (unix(7)). The key `descriptors` of such a message contains the number of its
-sockets. Both sides keep the order.
+A message can carry open sockets as SCM_RIGHTS (unix(7)). The key `descriptors` of such a message contains the number of
+its sockets. Sender and receiver use the sockets in the same order.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Create private networks for processes, with unshare(1) for the first process and setns(2) inside it.
 
 The first process is PID 1 of its own PID namespace. Its end therefore ends each process of the lab, and afterwards the
-kernel removes namespaces, links and rules. Three mechanisms end the first process. It ends when the harness closes the
-control socket or dies. setpriv(1) requests a death signal. And the option `--kill-child` of unshare(1) kills it when
-the unshare process ends.
+kernel removes namespaces, links and rules. Three mechanisms end the first process after the harness has ended. The
+first process ends when the harness closes the control socket or dies. The kernel sends the first process a death
+signal, which setpriv(1) requests. The option `--kill-child` of unshare(1) kills the first process when the unshare
+process ends.
 """
 
 from __future__ import annotations
@@ -66,9 +67,9 @@ def die_with_parent() -> None:
 
 
 def become_first_process(*, user_namespace: bool) -> None:
-    """Return in the first process of a private network, which is a grandchild of the calling process.
-
-    The calling process becomes the process outside, as that of `unshare --kill-child`. Both end with their parents.
+    """Create a private network, and return in its first process, which is a grandchild of the calling process. The
+    calling process does not return. It waits outside the private network, as `unshare --kill-child` does. Each of these
+    processes ends when its parent ends.
     """
     user, group = os.geteuid(), os.getegid()
     _check(_libc.unshare(_NEW_NAMESPACES | (_CLONE_NEWUSER if user_namespace else 0)))
@@ -95,9 +96,9 @@ def _check(result: int) -> None:
 def command(argv: Sequence[str], *, user_namespace: bool, die_with_parent: bool = True) -> list[str]:
     """Return the command that runs `argv` as the first process of a private network (unshare(1)).
 
-    With `user_namespace`, the command needs no rights, and has all rights over the objects that it creates. The death
-    signal follows the *thread* that started the command (PR_SET_PDEATHSIG in prctl(2)). Set `die_with_parent` to false
-    if this thread may end before the lab.
+    If `user_namespace` is true, the caller needs no special rights, and the command has all rights over the objects
+    that it creates. The death signal follows the *thread* that started the command (PR_SET_PDEATHSIG in prctl(2)). Set
+    `die_with_parent` to false if this thread may end before the lab.
     """
     setpriv = ["setpriv", "--pdeathsig", "KILL"] if die_with_parent else []
     user = ["--user", "--map-root-user"] if user_namespace else []
@@ -114,7 +115,9 @@ def user_namespace_choices() -> tuple[bool, ...]:
 
 
 def probe() -> tuple[bool, str]:
-    """Return true if this machine allows network namespaces, and a description or the error message."""
+    """Return whether this machine allows network namespaces. Also return a description of the namespaces, or the error
+    message if this machine does not allow them.
+    """
     message = ""
     for user_namespace in user_namespace_choices():
         argv = command(["true"], user_namespace=user_namespace, die_with_parent=False)
@@ -131,16 +134,16 @@ def probe() -> tuple[bool, str]:
 
 
 def not_executed(message: str) -> tuple[str, str] | None:
-    """Parse a tool's message that it could not start a program. Return the program and the reason. Return None for any
-    other message.
+    """Parse the message of unshare(1) or setpriv(1) that it could not execute a program. Return the name of the program
+    and the reason. Return None for any other message.
     """
     match = re.fullmatch(r"(?:unshare|setpriv): failed to execute (.+): (.+)", message)
     return (match[1], match[2]) if match else None
 
 
 def user() -> str:
-    """Return the user who executes programs, such as "user mail". In a user namespace, a process of root has the rights
-    of this user outside.
+    """Return the user whose rights this process has on the machine, such as "user mail". If the process is root in a
+    user namespace, this is the user that root stands for outside the namespace.
     """
     uid = os.geteuid()
     for line in Path("/proc/self/uid_map").read_text().splitlines():
@@ -155,7 +158,7 @@ def user() -> str:
 
 
 def way_out(message: str) -> str:
-    """Return advice for the user after this machine refused namespaces with this message."""
+    """Return advice for the user. `message` is the error with which this machine refused to create namespaces."""
     if "not installed" in message:
         return "Install util-linux (Debian, Ubuntu: apt install util-linux)."
     if not_executed(message):

@@ -68,8 +68,8 @@ class NetlinkSocket:
     def send(self, requests: Sequence[NetlinkRequest]) -> None:
         """Send the requests in order, and wait until the kernel has processed all of them.
 
-        Raises NetlinkError for the first refused request. The kernel has also executed the later requests of the same
-        batch.
+        Raises NetlinkError for the first request that the kernel refuses. The kernel then still executes the later
+        requests of the same batch.
         """
         batch: list[NetlinkRequest] = []
         encoded = bytearray()

@@ -1,8 +1,8 @@
 """The engine "nftables": it applies loss and partitions with rules in `table bridge air`, on kernels without netem.
 
-The rules are in the forward hook of the bridge. It handles each packet of any protocol once per receiver, because the
-switch has already copied broadcasts. Losses are therefore drawn separately for each receiver. A rule first marks the
-packet with the group of its incoming port. The rules in the chain of its receiver then pass or drop it:
+The rules are in the forward hook of the bridge. The switch copies a broadcast before this hook, so the hook handles
+each packet of any protocol once per receiver. Losses are therefore drawn separately for each receiver. A rule first
+marks the packet with the group of its incoming port. The rules in the chain of its receiver then pass or drop it:
 
     chain forward { meta mark set iifname map @group
                     oifname vmap { "v7" : jump cut_v7, ... }
@@ -46,13 +46,13 @@ _STDIN = ["-f", "/proc/self/fd/0"]  # nft translates "-" to /dev/stdin, which so
 _DEADLINE_S = 20.0
 _TOO_LONG = "Message too long"
 _COMMANDS_AT_ONCE = 500
-"""Maximum number of commands in one transaction. They take about 200 KB, which is the limit of net.core.wmem_max for an
-ordinary user.
+"""Maximum number of commands in one transaction. This number of commands takes about 200 KB. An ordinary user cannot
+send more at once, because of the kernel parameter net.core.wmem_max.
 """
 
 
 class NftablesEngine(Engine):
-    """An engine for independent loss per sender and receiver, and for partitions.
+    """An engine that applies partitions, and independent loss for each pair of sender and receiver.
 
     The engine does not support conditions that need a queue or a memory of earlier packets.
     """
@@ -192,8 +192,8 @@ class NftablesEngine(Engine):
 
 
 def _grouped(parts: list[list[dict[str, Any]]]) -> Iterator[list[dict[str, Any]]]:
-    """Combine successive lists of commands into longer lists of at most `_COMMANDS_AT_ONCE` commands. No list is
-    divided.
+    """Combine successive lists of commands into longer lists of at most `_COMMANDS_AT_ONCE` commands. All commands of
+    one input list stay in one output list.
     """
     together: list[dict[str, Any]] = []
     for part in parts:
@@ -246,8 +246,8 @@ def _verdicts(rules: list[list[dict[str, Any]]]) -> Iterator[tuple[str, str]]:
 
 
 def _only_mark(rules: list[list[dict[str, Any]]]) -> int | None:
-    """Return the only group from which these rules accept packets, as a packet mark. Return None if they accept all
-    packets.
+    """Return the packet mark of the only group from which these rules accept packets. Return None if the rules accept
+    packets of all groups.
     """
     marks = [e["match"]["right"] for expressions in rules for e in expressions if "match" in e]
     return marks[0] if marks else None

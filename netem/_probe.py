@@ -4,10 +4,10 @@ path.
     _probe.py receive PORT      receive the UDP datagrams of a port until SIGTERM
     _probe.py broadcast PORT COUNT FIRST BROADCAST_ADDRESS [BYTES [PAUSE_S]]
 
-`broadcast` numbers its datagrams from FIRST, writes the sending time into each, and pauses after every 20. At the end,
-it prints the number of seconds by which each pause was too long. `receive` prints "ready", and its results on SIGTERM.
-Each output is one JSON object. Times are those of the real-time clock, which all processes of a kernel share. Arrival
-times come from the kernel (SO_TIMESTAMPNS, socket(7)).
+`broadcast` numbers its datagrams from FIRST, writes the sending time into each datagram, and pauses after every 20
+datagrams. At the end, it prints how many seconds each pause was too long. `receive` prints "ready", and its results on
+SIGTERM. Each output is one JSON object. Times are those of the real-time clock, which all processes of a kernel share.
+Arrival times come from the kernel (SO_TIMESTAMPNS, socket(7)).
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def print_json(what: object) -> None:
 
 
 def collect(source: socket.socket, size: int) -> list[tuple[bytes, int]]:
-    """Receive packets until SIGTERM and a short silence after it. Return each packet with its time of arrival in
-    nanoseconds.
+    """Receive packets until SIGTERM arrives, and then until no packet has arrived for a short time. Return each packet
+    with its time of arrival in nanoseconds.
 
     The process has the lowest priority, and leaves packets in the socket's buffer as long as the buffer has room.
     Otherwise the process would use processor time and delay the packets that it measures.
@@ -67,7 +67,7 @@ def collect(source: socket.socket, size: int) -> list[tuple[bytes, int]]:
 
 
 def _filled(source: socket.socket) -> float:
-    """Return the used share of a socket's receive buffer."""
+    """Return the used share of a socket's receive buffer, from 0 to 1."""
     used, room = map(int, _MEMORY.unpack_from(source.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 64)))
     return used / room
 

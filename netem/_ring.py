@@ -1,8 +1,8 @@
-"""Capture all frames of one switch port, through a buffer that is shared with the kernel (AF_PACKET, TPACKET_V3).
-
-The kernel fills the blocks of the ring. It hands over a block when it is full or 100 ms old. A reader that is late
-still finds all blocks that fit into the ring. The kernel counts the frames of the port and the frames that did not fit,
-so losses are always known. See packet(7), and packet_mmap in the kernel's documentation.
+"""Capture all frames of one switch port, through a ring buffer that this process shares with the kernel (AF_PACKET,
+TPACKET_V3). The ring consists of blocks, which the kernel fills one after another. The kernel hands over a block when
+the block is full or 100 ms old. A reader that is late still finds all blocks that fit into the ring. The kernel counts
+the frames that crossed the port, and the frames that did not fit into the ring. The number of missing frames is
+therefore always known. See packet(7), and packet_mmap in the kernel's documentation.
 
 Frames that leave the port have passed netem and nftables, and reach the vehicle. Frames that enter the port have not
 passed netem and nftables yet. The kernel does not compute checksums of packets on veth pairs. It marks such packets,
@@ -45,9 +45,9 @@ RETIRE_MS = 100
 
 
 class CaptureRing:
-    """A ring buffer of `blocks` blocks. It contains the frames that cross the port from its creation on.
+    """A ring buffer of `blocks` blocks. The ring captures frames that cross the port after the ring was created.
 
-    Raises OSError if the kernel lacks AF_PACKET, the port or the memory.
+    Raises OSError if the kernel has no AF_PACKET, if the port does not exist, or if there is too little memory.
     """
 
     def __init__(self, port: str, blocks: int) -> None:
@@ -67,7 +67,7 @@ class CaptureRing:
         self._socket.bind((port, _ETH_P_ALL))
 
     def fileno(self) -> int:
-        """Return the file descriptor, which is readable when a block of frames is available."""
+        """Return a file descriptor. It becomes readable when a block of frames is available."""
         return self._socket.fileno()
 
     def take(self) -> Iterator[tuple[int, bytes, bool]]:
@@ -111,7 +111,7 @@ class CaptureRing:
 
 
 def _with_checksum(frame: bytes, start: int, at: int) -> bytes:
-    """Compute a checksum as the hardware would, and write it into the frame. The checksum field already contains a
-    partial sum, and the data begins at `start`.
+    """Compute a checksum in place of the network hardware, and write it into the frame. The checksum covers the bytes
+    from offset `start` on. The kernel has already written the sum of the pseudo-header into the checksum field.
     """
     return frame[:at] + checksum(frame[start:]).to_bytes(2, "big") + frame[at + 2 :]

@@ -1,11 +1,12 @@
 """Build the netlink requests of the engine "netem" for one switch port.
 
-Numbers come from linux/pkt_sched.h, pkt_cls.h and tc_act/. HTB is used only for its classes. Their rate is 34 Gbit/s,
-the highest value without the 64-bit attribute. A veth pair carries less.
+Numbers come from linux/pkt_sched.h, pkt_cls.h and tc_act/. The engine uses the queueing discipline HTB only to divide
+packets into classes. Each class has a rate of 34 Gbit/s, the highest value without the 64-bit attribute. This rate does
+not limit packets, because a veth pair is slower.
 
 If a change omits an option, netem keeps the old value of some options (corruption, rate, reordering, distribution
-table) and resets others (loss model). Therefore each change contains all options. netem reports all options except for
-the table.
+table) and resets others (loss model). Each change therefore contains all options. netem reports all options except the
+distribution table.
 """
 
 from __future__ import annotations
@@ -36,11 +37,13 @@ from netem._netlink import (
 from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkConditions
 
 MAX_KIND = 0x7FFF
-"""Highest number of a traffic class. Above it, no number would remain for the netem of the class."""
+"""Highest number of a traffic class. A netem belongs to each class and needs a number as well. For higher class numbers
+there would be no free number.
+"""
 
 RELAYED = 0x10000
-"""Mark of frames that `netem.relay` delivers. It differs from all group numbers. These frames belong to no traffic
-class.
+"""Mark of frames that `netem.relay` delivers. The mark differs from all group numbers. Frames with this mark belong to
+no traffic class.
 """
 
 _SET = NLM_F_CREATE | 0x100  # NLM_F_REPLACE: create or replace
@@ -125,8 +128,8 @@ class TrafficControl:
         return [NetlinkRequest("set class of htb", RTM_NEWTCLASS, message, _SET), self.change_class(kind, link)]
 
     def change_class(self, kind: int, link: LinkConditions, *, table: bool = True) -> NetlinkRequest:
-        """Return the request that sets the network conditions of a traffic class. Without `table`, the distribution of
-        the delay stays the same.
+        """Return the request that sets the network conditions of a traffic class. `table` is the distribution of the
+        delay. Without it, the distribution does not change.
         """
         options = _options(link, table)
         message = self._header(_HTB | kind, (0x8000 | kind) << 16) + text(_KIND, "netem") + options
@@ -205,8 +208,8 @@ class TrafficControl:
 
 
 def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
-    """Return the attributes inside nested attributes, found by the attribute types along `path`. Return an empty result
-    if the path does not exist.
+    """Return the attributes that are nested inside other attributes. `path` lists the types of the outer attributes,
+    the outermost first. The result is empty if one of them is missing.
     """
     for kind in path:
         attributes = parse(attributes.get(kind, b""))
@@ -215,7 +218,7 @@ def _inside(attributes: Mapping[int, bytes], *path: int) -> Mapping[int, bytes]:
 
 @lru_cache(maxsize=1 << 12)
 def _options(link: LinkConditions, table: bool) -> bytes:
-    """Return the network conditions in the format of netem's TCA_OPTIONS."""
+    """Encode network conditions in the format of netem's TCA_OPTIONS."""
     delay = link.delay or Delay(0)
     latency_ns, jitter_ns = _nanoseconds(delay.mean_s), _nanoseconds(delay.jitter_s)
     loss = 0 if isinstance(link.loss, GilbertElliott) else _share(link.loss)
@@ -254,8 +257,8 @@ def _table(distribution: Distribution) -> bytes:
 
 
 def _link(options: bytes) -> LinkConditions:
-    """Return netem's options as network conditions. This is the inverse of `_options`, except for the distribution of
-    the delay.
+    """Decode netem's options to network conditions. This is the inverse of `_options`, except that the result lacks the
+    distribution of the delay.
     """
     _, limit, loss, _, duplicate, _ = _NETEM.unpack_from(options)
     attributes = parse(options[_NETEM.size :])
@@ -289,12 +292,12 @@ def _conditions(
 
 
 def _share(probability: float) -> int:
-    """Return a probability in netem's units. Rounding never changes it to 0 or 1."""
+    """Convert a probability to netem's units. Rounding never changes the probability to 0 or 1."""
     if not 0.0 < probability < 1.0:
         return _ALWAYS if probability else 0
     return min(max(round(probability * _ALWAYS), 1), _ALWAYS - 1)
 
 
 def _nanoseconds(seconds: float) -> int:
-    """Return a time in nanoseconds. Rounding never changes a positive time to 0."""
+    """Convert a time from seconds to nanoseconds. Rounding never changes a positive time to 0."""
     return max(round(seconds * _NANO), 1) if seconds else 0

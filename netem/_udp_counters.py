@@ -10,23 +10,24 @@ _NET = Path("/proc/thread-self/net")
 
 @dataclass(frozen=True)
 class UdpCounters:
-    """The counts of UDP datagrams in the network of one vehicle, including those of closed sockets.
-
-    `broadcasts` counts the broadcasts that arrived, including those of the vehicle itself. `read` counts the datagrams
-    that programs have read. `overflowed` counts those that the kernel discarded because the buffer of their socket was
-    full, and `unreachable` those that it discarded because no socket was open. `others` counts the other datagrams that
-    arrived, for example on loopback.
+    """The counts of UDP datagrams in the network of one vehicle. They include datagrams of sockets that are already
+    closed.
     """
 
     broadcasts: int
+    """Number of broadcasts that arrived, including the vehicle's own."""
     read: int
+    """Number of datagrams that programs have read."""
     overflowed: int
+    """Number of datagrams that the kernel discarded because a socket's receive buffer was full."""
     unreachable: int
+    """Number of datagrams that the kernel discarded because no socket was open for them."""
     others: int
+    """Number of arrived datagrams that are not broadcasts, for example on loopback."""
 
 
 def read_udp_counters() -> dict[str, int]:
-    """Return the counters of the network namespace of the calling thread, as JSON."""
+    """Return the counters of the calling thread's network namespace as a JSON object."""
     udp = _counters("snmp", "Udp:")
     unreachable = udp["NoPorts"] + udp["IgnoredMulti"]
     broadcasts = _counters("netstat", "IpExt:")["InBcastPkts"]

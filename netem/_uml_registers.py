@@ -3,14 +3,15 @@
 A User Mode Linux kernel older than 6.13 (Debian 12 has 6.1) supports registers up to AVX. On newer processors this
 kernel fails in two ways:
 
-- It has 2,696 bytes for the registers of a process. With AMX (Intel since Sapphire Rapids) they take 11,008 bytes, and
-  the host transfers them only as a whole. The kernel panics at its start.
-- It stores 832 bytes of the registers in the frame of a signal. After a signal, the additional registers of AVX-512
-  have the values of the signal handler. The C library uses them to copy memory, also in handlers, so copies become
-  corrupt.
+- It has 2,696 bytes for the registers of a process. On processors with AMX (Intel since Sapphire Rapids) the registers
+  take 11,008 bytes, and the host transfers either all of them or none. The kernel panics at its start.
+- When it delivers a signal, it saves only 832 bytes of the registers. After the signal handler, the additional
+  registers of AVX-512 keep the values that the handler wrote. The C library copies memory through these registers, also
+  inside handlers. Copies therefore become corrupt.
 
 On these processors the harness preloads a library, uml_registers.c, which replaces ptrace(2). It compiles the library
-for each guest, because machines differ and no files should remain. This takes a tenth of a second.
+at each start of User Mode Linux, because machines differ and no files should remain. The compilation takes a tenth of a
+second.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ def has_compiler() -> bool:
 
 
 def preload(folder: Path) -> dict[str, str]:
-    """Compile the library into `folder`. Return the environment variables with which to start the kernel. Raises
-    UmlError.
+    """Compile the library into `folder`. Return the environment variables that the kernel needs at its start to load
+    the library. Raises UmlError.
     """
     library = folder / "registers.so"
     done = subprocess.run(

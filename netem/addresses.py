@@ -1,8 +1,8 @@
-"""The addresses of vehicles. IP address, MAC address and name of the switch port are computed from the vehicle's ID.
+"""Compute the IP address, the MAC address and the switch port name of a vehicle from its ID.
 
-IDs may be 1 to 65535. A /16 network is too small, because ID 65535 would be its broadcast address. The last two bytes
-of 10.77.x.y are therefore the ID, and the network is the larger 10.76.0.0/14. The network and broadcast addresses
-10.76.0.0 and 10.79.255.255 belong to no ID.
+IDs may be 1 to 65535. A /16 network is too small, because ID 65535 would be its broadcast address. The network is
+therefore the larger 10.76.0.0/14. A vehicle has the address 10.77.x.y, and the bytes x and y are its ID. The network
+and broadcast addresses 10.76.0.0 and 10.79.255.255 belong to no ID.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ BROADCAST = "10.79.255.255"
 
 
 def address(vehicle: int) -> str:
-    """Return the IPv4 address of a vehicle, such as 10.77.1.2 for 258."""
+    """Return the IPv4 address of a vehicle, such as 10.77.1.2 for vehicle 258."""
     return f"10.77.{vehicle >> 8}.{vehicle & 0xFF}"
 
 

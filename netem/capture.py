@@ -6,8 +6,8 @@
 
 FOLDER/7.pcapng contains each Ethernet frame that vehicle 7 sent (outbound), and each one that reached its interface
 (inbound), even if no program received it. Frames that netem or nftables dropped are only in their sender's file.
-Corrupted frames are stored as they arrived. The comment of the section header is a JSON object for the conversion of
-times: mission_s = (timestamp - epoch) * speedup.
+Corrupted frames are stored as they arrived. The comment of a file's section header is a JSON object. A reader uses its
+keys `epoch_us` and `speedup` to convert a timestamp to mission seconds: (timestamp - epoch) * speedup.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class LiveCapture:
         self._folder = folder
         self._process = process
         self.processor_s = 0.0
-        """Processor time that the capture took, in seconds. It is known after `stop`."""
+        """Processor time in seconds that the capture process used. The value is set by `stop`."""
 
     @classmethod
     async def start(cls, lab: Lab, folder: Path, vehicles: Sequence[int] | None = None) -> LiveCapture:
-        """Start to capture frames at the switch ports of `vehicles`. The default is all vehicles. Raises
-        LiveCaptureError.
+        """Start to capture frames at the switch ports of `vehicles`. Without `vehicles`, capture at the ports of all
+        vehicles. Raises LiveCaptureError.
 
         Frames wait in memory until `begin`.
         """

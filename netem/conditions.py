@@ -1,6 +1,7 @@
-"""Represent network conditions (conditions of links, and partitions) independently of the mechanism that applies them.
+"""Represent network conditions independently of the mechanism that applies them. Network conditions are the conditions
+of all links, and a partition.
 
-As in the thesis, conditions belong to the receiver: each receiver of a broadcast loses or receives the broadcast
+As in the thesis, conditions belong to the receiver. Each receiver of a broadcast loses or receives the broadcast
 independently of the other receivers. In addition, a link can have its own conditions. A link leads from one sender to
 one receiver, in this direction only. `netem.link` defines the conditions of a link. A partition is a tuple of groups. A
 packet reaches only vehicles in the group of its sender. Vehicles in no group form a further group. A partition with a
@@ -80,10 +81,9 @@ class NetworkConditions:
         return not self.partition and all(link.lossless for link in links)
 
     def needs(self) -> tuple[str, ...]:
-        """Return the names of all network conditions in use, other than independent loss and partition.
-
-        Each condition occurs once, with the first place at which it is used, for example "delay", "receivers 3 reorder"
-        or "links 1>2 delay".
+        """Return the names of all network conditions in use, other than independent loss and partition. Each condition
+        occurs once. Its name includes the first receiver or link that uses it, for example "receivers 3 reorder" or
+        "links 1>2 delay". A name such as "delay" stands for the default conditions.
         """
         asked = {key: key for key in self.default.needs()}
         for vehicle, link in self.receivers.items():
@@ -121,7 +121,7 @@ class NetworkConditions:
         """Return these network conditions with an additional vehicle `listener`, whose links to and from `vehicles` are
         perfect.
 
-        The listener must reach all groups. Therefore links with a loss of 1 replace the partition.
+        Links with a loss of 1 replace the partition, because the listener must reach the vehicles of all groups.
         """
         roster, open_air = tuple(vehicles), LinkConditions()
         cut = {pair: LinkConditions(loss=1.0) for pair in permutations(roster, 2) if self.is_cut(*pair)}
@@ -129,9 +129,9 @@ class NetworkConditions:
         return replace(self, links={**self.links, **cut, **heard}, partition=())
 
     def at_speed(self, speedup: float) -> NetworkConditions:
-        """Return these network conditions in wall time, for a mission that runs `speedup` times as fast as wall time.
-
-        A kernel measures wall time. It needs delays that are shorter, and rates that are higher, by this factor.
+        """Convert these network conditions from mission time to wall time. `speedup` is the number of mission seconds
+        per second of wall time. A kernel measures wall time, so the method divides delays by `speedup` and multiplies
+        rates by `speedup`.
         """
         if speedup == 1:
             return self

@@ -1,10 +1,9 @@
 """Define the interface of engines. An engine makes the kernel apply network conditions to packets, and reports the
-result.
-
-There are two engines: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). For each receiver, both report the kernel's
-counts of passed, lost and cut packets. The counts start with the lab and are not reset by a change. After each change,
-the engine reads the state of the kernel. A difference from the requested conditions is an error, and the previous
-conditions are restored. A packet that is in transit during a change arrives under the old conditions.
+result. There are two engines: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). For each receiver, both report the
+kernel's counts of three kinds of packets: passed, lost, and dropped by a partition. The counts begin at 0 when the lab
+starts, and a change of conditions does not reset them. After each change, the engine reads the state of the kernel. A
+difference from the requested conditions is an error, and the previous conditions are restored. A packet that is in
+transit during a change arrives under the old conditions.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from netem.errors import EngineError
 from netem.link import GilbertElliott, LinkConditions
 
 RESOLUTION = 1.5e-9
-"""Precision of an engine for probabilities and delays. Engines store probabilities as fractions of 2^32-1 or 10^9, and
+"""Precision of probabilities and of delays in seconds. Engines store probabilities as fractions of 2^32-1 or 10^9, and
 delays in nanoseconds.
 """
 RATE_RESOLUTION = 4.01
-"""Precision of an engine for rates, in bits per second. Engines store rates in whole bytes per second."""
+"""Precision of rates, in bits per second. Engines store rates in whole bytes per second."""
 
 _COUNTS = ("passed", "lost", "cut")
 _MAX_WORDS = 600  # characters of conditions in an error message
@@ -51,8 +50,8 @@ class ReceiverFigures:
 
     @classmethod
     def of(cls, held: Mapping[int, LinkConditions], cut_from: tuple[int, ...], *counts: int) -> ReceiverFigures:
-        """Return the object for one receiver. `held` contains the network conditions of each sender. The most frequent
-        conditions become `link`.
+        """Return the object for one receiver. `held` maps each sender to the network conditions of its packets. The
+        most frequent conditions become `link`.
         """
         ((usual, _),) = Counter(held.values()).most_common(1) or [(LinkConditions(), 0)]
         differing = {sender: link for sender, link in held.items() if link != usual}
@@ -107,7 +106,9 @@ class Engine(ABC):
 
     name: ClassVar[str]
     has_queues: ClassVar[bool]
-    """True if the engine supports all conditions. Otherwise it supports only independent loss and partitions."""
+    """True if the engine supports all network conditions. An engine with a false value supports only independent loss
+    and partitions.
+    """
 
     def __init__(self, fabric: VirtualSwitch) -> None:
         """Install the engine. At first it applies neither loss nor delay. Raises EngineError if the kernel does not

@@ -28,7 +28,9 @@ class LabError(NetemError):
 
 
 class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
-    """An error: this machine cannot run the virtual network or the requested engine. `way_out` is the user's remedy."""
+    """An error: this machine cannot run the virtual network or the requested engine. `way_out` describes what the user
+    can do.
+    """
 
     def __init__(self, reason: str, way_out: str, stage: str = "namespaces") -> None:
         super().__init__(f"{reason.rstrip('.')}. {way_out}")

@@ -1,15 +1,15 @@
-"""Estimate properties of a received stream of packets, with 99.9 % confidence intervals.
-
-The intervals of shares are Wilson's, and the intervals of means and deviations are normal. Losses in bursts are not
-independent. Such a stream therefore counts as a smaller number of independent packets, according to its correlation.
+"""Estimate properties of a received stream of packets, with 99.9 % confidence intervals. Shares have Wilson intervals.
+Means and deviations have intervals of the normal distribution. Losses in bursts are not independent. A stream with such
+losses therefore counts as a smaller number of independent packets. The number depends on the correlation of the losses.
 Rate and limit are not random. Their intervals contain all values that are consistent with the arrival times.
 
-Each measured time contains delays of the machine. They have two causes. *Transit*: even on a perfect link, a packet
-takes some time from the sender to the receiver. A reference vehicle with perfect links receives the same packets, and
-its times are subtracted packet by packet. *Timers*: a delayed packet leaves when a timer of the kernel expires, and
-timers expire late. The sender sleeps between its packets, and records how late it wakes up. This lateness cannot be
-separated from a delay. The upper limit of the recorded lateness is therefore subtracted from the lower limit of a
-delay. On a slow machine the intervals become wide, but a correct kernel is never reported as wrong.
+Each measured time contains delays of the machine. They have two causes. The first cause is *transit*: even on a perfect
+link, a packet takes some time from the sender to the receiver. A reference vehicle with perfect links receives the same
+packets. The time of each packet to the reference vehicle is subtracted from the packet's measured delay. The second
+cause is *timers*: a delayed packet leaves when a timer of the kernel expires, and timers expire late. The sender sleeps
+between its packets, and records how late it wakes up. A measurement cannot separate the lateness of a timer from a
+delay. The upper limit of the recorded lateness is therefore subtracted from the lower limit of a delay. On a slow
+machine the intervals become wide, but a correct kernel is never reported as wrong.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ _NOTHING = Estimate(0.0, 0.0, 0.0, 0)
 
 
 def lost(received: ReceivedStream) -> Estimate:
-    """Estimate the share of lost packets, if losses are independent."""
+    """Estimate the share of lost packets. Assume that losses are independent."""
     return share(sum(_losses(received)), len(received.sent_s))
 
 
 def lost_in_bursts(received: ReceivedStream) -> Estimate:
-    """Estimate the share of lost packets, if losses follow a Markov chain with two states."""
+    """Estimate the share of lost packets. Assume that losses follow a Markov chain with two states."""
     losses = _losses(received)
     return share(sum(losses), len(losses), worth=_independence(losses))
 
@@ -151,8 +151,8 @@ def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
 
 
 def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
-    """Estimate a probability from `hits` in `count` draws. Each draw counts as `worth` independent draws (Wilson,
-    1927).
+    """Estimate the probability of an event that occurred in `hits` of `count` draws (Wilson, 1927). Each draw counts as
+    `worth` independent draws.
     """
     if count == 0:
         return _NOTHING
@@ -164,7 +164,9 @@ def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
 
 
 def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
-    """Estimate the mean of independent values from `packets` packets. By default, there is one value per packet."""
+    """Estimate the mean of independent values. `packets` is the number of packets that gave these values. By default,
+    each packet gave one value.
+    """
     if len(values) < 2:
         return _NOTHING
     average, margin = fmean(values), _Z * math.sqrt(variance(values) / len(values))
@@ -172,7 +174,7 @@ def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
 
 
 def deviation(values: Sequence[float]) -> Estimate:
-    """Estimate the standard deviation of independent values, whose distribution is unknown."""
+    """Estimate the standard deviation of independent values. The estimate assumes no particular distribution."""
     if len(values) < 2:
         return _NOTHING
     middle = fmean(values)
@@ -187,8 +189,8 @@ def _losses(received: ReceivedStream) -> list[bool]:
 
 
 def _independence(losses: Sequence[bool]) -> float:
-    """Return the share of independent draws in a correlated sequence of losses: (1 - c) / (1 + c), where c is the
-    correlation.
+    """Return the number of independent draws that one draw of this sequence of losses is worth. It is (1 - c) / (1 +
+    c), where c is the correlation of successive losses.
     """
     loss = fmean(losses)
     if not 0 < loss < 1:

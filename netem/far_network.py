@@ -1,4 +1,5 @@
-"""The network of a vehicle on another computer: one interface, whose frames a program reads and writes (TAP).
+"""The network of a vehicle on another computer. It has one interface (TAP): a program reads the frames that the vehicle
+sends, and writes the frames that the vehicle receives.
 
 The vehicle there has the same address, the same broadcast address and the same interface name `eth0` as a vehicle of a
 lab. The interface is not connected to a switch. The program behind it carries datagrams between the interface and a
@@ -22,7 +23,7 @@ from netem.errors import LabUnavailable
 from netem.frames import udp_broadcast
 
 MAX_DATAGRAM = 65_000
-"""Maximum number of bytes of a datagram. A larger one does not fit into a frame of the interface."""
+"""Maximum size of a datagram in bytes. A larger datagram does not fit into a frame of the interface."""
 
 _DEVICE = "/dev/net/tun"
 _INTERFACE = "eth0"
@@ -64,8 +65,8 @@ def die_with_parent() -> None:
 
 
 def become_first_process(*, user_namespace: bool) -> None:
-    """Return in the first process of a private network, which is a grandchild of the calling process. Both end with
-    their parents. `user_namespace` is the result of `needs_user_namespace`.
+    """Create a private network, and return in its first process, which is a grandchild of the calling process. Each of
+    these processes ends when its parent ends. `user_namespace` is the result of `needs_user_namespace`.
     """
     _namespaces.become_first_process(user_namespace=user_namespace)
 
@@ -108,5 +109,5 @@ class FarNetwork:
         return frame[begin + _UDP_BYTES : begin + int.from_bytes(udp[4:6], "big")]
 
     def write(self, sender: int, data: bytes) -> None:
-        """Let a datagram of another vehicle arrive. Raises OSError."""
+        """Let the vehicle receive a datagram of another vehicle. Raises OSError."""
         os.write(self.descriptor, udp_broadcast(sender, self._port, data))

@@ -1,7 +1,6 @@
-"""Run a function in a forked copy of this process, in place of a program in a new interpreter.
-
-A new interpreter spends most of its start on imports. A fork shares the imported modules, so a large swarm starts in a
-fraction of the time, and needs less memory.
+"""Run a function in a forked copy of this process, instead of a program in a new interpreter. A new interpreter spends
+most of its start on imports. A fork shares the modules that this process has imported. A large swarm therefore starts
+in a fraction of the time, and needs less memory.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ def fork_program(
 ) -> int:
     """Call `main` in a new process, and return the ID of this process.
 
-    The process has a session of its own, the default handlers of signals, an empty input, and no open files except for
-    `files`, which are its standard output and standard error. It calls `prepare` before `main`. The calling process
-    must have one thread.
+    The new process has its own session, the default signal handlers and an empty standard input. `files` are its
+    standard output and standard error. It has no other open files. It calls `prepare` before `main`. The calling
+    process must have one thread.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -37,7 +36,7 @@ def fork_program(
 
 
 def end_with(main: Callable[[], int | None]) -> None:
-    """Call a function in a forked process, and end the process as an interpreter would."""
+    """Call a function in a forked process. Then end the process in the same way as an interpreter ends."""
     status = 1
     try:
         gc.freeze()  # objects of the parent process must not close files of this one

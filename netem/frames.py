@@ -16,15 +16,17 @@ _TTL = 64
 
 
 def checksum(data: bytes) -> int:
-    """Return the Internet checksum (RFC 1071) as in UDP, with 0xFFFF in place of 0.
-
-    The code uses that the sum of 16-bit words with end-around carry equals the remainder of a division by 0xFFFF.
+    """Return the Internet checksum (RFC 1071) as UDP uses it, with 0xFFFF in place of 0. The checksum is a sum of
+    16-bit words with end-around carry. This sum equals the remainder of a division by 0xFFFF, which is faster to
+    compute.
     """
     return 0xFFFF - (int.from_bytes(data, "big") << 8 * (len(data) % 2)) % 0xFFFF
 
 
 def udp_broadcast(sender: int, port: int, data: bytes) -> bytes:
-    """Return the Ethernet frame in which a vehicle broadcasts a datagram, from `port` to `port`."""
+    """Return the Ethernet frame in which a vehicle broadcasts a datagram. The source port and the destination port are
+    both `port`.
+    """
     source, everyone = (socket.inet_aton(address) for address in (addresses.address(sender), addresses.BROADCAST))
     length = _UDP.size + len(data)
     pseudo_header = source + everyone + struct.pack("!HH", socket.IPPROTO_UDP, length)

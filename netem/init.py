@@ -48,15 +48,17 @@ class _OpeningConnection:
 
 
 def _limit_files(most_bytes: int) -> None:
-    """Limit the size of the files that this process writes. SIGXFSZ is ignored, so a write beyond the limit fails with
-    EFBIG.
+    """Limit the size of the files that this process writes. The process ignores the signal SIGXFSZ, so a write beyond
+    the limit fails with EFBIG.
     """
     resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
 
 def _module_of(argv: list[str]) -> Callable[[], None]:
-    """Return a function that plays the command `python -P -m MODULE ARGUMENT...`. Import its module now."""
+    """Import the module of the command `python -P -m MODULE ARGUMENT...`. Return a function that does what this command
+    would do.
+    """
     _, _, _, name, *arguments = argv
     module = importlib.import_module(name)
 

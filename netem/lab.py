@@ -8,9 +8,9 @@ The lab is not visible from outside: it adds no interface, rule or name to the c
 are shared with the caller. The lab ends with `close`, or with the caller's process. Process IDs belong to the lab, so
 `LabProcess.pid` has no meaning outside.
 
-Open a lab in the main thread. The death signal that guards the lab (see `netem._namespaces`) follows the thread that
-opened it. A lab that is opened in another thread has no death signal. Then only the end of the control socket ends the
-lab, and a lab that is suspended with SIGSTOP does not detect it.
+Open a lab in the main thread. The kernel sends the lab a death signal when the thread that opened the lab ends (see
+`netem._namespaces`). A lab that was opened in another thread therefore requests no death signal. Such a lab ends only
+when the control socket is closed. If the lab is suspended with SIGSTOP, it does not detect this.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class LabProcess:
 
     @property
     def end(self) -> str:
-        """The way in which the program ended, as text: the name of a signal, or the exit status."""
+        """A text about the end of the program: the name of the signal that killed it, or its exit status."""
         return in_words(self._ended.result())
 
     async def wait(self) -> int:
@@ -224,8 +224,8 @@ class Lab:
 
     @property
     def network(self) -> Self:
-        """This virtual network. The class for containers has the same property, which returns the virtual network below
-        it.
+        """This virtual network itself. The class for containers also has this property, and returns the virtual network
+        that connects its containers.
         """
         return self
 
@@ -306,7 +306,7 @@ class Lab:
         try:
             await asyncio.wait_for(self._process.wait(), _CLOSE_DEADLINE_S)
         except TimeoutError:
-            with contextlib.suppress(ProcessLookupError):  # it may end at this moment
+            with contextlib.suppress(ProcessLookupError):  # the process may end at this moment
                 self._process.kill()
             await self._process.wait()
 

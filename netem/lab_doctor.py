@@ -20,9 +20,9 @@ from netem.lab import Lab, LabError
 
 @dataclass(frozen=True)
 class LabRequirement:
-    """A requirement of the virtual network: its state, an observation, and the remedy if it is not met.
-
-    If a `needed` requirement is not met, this machine cannot open a lab. Of the engines, one is sufficient.
+    """A requirement of the virtual network. The object states whether this machine meets the requirement, what was
+    observed, and what the user can do otherwise. If this machine does not meet a `needed` requirement, it cannot open a
+    lab. One working engine is enough.
     """
 
     name: str

@@ -1,8 +1,8 @@
 """Represent the network conditions of packets from one vehicle to another: loss, delay, duplicates, reordering, and
 more.
 
-Names and meanings are those of tc-netem(8). The random draws of each packet are independent. JSON omits default values:
-a link with loss only is {"loss": 0.1}.
+Names and meanings are those of tc-netem(8). The random draws of each packet are independent. The JSON form omits
+default values. For example, a link that has only loss is {"loss": 0.1}.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ MAX_DELAY_S = 60.0
 ns ticks)."""
 
 MAX_LIMIT = 100_000
-"""Maximum number of waiting packets that `limit` can set. Without `limit`, the kernel has room for one packet more, so
-a flood cannot fill its memory.
+"""Greatest value of `limit`, the maximum number of waiting packets. Without `limit`, the kernel lets one packet more
+wait, so that a flood of packets cannot fill its memory.
 """
 
 
@@ -90,7 +90,9 @@ class Delay:
         object.__setattr__(self, "jitter_s", jitter_s)
 
     def at_speed(self, speedup: float) -> Delay:
-        """Return the delay in wall time for a mission that runs `speedup` times as fast."""
+        """Convert the delay from mission time to wall time. `speedup` is the number of mission seconds per second of
+        wall time.
+        """
         return replace(self, mean_s=self.mean_s / speedup, jitter_s=self.jitter_s / speedup)
 
     def to_json(self) -> dict[str, Any]:
@@ -189,9 +191,8 @@ class LinkConditions:
         return tuple(key for key, needed in asked.items() if needed)
 
     def at_speed(self, speedup: float) -> Self:
-        """Return the network conditions in wall time for a mission that runs `speedup` times as fast.
-
-        Delays become shorter, and the rate higher.
+        """Convert the network conditions from mission time to wall time. `speedup` is the number of mission seconds per
+        second of wall time. Delays become shorter, and the rate becomes higher.
         """
         return replace(
             self,
@@ -231,8 +232,8 @@ def probability(key: str, value: object) -> float:
 
 
 def keywords(cls: type[Any], value: Mapping[str, Any], at: str = "", required: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Check the fields of a JSON object for a dataclass, and return them. Raises ConditionsError for an unknown or
-    missing key.
+    """Check that the keys of a JSON object fit the fields of a dataclass. Return the object's keys and values. Raises
+    ConditionsError for an unknown or missing key.
     """
     prefix = f"{at}." if at else ""
     allowed = [field.name for field in fields(cls)]

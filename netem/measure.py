@@ -1,15 +1,15 @@
 """Measure how a network treats packets, and compare the results with the requested network conditions.
 
-A *study* consists of a network, broadcasts in it, and comparisons of measured values with requested ones. A value
-describes the packets from one sender to one receiver. Each receiver has its own conditions, so one stream of packets is
-enough for many comparisons. `measure` passes studies to an observer (`netem.observers`), which sends real packets or
-simulates packets in virtual time. A measurement is right if its 99.9 % interval (`netem.estimates`) contains the
-requested value.
+A *study* consists of network conditions, broadcasts under these conditions, and comparisons of measured values with
+requested values. Each value describes the packets from one sender to one receiver. Each receiver has its own
+conditions, so one stream of packets is enough for many comparisons. `measure` passes studies to an observer
+(`netem.observers`), which sends real packets or simulates packets in virtual time. A measurement is right if its 99.9 %
+interval (`netem.estimates`) contains the requested value.
 
 Even with a right kernel, one of a thousand intervals does not contain the requested value. With thirty comparisons,
 this happens in one of about thirty measurements. A wrong comparison is therefore repeated with a new stream. The second
-result counts, and the first result is shown beside it. A right kernel then fails a measurement of thirty comparisons
-once in 30,000 cases. A wrong kernel fails twice in a row.
+result counts, and the first result is shown beside it. With thirty comparisons, a right kernel then fails about one of
+30,000 measurements. A wrong kernel fails twice in a row.
 
 The requested value is the value that the engine can reach. For a delay, it is the mean and deviation of netem's table
 (`netem._distributions`). For corruption, it is the share of corrupted packets that checksums can detect.
@@ -39,8 +39,8 @@ REFERENCE = 3
 
 _FRAME_BITS = (DATA_BYTES + 42) * 8
 _UNPROTECTED_BITS = 95
-"""Bits of a frame without a checksum: the Ethernet addresses, without the group bit, whose corruption makes a receiver
-ignore a broadcast.
+"""Number of bits of a frame that no checksum protects. These are the bits of the Ethernet addresses, except for the
+group bit. A receiver ignores a broadcast whose group bit is corrupted.
 """
 _TABLE_SIZE = 4094  # size of the kernel's tables
 _SENDER, _OTHER_SENDER = 1, 2
@@ -49,8 +49,8 @@ _FIRST_FREE = 4
 
 @dataclass(frozen=True)
 class MeasuredQuantity:
-    """A comparison to make: the value that is estimated from the packets between two vehicles should equal the
-    requested value `asked`.
+    """A comparison to make. `estimate` computes a value from the packets between two vehicles. This value should equal
+    the requested value `asked`.
     """
 
     sender: int
@@ -198,8 +198,8 @@ def _losses() -> list[_LinkCase]:
 
 
 def _other_conditions(noticed: float) -> list[_LinkCase]:
-    """Return the network conditions other than loss and duplicates. `noticed` is the share of corrupted packets that
-    are detected.
+    """Return the cases for network conditions other than loss and duplicates. `noticed` is the share of corrupted
+    packets that receivers detect.
     """
     bursts = GilbertElliott(p=0.05, r=0.25)
     fixed, jitter_s = Delay(0.1), 0.02

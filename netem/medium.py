@@ -1,20 +1,21 @@
-"""Deliver broadcasts in virtual time. Seeded random numbers decide about losses and delays.
+"""Deliver broadcasts in virtual time. Seeded random numbers determine losses and delays.
 
 The medium is the third engine beside tc netem and nftables. It applies the same conditions without a kernel and without
 packets. Losses and delays are drawn separately for each receiver of a broadcast. If the conditions have neither a delay
 nor a rate, the latency is uniform from 2 to 50 ms, as over a radio. If they have only a rate, the rate determines the
 latency.
 
-A packet passes the steps of netem_enqueue in Linux (net/sched/sch_netem.c): draws for duplication and loss together, a
-draw for corruption, the limit, the second copy with its own draws, the delay, and the rate. Before these steps, a
-partition may drop the packet.
+First, a partition may drop the packet. The packet then passes the steps of netem_enqueue in Linux
+(net/sched/sch_netem.c) in this order: duplication and loss together, corruption, the limit of the queue, the second
+copy with its own draws, the delay, and the rate.
 
-Each sender has a random stream for each purpose: loss, latency, duplication, and so on. A further fault, or more
-messages of one sender, therefore do not change the draws of other senders. A draw is a word of 32 bits and is compared
-with integers only, so that a seed gives the same results on every machine.
+Each sender has a separate random number generator for each purpose, such as loss, latency or duplication. A further
+fault, or more messages of one sender, therefore do not change the random numbers of other senders. A random number has
+32 bits and is compared only with integers, so a seed gives the same results on every machine.
 
-In a swarm of 200 agents most draws are never used, because an answer matters only to one agent. The medium therefore
-draws words in large blocks. A broadcast stores the position of its words and reads them on demand.
+In a swarm of 200 agents most random numbers are never used, because an answer matters only to one agent. The medium
+therefore draws random numbers in large blocks. A broadcast stores the index of its first random number in the block,
+and reads its random numbers only when they are needed.
 """
 
 from __future__ import annotations
@@ -68,12 +69,12 @@ class Medium:
         self._words = [
             _RandomWords(self._stream("loss", sender), self._stream("latency", sender)) for sender in vehicles
         ]
-        self._rare: dict[int, tuple[Random, ...]] = {}  # by sender, where the air was ever not plain
-        self._links: list[list[_Link]] = [[] for _ in vehicles]  # of each sender, to all; none where the air is plain
+        self._rare: dict[int, tuple[Random, ...]] = {}  # by sender, if its links were ever not plain
+        self._links: list[list[_Link]] = [[] for _ in vehicles]  # of each sender to all; empty if its links are plain
         self.soonest = latency.mean_s
         self.latest = latency.mean_s
-        """Upper bound in seconds of the delays of all copies, so far and under the current conditions. `soonest` is the
-        lower bound.
+        """Upper bound, in seconds, of the delay of any message that was sent so far or is sent under the current
+        conditions. `soonest` is the lower bound.
         """
         self.apply(NetworkConditions())
 
@@ -93,19 +94,23 @@ class Medium:
         self.latest = max(self.latest, *(air.latest for air in self._air))
 
     def certain_delays(self) -> tuple[float, float] | None:
-        """Return the smallest and largest delay in seconds. Return None if messages may be lost."""
+        """Return the smallest and the largest delay in seconds. Return None if the medium may lose or duplicate a
+        message at random.
+        """
         if not all(air.certain for air in self._air):
             return None
         return min(air.soonest_of_all for air in self._air), max(air.latest for air in self._air)
 
     def hears(self, sender: int, receiver: int) -> bool:
-        """Return true if no partition separates the two vehicles, which are given by their numbers from 0."""
+        """Return true if no partition separates the two vehicles. Both arguments are indexes of vehicles from 0, not
+        IDs.
+        """
         return self._group[sender] == self._group[receiver]
 
     def draw(self, sender: int, now: float, data_bytes: int) -> RandomDraws:
         """Return the random results of a broadcast of `data_bytes` bytes, sent at the time `now` in seconds.
 
-        `sender` is the number of a vehicle from 0, not its ID. The calls for one sender must be in time order.
+        `sender` is the index of a vehicle from 0, not its ID. The calls for one sender must be in time order.
         """
         return self._air[sender].draw(now, data_bytes)
 
@@ -179,7 +184,9 @@ class _PlainSenderLinks:
 
 
 class _PlainDraws:
-    """The random results of one broadcast, stored as a position in the arrays of random numbers."""
+    """The random results of one broadcast. The object stores an index into the arrays of random numbers, and computes
+    each result on demand.
+    """
 
     __slots__ = ("_air", "_at", "_latency", "_loss", "latest")
 
@@ -207,9 +214,7 @@ class _PlainDraws:
 
 
 class _RandomWords:
-    """Two streams of 32-bit random numbers, which are drawn in blocks. The numbers from position `next` on are
-    unused.
-    """
+    """Two streams of 32-bit random numbers, which are drawn in blocks. The numbers from index `next` on are unused."""
 
     def __init__(self, loss: Random, latency: Random) -> None:
         self.loss = array("I")
@@ -218,7 +223,7 @@ class _RandomWords:
         self.next = 0
 
     def take(self, count: int) -> int:
-        """Return the position of the next `count` random numbers in the arrays `loss` and `latency`.
+        """Return the index of the next `count` random numbers in the arrays `loss` and `latency`.
 
         An array never changes. `refill` creates new arrays.
         """
@@ -229,7 +234,7 @@ class _RandomWords:
         return at
 
     def refill(self, count: int) -> int:
-        """Draw a new block of random numbers, and return the position of the first unused one."""
+        """Draw a new block of random numbers, and return the index of the first unused one."""
         loss, latency = self._streams
         self.loss = self.loss[self.next :] + _draw(loss, _BROADCASTS_AT_ONCE * count)
         self.latency = self.latency[self.next :] + _draw(latency, _BROADCASTS_AT_ONCE * count)
@@ -295,15 +300,15 @@ class _Link:
         self.conditions = conditions
         self._delay = conditions.delay or (latency if conditions.rate is None else AT_ONCE)
         self._bad = False
-        self._last = -inf  # when the last packet leaves
-        self._departures: list[float] = []  # a heap of when the packets leave that wait; some may have left
+        self._last = -inf  # time at which the last packet leaves
+        self._departures: list[float] = []  # heap: when each waiting packet leaves, or has left
         if before is not None and conditions.remembers and before.conditions.remembers:
             self._bad = before._bad and conditions == before.conditions
             self._last, self._departures = before._last, before._departures
 
     def enqueue(self, now: float, bits: int, draws: _Copy, second: _Copy | None = None) -> tuple[float, ...]:
-        """Send a packet at the time `now`. Return the delays in seconds of the copies that arrive: of the packet, and
-        of its duplicate if it has one.
+        """Send a packet at the time `now`. Return the delay in seconds of each copy that arrives. If `second` is given,
+        the packet is duplicated, and up to two copies arrive.
         """
         conditions = self.conditions
         loss, turn, corruption, reordering, latency = draws
@@ -312,10 +317,10 @@ class _Link:
             return ()
         if conditions.limit is not None and self._waiting(now) >= conditions.limit:
             return ()
-        # The second copy goes first; and of a packet both lost and duplicated, one is left.
+        # The second copy is sent first. If a packet is both lost and duplicated, one copy remains.
         copies = self.enqueue(now, bits, second) if second is not None and not lost else ()
         delay_s = 0.0 if reordering < conditions.reorder else self._wait(now, bits, latency)
-        if corruption < conditions.corrupt:  # its receiver throws it away
+        if corruption < conditions.corrupt:  # the receiver discards a corrupted packet
             return copies
         return (delay_s, *copies)
 
@@ -360,7 +365,9 @@ class _RepeatedDraws:
 
 
 def sample(delay: Delay, lot: float) -> float:
-    """Return the delay in seconds for a random number between 0 and 1. As in netem, a negative delay counts as 0."""
+    """Convert a random number between 0 and 1 to a delay in seconds with this distribution. As in netem, a negative
+    delay becomes 0.
+    """
     if delay.distribution == "uniform":
         return delay.mean_s + delay.jitter_s * (2 * lot - 1)
     deviations = table(delay.distribution, _TABLE_SIZE)[int(lot * _TABLE_SIZE)] / SCALE

@@ -23,7 +23,9 @@ from netem.measure import DATA_BYTES, REFERENCE, NetworkStudy, Observer
 from netem.medium import Medium
 
 PAUSES_S = (0.005, 0.01, 0.02)
-"""Seconds that a sender pauses after every 20 packets. The next longer pause is used if the machine is too slow."""
+"""Pauses in seconds after every 20 packets of a sender, in ascending order. If the machine is too slow for a pause, the
+measurement is repeated with the next pause.
+"""
 SPACING_S = 0.0003
 """Seconds between packets in virtual time."""
 
@@ -34,7 +36,7 @@ _TRY_AGAIN = "this machine is too busy to measure just now: try again when it is
 
 
 def in_medium(seed: int) -> Observer:
-    """Return a function that measures simulated packets, which have no delays of the machine. The seed determines all
+    """Return a function that observes simulated packets. The machine adds no delay to them. The seed determines all
     results.
     """
     streams = itertools.count()
@@ -60,12 +62,12 @@ def in_medium(seed: int) -> Observer:
 
 
 def in_lab(engine: EngineName) -> Observer:
-    """Return a function that measures real packets, each time in a new virtual network.
+    """Return a function that observes real packets. Each call opens a new virtual network.
 
     If the kernel's engine passed more packets than arrived, the machine lost them, because a receive buffer or a
-    processor's backlog was full. A stream with such losses is useless for the measurement, and is sent again more
-    slowly. Raises LabError if packets are still lost or the lab fails, and LabUnavailable if this machine cannot run
-    the lab.
+    processor's backlog was full. A stream with such losses is useless for the measurement. The function then sends a
+    new stream more slowly. Raises LabError if packets are still lost or the lab fails, and LabUnavailable if this
+    machine cannot run the lab.
     """
 
     def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
@@ -158,7 +160,7 @@ class PacketArrival(NamedTuple):
 
 
 def _arrivals(report: Mapping[str, Any], own: range) -> list[PacketArrival]:
-    """Return the received packets of one sender, renumbered from 0. `own` contains the numbers of this sender's
+    """Return the received packets of one sender, numbered from 0. `own` contains the original numbers of this sender's
     packets.
     """
     each = zip(report["numbers"], report["at_s"], report["delays_s"], strict=True)
@@ -190,7 +192,7 @@ class _ProbeProgram:
         return cls(process, output)
 
     async def wait_for(self, word: str) -> None:
-        """Wait until the output of the program contains the word, or until the program ends."""
+        """Wait until the output of the program contains `word`, or until the program ends."""
         while word not in self._output.read_text() and self._process.returncode is None:
             await asyncio.sleep(0.01)
 

@@ -71,7 +71,9 @@ class PcapngFile:
         self.packets = 0
 
     def packet(self, at_ns: int, frame: bytes, *, outbound: bool) -> None:
-        """Append a frame that left through the interface (`outbound` is true) or arrived at it."""
+        """Append a frame. `outbound` is true if the vehicle sent the frame, and false if the frame arrived at its
+        interface.
+        """
         captured = len(frame)
         padding = -captured % 4
         length = _PACKET_BYTES + captured + padding
@@ -80,7 +82,9 @@ class PcapngFile:
         self._append(b"".join((head, frame, bytes(padding), _DIRECTIONS[outbound], _BLOCK_LENGTH.pack(length))))
 
     def statistics(self, at_ns: int, received: int, dropped: int) -> None:
-        """Append the number of frames at the interface, and the number of frames that are missing in this file."""
+        """Append two counts: the frames that crossed the interface, and the frames among them that are missing in this
+        file.
+        """
         counts = _option(_ISB_IFRECV, struct.pack("<Q", received)) + _option(_ISB_IFDROP, struct.pack("<Q", dropped))
         at = struct.pack("<III", 0, at_ns >> 32, at_ns & 0xFFFFFFFF)
         self._append(_block(_STATISTICS, at + counts + _END_OF_OPTIONS))

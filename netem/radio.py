@@ -1,6 +1,5 @@
-"""Define radio models: the loss rate between two places, and its effect on network conditions.
-
-A radio is a function from distance to loss. The caller provides the positions of the vehicles.
+"""Define radio models. A radio model computes the loss rate between two places from their distance. The module also
+adds these losses to network conditions. The caller provides the positions of the vehicles.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ MIN_DISTANCE_M = 1.0
 """Reference distance of the path loss models, in metres. Shorter distances are treated like this distance."""
 
 STEPS = 100
-"""Number of steps to which a loss rate is rounded. Because of the rounding, two hovering vehicles cause no change of
-conditions.
+"""Loss rates are rounded to multiples of 1 / this number. Because of the rounding, the small movements of hovering
+vehicles do not change the network conditions.
 """
 
 
@@ -111,7 +110,7 @@ class LogDistance:
 
 
 def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], float]:
-    """Return the loss rate for each pair of vehicles, rounded to steps. Pairs without loss are omitted."""
+    """Return the rounded loss rate for each pair of vehicles. Pairs without loss are omitted."""
     losses: dict[frozenset[int], float] = {}
     for first, second in combinations(places, 2):
         if lost := round(radio.loss(places[first].distance_m(places[second])) * STEPS) / STEPS:
@@ -120,7 +119,9 @@ def links(radio: Radio, places: Mapping[int, Place]) -> dict[frozenset[int], flo
 
 
 def over_the_air(conditions: NetworkConditions, losses: Mapping[frozenset[int], float]) -> NetworkConditions:
-    """Return network conditions to which the additional, independent loss of the radio is added."""
+    """Return a copy of the network conditions with the loss of the radio added to each link. The loss of the radio is
+    independent of the other losses.
+    """
     if not losses:
         return conditions
     pairs = dict(conditions.links)

@@ -7,11 +7,12 @@
 
 `python -m netem.relay 1 2 3` opens and closes a relay, to test whether the kernel supports it.
 
-A radio channel decides when each vehicle gets a broadcast, and which vehicles lose it. A queue of the kernel at one
-port cannot do this. The relay uses two features that every bridge has. A port flag (`bcast_flood`, bridge(8)) keeps
-broadcasts away from the vehicles. A packet socket (packet(7)) gets each broadcast before the bridge handles it, and
-other packet sockets send it to single ports. The vehicles detect no difference, and the switch handles all other
-packets as before. Captures at the ports have both the sent and the delivered frames.
+A simulated radio channel decides when each vehicle receives a broadcast, and which vehicles lose it. A queue of the
+kernel at one port cannot do this. The relay uses two features that every bridge has. A port flag (`bcast_flood`,
+bridge(8)) keeps broadcasts away from the vehicles. A packet socket (packet(7)) gets each broadcast before the bridge
+handles it, and other packet sockets send it to single ports. The vehicles detect no difference, and the switch handles
+all other packets as before. A capture at a port contains the frames that the vehicle sent, and the frames that the
+relay delivered to the vehicle.
 
 Frames keep the header of `PACKET_VNET_HDR`, which marks their checksum as missing. The kernel therefore never computes
 the checksum. Delivered frames have a packet mark, and every engine lets frames with this mark pass.

@@ -2,10 +2,10 @@
 
 The program prints "ready" when it captures all ports. It then keeps frames in memory until SIGUSR1. Before this signal,
 the caller creates the files FOLDER/<ID>.pcapng, and the program then appends the frames to these files. SIGTERM ends
-the capture. The program then writes the remaining frames and the counters. The counters are at the end of each file,
-and for all files in one JSON object on standard output. A suspended process may receive SIGTERM before SIGUSR1. In this
-case the existence of the files shows that the mission began. Directions at a port are seen from the switch, and
-directions in a file from the vehicle.
+the capture. The program then writes the remaining frames and the counters. The counters of each port are at the end of
+its file. One JSON object on standard output contains the counters of all ports. A suspended process may receive SIGTERM
+before SIGUSR1. In this case the process checks whether the files exist, because they show that the mission began. A
+frame that enters the switch at a port is outbound in the vehicle's file. A frame that leaves the switch is inbound.
 """
 
 from __future__ import annotations

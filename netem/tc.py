@@ -49,8 +49,8 @@ _SURE_JITTER_S = (2**31 - 1) / 1e9
 
 
 def may_refuse(conditions: NetworkConditions) -> bool:
-    """Return true if some kernels with netem refuse these network conditions. The docstring of this module gives the
-    reason.
+    """Return true if some kernels with netem refuse these network conditions. See the docstring of this module for the
+    reasons.
     """
     links = (conditions.default, *conditions.receivers.values(), *conditions.links.values())
     return any(link.duplicate or (link.delay and link.delay.jitter_s > _SURE_JITTER_S) for link in links)
@@ -66,8 +66,8 @@ class _RemovedClassTotals:
 
 @dataclass
 class _ClassState:
-    """The network conditions that were last set for a traffic class, or None if the kernel refused them. `distribution`
-    is the distribution of the delay.
+    """The network conditions that the engine last set for a traffic class. They are None if the kernel refused them.
+    `distribution` is the distribution of the delay.
     """
 
     link: LinkConditions | None
@@ -215,7 +215,7 @@ class NetemEngine(Engine):
         return {vehicle: classes.get(port.index, {}) for vehicle, port in self._ports.items()}
 
     def _filters(self) -> tuple[dict[int, tuple[int, int] | None], dict[int, tuple[set[int], int]]]:
-        """Return the sender's mark and the accepted groups at each port."""
+        """Return the mark of packets that enter at each port, and the groups whose packets may leave there."""
         marks = {vehicle: port.read_mark(self._netlink) for vehicle, port in self._ports.items()}
         return marks, {vehicle: port.accepted_groups(self._netlink) for vehicle, port in self._ports.items()}
 
@@ -266,8 +266,8 @@ class NetemEngine(Engine):
 
 
 def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[frozenset[int]]:
-    """Divide senders into groups that have the same network conditions at every receiver. A sender on a link with
-    memory forms its own group.
+    """Divide senders into kinds. All senders of a kind have the same network conditions at every receiver. A sender on
+    a link with memory forms its own kind.
     """
     shared = (conditions.default, *conditions.receivers.values())
     own: dict[int, list[object]] = {vehicle: [] for vehicle in vehicles}
@@ -284,9 +284,9 @@ def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[fro
 
 
 def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> dict[int, LinkConditions]:
-    """Return one receiver's network conditions for each group of senders.
+    """Return number of a kind of senders -> network conditions of this receiver for these senders.
 
-    A vehicle that is alone in its group also has conditions for itself.
+    Kinds without a sender other than the receiver are omitted, unless no other kind exists.
     """
     senders = {number: next((v for v in kind if v != receiver), None) for kind, number in kinds.items()}
     links = {n: conditions.link(sender, receiver) for n, sender in senders.items() if sender is not None}

@@ -4,8 +4,8 @@
 
 linux.uml (Debian: user-mode-linux) boots from the host's own files (hostfs). The command finds all programs and
 directories at their usual paths, and writes with the caller's rights. The command needs no other rights. Inside the
-guest it is root. Only /run, with TMPDIR in it, is separate from the host. The guest has one processor, and a system
-call takes about twenty times as long as on the host.
+guest it is root. Only the directory /run is separate from the host. TMPDIR is inside it. The guest has one processor,
+and a system call takes about twenty times as long as on the host.
 
 The output of the command is copied without delay. The terminal of the command is a console of the guest. Ctrl-C and
 SIGTERM reach the command as Ctrl-C, and the command has no other input. Another console is for shells
@@ -52,7 +52,7 @@ regularly.
 
 POLL_S = 0.05
 SHELLS_KEYS, SHELLS_SCREEN = "keys", "screen"
-"""Files in a guest's folder: the input and the output of the console for shells (`netem.uml_shell`)."""
+"""Names of two files in a guest's folder: the input and the output of the console for shells (`netem.uml_shell`)."""
 INTERRUPTED = 128 + signal.SIGINT
 CTRL_C = b"\x03"
 
@@ -128,7 +128,9 @@ def find() -> Path:
 
 
 def examine() -> str:
-    """Boot User Mode Linux as a test. Return its path, and how it preserves registers. Raises UmlError."""
+    """Boot User Mode Linux as a test. Return a text with the path of the kernel and the method by which it preserves
+    registers. Raises UmlError.
+    """
     kernel = find()
     status = run(["true"], cwd=Path("/"), env={"PATH": SYSTEM_PATH})
     if status != 0:
@@ -242,7 +244,7 @@ class _RunningKernel:
                 chunk = word.read()
                 received += chunk
                 printed, errors = stdout.read(), stderr.read()
-                # The command's first output can precede the first beat, and the caller may act on it at once.
+                # The command's output can precede the first empty line, and the caller may react to it immediately.
                 self.up = self.up or bool(received or printed or errors)
                 _write(sys.stdout.buffer, printed)
                 _write(sys.stderr.buffer, errors)
@@ -279,7 +281,9 @@ def _write(target: BinaryIO, data: bytes) -> None:
 
 
 def _exit_status(received: bytes) -> int | None:
-    """Return the exit status in the received text. Return None if the line with the status is not complete yet."""
+    """Return the exit status from the received text. Return None if the text does not yet contain the complete line
+    with the status.
+    """
     *lines, _ = received.split(b"\n")
     return next((int(line) for line in lines if line.strip()), None)
 

@@ -1,12 +1,12 @@
-"""Run a program in a User Mode Linux that another process has started (`netem.uml`).
+"""Run a program in a virtual machine of User Mode Linux that another process has started (`netem.uml`).
 
     for folder in uml_shell.guests():
         status = uml_shell.enter(folder, ["ip", "address"], cwd=Path.cwd(), env=os.environ)
 
-Input goes into a named pipe in the guest's folder. The output of the console is a growing file there. At this console,
-the guest reads the name of a script in its folder, and runs the script with the console as its terminal. A zero byte
-and the name mark the start of the output. A zero byte, the name and the exit status mark its end. Only one program can
-run at a time.
+The virtual machine (guest) has a console for this module. The module writes input into a named pipe in the guest's
+folder, and reads the console's output from a growing file there. The guest reads the name of a script from the console,
+and runs this script from its folder with the console as terminal. A zero byte and the name mark the start of the
+output. A zero byte, the name and the exit status mark its end. Only one program can run at a time.
 """
 
 from __future__ import annotations
@@ -131,14 +131,16 @@ def _copy_until_end(folder: Path, token: bytes, keys: int, screen: io.FileIO) ->
 
 
 def _certain_length(output: bytes) -> int:
-    """Return the number of output bytes that cannot belong to the end mark."""
+    """Return the number of bytes at the beginning of `output` that cannot belong to the end mark."""
     at = output.rfind(b"\0", -END_MARK_BYTES)
     return at if at >= 0 else len(output)
 
 
 @contextlib.contextmanager
 def _raw_terminal() -> Iterator[None]:
-    """Pass all keys of the terminal to the virtual machine inside the context, including Ctrl-C."""
+    """Return a context manager. Inside its context, all keys of the terminal go to the virtual machine, including
+    Ctrl-C.
+    """
     if not sys.stdin.isatty():
         yield
         return

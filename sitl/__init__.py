@@ -1,7 +1,7 @@
 """Run simulated vehicles: ArduPilot SITL or the embedded vehicle model, and a pilot that flies them over MAVLink.
 
-`__all__` lists the public names. A name is imported at its first use, because every embedded vehicle imports this
-package. This lazy import keeps the start of the embedded vehicle fast.
+`__all__` lists the public names. Python imports a public name only when a program first uses it. Every embedded vehicle
+imports this package, and it therefore starts faster.
 """
 
 from typing import TYPE_CHECKING
@@ -36,7 +36,7 @@ _NAMES_OF = {
     "sitl.plan": ("GoTo", "Land", "Loiter", "Plan", "PlanError", "TakeOff"),
     "sitl.vehicle": ("Home", "Launch", "VehicleError", "VehicleKind"),
 }
-"""Module -> its public names. The module is imported when one of these names is first used."""
+"""Module -> its public names. Python imports the module when a program first uses one of these names."""
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 
 if not TYPE_CHECKING:  # a type checker would accept any name

@@ -4,10 +4,11 @@ parsers.
 `Autopilot` is the vehicle. A client exchanges bytes with it through a `ClientChannel` (serial_channel.py). The module
 streams.py defines the messages that the vehicle sends at intervals. Times are simulated seconds since boot.
 
-The autopilot answers like ArduPilot in every way that a client can observe. It refuses to arm until its position is
-known. It acknowledges a mode that is set in the first seconds after boot, and then undoes it. A copter begins a mission
-on command, a plane and a rover as soon as they are armed in AUTO mode. Formulas determine the motion of the vehicle. A
-new movement begins at the exact second at which the previous one ends, regardless of the step size of `advance`.
+A client cannot distinguish the autopilot's answers from those of ArduPilot. For example, the autopilot refuses to arm
+until its position is known. If a client sets a mode in the first seconds after boot, the autopilot acknowledges the
+mode and then leaves it again. A copter begins a mission on command. A plane and a rover begin a mission as soon as they
+are armed in AUTO mode. The position of the vehicle follows from formulas, not from simulated time steps. A new movement
+begins exactly when the previous movement ends, regardless of the step size of `advance`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from sitl._models import AT_ONCE, MODELS, MotionModel
 from sitl.modes import BOOT_MODES, MODES
 from sitl.vehicle import READY_S, Home, VehicleType
 
-MODE_SWITCH_READ_S = 3.0  # ArduPilot reads its mode switch about now, and undoes a mode set earlier
+MODE_SWITCH_READ_S = 3.0  # ArduPilot then reads its mode switch, and undoes a mode that was set before
 
 BATTERY_FULL_MAH = 10_000.0
 CURRENT_ARMED_A, CURRENT_IDLE_A = 10.0, 0.3
@@ -44,7 +45,9 @@ class MessageListener(Protocol):
 
 
 class Autopilot:
-    """The autopilot of one vehicle. `epoch_us` is the time of its boot in microseconds since the Unix epoch."""
+    """The autopilot of one vehicle. `epoch_us` is the time at which the vehicle boots, in microseconds since the Unix
+    epoch.
+    """
 
     takes_missions = True
 
@@ -80,7 +83,7 @@ class Autopilot:
 
     @property
     def ready(self) -> bool:
-        """True if the position is known, so that the vehicle may be armed."""
+        """True if the vehicle knows its position. It can be armed only then."""
         return self.has_booted and self.failsafes.has_gps
 
     @property
@@ -140,9 +143,8 @@ class Autopilot:
         return ACCEPTED
 
     def disarm(self, force: bool = False) -> int:
-        """Disarm the vehicle. Return the result code of the MAVLink command.
-
-        With `force` (MAV_CMD_COMPONENT_ARM_DISARM, param2 21196), this also works in flight. The vehicle then falls.
+        """Disarm the vehicle. Return the result code of the MAVLink command. If `force` is true, the vehicle also
+        disarms in flight, and then falls. A client requests this with MAV_CMD_COMPONENT_ARM_DISARM and param2 = 21196.
         """
         if self.airborne and self.armed and not force:
             return self._refuse("Disarm refused: in flight")
@@ -197,9 +199,7 @@ class Autopilot:
         return ACCEPTED
 
     def set_speed(self, speed_ms: float) -> int:
-        """Execute MAV_CMD_DO_CHANGE_SPEED, and return the result code. The new speed applies to the flight to the next
-        place.
-        """
+        """Execute MAV_CMD_DO_CHANGE_SPEED, and return the result code. The next movement has the new speed."""
         if not 0 < speed_ms <= MAX_SPEED_MS:
             return FAILED
         self._speed_ms = speed_ms
@@ -217,7 +217,9 @@ class Autopilot:
         return ACCEPTED
 
     def load(self, mission: Sequence[Any]) -> None:
-        """Replace the mission. A mission in progress continues in the new mission with the item of the same number."""
+        """Replace the mission. If a mission is in progress, the vehicle continues with the item of the same number in
+        the new mission.
+        """
         self.mission = mission
         if not self._in_mission:
             self.current_item = 0
@@ -237,7 +239,7 @@ class Autopilot:
                 self._go_on_to(self.place(item.frame, item.x, item.y, item.z), self.current_item)
 
     def hear(self, system: int) -> None:
-        """Process a heartbeat from the system with this ID."""
+        """Process a heartbeat. `system` is the MAVLink system ID of its sender."""
         if system == self.failsafes.parameters[STATION]:
             self.station_heard_s = self.now_s
 
@@ -382,8 +384,8 @@ class Autopilot:
         self._begin(self._model.go_to(self.motion, place, speed_ms, self._place_before(number)), self._item_reached)
 
     def _place_before(self, number: int) -> LocalPlace | None:
-        """Return the place of the previous mission item, ignoring changes of speed. Return None if that item has no
-        place.
+        """Return the place of the previous mission item. Skip items that change the speed. Return None if the previous
+        item has no place.
         """
         for item in reversed(self.mission[1:number]):
             match item.command:
@@ -417,9 +419,8 @@ class Autopilot:
             self._stay()
 
     def place(self, frame: int, lat_e7: int, lon_e7: int, alt_m: float) -> LocalPlace:
-        """Convert a place in one of the coordinate frames `FRAMES` to metres from home.
-
-        Latitude and longitude 0 stand for the current position.
+        """Convert a place to metres from home. `frame` is one of the coordinate frames in `FRAMES`. A latitude and
+        longitude of 0 stand for the current position.
         """
         up_m = alt_m - self.home.alt_m if frame in ABSOLUTE_FRAMES else alt_m
         if lat_e7 == lon_e7 == 0:

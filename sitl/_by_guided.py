@@ -1,6 +1,5 @@
-"""Fly a plan in GUIDED mode: the pilot sends the next place when the vehicle has reached the previous one.
-
-A plane takes off in its mode TAKEOFF. It cannot land in GUIDED mode, so its landing is a separate mission in AUTO mode.
+"""Fly a plan in GUIDED mode. The pilot sends the next place when the vehicle has reached the previous place. A plane
+takes off in mode TAKEOFF. A plane cannot land in GUIDED mode, so its landing is a separate mission in AUTO mode.
 """
 
 from __future__ import annotations
@@ -47,9 +46,9 @@ class GuidedFlight:
         self._take_off: TakeOff | None = TakeOff(link, vehicle_type, waypoints[0].place.up_m)
         self._landing: MissionFlight | None = None
         self._landing_begins = landing_begins(waypoints, vehicle_type)
-        self._done = 0 if vehicle_type == "rover" else 1  # waypoints; the first is the take-off
+        self._done = 0 if vehicle_type == "rover" else 1  # completed waypoints; the first waypoint is the take-off
         self._sent_to: int | None = None  # the waypoint that the vehicle was last sent to
-        self._there_s: float | None = None  # since when it has been there
+        self._there_s: float | None = None  # time since which it has been there
 
     def next_step(self) -> ProcedureStep | None:
         if self._take_off is not None:
@@ -65,7 +64,7 @@ class GuidedFlight:
                     return None
                 raise HopelessError(f"it disarmed on {leg.name}")
             if self._done == self._landing_begins:
-                rest = self._waypoints[self._done :]  # its approach and its landing
+                rest = self._waypoints[self._done :]  # the approach and the landing of a plane
                 self._landing = MissionFlight(self._to.link, "plane", rest, under_way=True)
                 return self._landing.next_step()
             if waypoint.kind == "land":
@@ -107,9 +106,8 @@ class GuidedFlight:
         return is_near(place, waypoint, self._to.vehicle_type)
 
     def _on_its_way(self) -> bool:
-        """Return true if the vehicle has accepted its target.
-
-        A plane acknowledges its target. Other vehicles begin to move.
+        """Return true if the vehicle has accepted its target. A plane accepts the target with an acknowledgement. Other
+        vehicles send none, so the function checks whether they move.
         """
         if self._to.vehicle_type == "plane":
             return self._to.accepted(mavlink.MAV_CMD_DO_REPOSITION)
@@ -132,7 +130,7 @@ class GuidedFlight:
         self._to.link.send(
             mavlink.MAVLink_set_position_target_global_int_message(0, *target, frame, POSITION_ONLY, *place, *[0.0] * 8)
         )
-        self._set_speed(waypoint)  # again: ArduCopter forgets it when it begins to go to places
+        self._set_speed(waypoint)  # sent again, because ArduCopter forgets the speed at the first place
 
     def _set_speed(self, waypoint: Waypoint) -> None:
         kind = SPEED_TYPES[self._to.vehicle_type]

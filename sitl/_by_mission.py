@@ -23,8 +23,8 @@ class MissionFlight:
     """A flight as a mission: upload the plan, arm, start, and count the waypoints. A copter is armed in GUIDED mode,
     the other types in AUTO mode.
 
-    `under_way` is true if the vehicle is already flying. A disarmed vehicle then has finished its flight, and is not
-    waiting for a start.
+    `under_way` is true if the vehicle is already flying. In this case a disarmed vehicle has finished its flight, and
+    the pilot does not arm it.
     """
 
     purpose = "fly its plan"

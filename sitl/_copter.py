@@ -46,7 +46,7 @@ class CopterMotion:
         length_m = math.hypot(level_m, climb_m)
         if not length_m:
             return [RestSegment(start, 0.0)]
-        # along a slope the slower of the two axes sets the pace
+        # on a slope, the slower of the two axes determines the speed
         limits = [(level_m, speed_ms, ACCEL_MS2)] if level_m else []
         if climb_m:
             limits.append((abs(climb_m), CLIMB_MS if climb_m > 0 else DESCENT_MS, VERTICAL_ACCEL_MS2))

@@ -1,8 +1,8 @@
 """Simulate faults of the embedded vehicle, and decide when its failsafes act.
 
-Parameters have the names of ArduPilot and its simulation. The vehicle has a GPS, a battery, a receiver of a remote
-control, a fence and, if it is a copter, motors. A plane is affected by wind. It has no compass. The vehicle does not
-know parameters of parts that it does not have.
+Parameters have the names of ArduPilot and its simulation. Each vehicle has a GPS, a battery, a receiver of a remote
+control, and a fence. Only a copter has motors that can fail. Only a plane is affected by wind. No vehicle has a
+compass. A vehicle does not know the parameters of parts that it lacks.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from typing import Literal
 from sitl._kinematics import LocalPlace
 from sitl.vehicle import VehicleType
 
-BATTERY_FULL_V, BATTERY_USED_V = 16.8, 3.6  # full, and what of that a battery loses until it is empty
-NO_GPS_S = 8.0  # an EKF does without that long, as measured with 4.7
+BATTERY_FULL_V, BATTERY_USED_V = 16.8, 3.6  # voltage of a full battery, and its loss until the battery is empty
+NO_GPS_S = 8.0  # time without GPS after which the EKF failsafe acts, measured with 4.7
 
-SLOWEST_MS = 3.0  # over the ground, however strong the wind
+SLOWEST_MS = 3.0  # minimum ground speed in any wind
 
 GPS, VOLTS, THRUST, MOTOR = "SIM_GPS1_ENABLE", "SIM_BATT_VOLTAGE", "SIM_ENGINE_MUL", "SIM_ENGINE_FAIL"
 WIND, WIND_FROM = "SIM_WIND_SPD", "SIM_WIND_DIR"
@@ -24,8 +24,8 @@ WIND, WIND_FROM = "SIM_WIND_SPD", "SIM_WIND_DIR"
 LOW_AT, CRITICAL_AT, LOW_FOR = "BATT_LOW_VOLT", "BATT_CRT_VOLT", "BATT_LOW_TIMER"
 WHEN_LOW, WHEN_CRITICAL = "BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"
 BATTERY = {LOW_AT: 0.0, CRITICAL_AT: 0.0, LOW_FOR: 10.0, WHEN_LOW: 0.0, WHEN_CRITICAL: 0.0}
-"""ArduPilot's default parameters for the battery. With these parameters, the battery is never low. Only the battery of
-a copter can be low, but this has no effect.
+"""ArduPilot's default parameters for the battery failsafes. With the defaults, only a copter detects a low battery, and
+then only reports it.
 """
 COPTER_LOW_V = 10.5
 
@@ -34,8 +34,8 @@ ACTIONS: dict[VehicleType, dict[float, str]] = {
     "plane": {1: "RTL", 2: "RTL"},
     "rover": {1: "RTL", 2: "HOLD", 3: "RTL", 4: "HOLD"},
 }
-"""The modes that the values of BATT_FS_..._ACT select if the vehicle knows no better route home. Other values select no
-mode.
+"""Value of a parameter BATT_FS_..._ACT -> mode that the vehicle enters. Other values select no mode. Some values prefer
+another route home, which this vehicle does not have.
 """
 
 RC_FAIL, RC_SILENT_S = "SIM_RC_FAIL", 1.0
@@ -48,12 +48,12 @@ LINKS: dict[VehicleType, dict[str, float]] = {
     "plane": {STATION_SILENT: 5.0, "FS_GCS_ENABL": 0.0, "THR_FAILSAFE": 1.0, "FS_LONG_ACTN": 0.0},
     "rover": {STATION_SILENT: 5.0, "FS_GCS_ENABLE": 0.0, "FS_THR_ENABLE": 1.0, "FS_ACTION": 2.0},
 }
-"""Parameters of the failsafes for the ground station and the remote control, with ArduPilot's default values. For a
-plane, ArduPilot has the timeout in FS_LONG_TIMEOUT.
+"""Parameters of the failsafes for a silent ground station and a silent remote control, with ArduPilot's default values.
+In ArduPlane, the timeout has the name FS_LONG_TIMEOUT.
 """
 LINK_ACTION: dict[VehicleType, str] = {"plane": "FS_LONG_ACTN", "rover": "FS_ACTION"}
-"""The parameter with the action of both failsafes. For a copter, the parameters that enable the failsafes contain the
-action.
+"""The parameter that selects the action of both failsafes. A copter has no such parameter. The parameters that enable
+its failsafes also select the action.
 """
 STATION_ACTIONS = {1.0: "RTL", 2.0: "RTL", 3.0: "RTL", 4.0: "LAND", 5.0: "LAND", 6.0: "RTL", 7.0: "LAND"}
 RC_ACTIONS = {1.0: "RTL", 2.0: "RTL", 3.0: "LAND", 4.0: "RTL", 5.0: "LAND", 6.0: "RTL", 7.0: "LAND"}
@@ -78,7 +78,7 @@ class Failsafes:
         self.parameters |= {**LINKS[vehicle_type], FENCE: 0.0, FENCE_TYPE: 2.0, FENCE_ACTION: 1.0, FENCE_RADIUS: 300.0}
         self._vehicle_type: VehicleType = vehicle_type
         self._actions = ACTIONS[vehicle_type]
-        self._needs_gps = vehicle_type != "plane"  # which knows its airspeed, and reckons from that where it is
+        self._needs_gps = vehicle_type != "plane"  # a plane estimates its position from its airspeed
         if vehicle_type == "copter":
             self.parameters |= {THRUST: 1.0, MOTOR: 0.0, LOW_AT: COPTER_LOW_V}
         if vehicle_type != "rover":
@@ -99,8 +99,8 @@ class Failsafes:
         return self.parameters.get(THRUST, 1.0) < 0.5
 
     def over_ground(self, speed_ms: float, bearing_rad: float) -> float:
-        """Return the ground speed for an air speed and a bearing in the current wind. Bearings are clockwise from
-        north.
+        """Return the ground speed in the current wind. `speed_ms` is the air speed. `bearing_rad` is the direction of
+        the flight, clockwise from north.
         """
         from_rad = math.radians(self.parameters.get(WIND_FROM, 0.0))
         head_ms = self.parameters.get(WIND, 0.0) * math.cos(bearing_rad - from_rad)
@@ -112,7 +112,7 @@ class Failsafes:
 
     def action(self, failsafe: Failsafe) -> str | None:
         """Return the flight mode that the vehicle enters when this failsafe acts. Return None if the vehicle stays in
-        its mode. The failsafe must be one of the battery, a link or the fence.
+        its mode. The failsafe must not be "ekf".
         """
         kind = self._vehicle_type
         if failsafe == "fence":

@@ -16,7 +16,7 @@ from sitl._pilot_link import PilotLink
 from sitl.procedure import HEARTBEAT, ProcedureStep
 
 PATIENCE = 10
-"""Number of heartbeats without an answer after which a request is given up."""
+"""Number of heartbeats after which the pilot gives up a request without an answer."""
 MOST_AT_ONCE = 50
 
 _VERSION = ProcedureStep("its version")
@@ -25,8 +25,8 @@ _GIVEN = ProcedureStep("the parameters that it was given")
 
 
 class VehicleIntroduction:
-    """The requests for version and parameters of a vehicle. The vehicle must have the parameters in `given`. The pilot
-    sets the parameters whose values differ from `given`.
+    """The procedure that requests the version and the parameters of a vehicle. It also sets the parameters in `given`
+    to the given values. The vehicle must have these parameters.
     """
 
     purpose = "introduce itself"
@@ -59,7 +59,7 @@ class VehicleIntroduction:
             for name, value in self._given.items():
                 if name in link.parameters:
                     link.set_parameter(name, value)
-                link.request_parameter(name)  # ArduPilot lists none of a group that is switched off
+                link.request_parameter(name)  # ArduPilot's list omits the parameters of groups that are switched off
 
     def _ask_for_list(self) -> None:
         """Request all parameters until the first parameter arrives. When no more parameters arrive, request the missing

@@ -1,8 +1,8 @@
-"""Describe the motion of vehicles as sequences of segments. Each segment is a formula of the time since its beginning.
-
-The formulas do not simulate forces or time steps, so a position does not depend on how often it is computed. A process
-that wakes once in twenty simulated seconds and a simulation in virtual time compute the same track. The motions of
-copters, planes and rovers are in _copter.py, _plane.py and _rover.py.
+"""Describe the motion of vehicles as sequences of segments. Each segment is a formula that computes the position from
+the time since the beginning of the segment. The formulas simulate neither forces nor time steps, so a position does not
+depend on how often a program computes it. For example, a process that wakes only every twenty simulated seconds
+computes the same track as a simulation in virtual time. The motions of copters, planes and rovers are in _copter.py,
+_plane.py and _rover.py.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 GRAVITY_MS2 = 9.81
-NEAR_M = 1e-6  # closer than this is there
+NEAR_M = 1e-6  # a vehicle at this distance has reached a place
 
 
 class LocalPlace(NamedTuple):
@@ -58,7 +58,9 @@ class MotionSegment(Protocol):
         """The duration of the segment in seconds, or math.inf if it has no end."""
 
     def at(self, since_s: float) -> MotionState:
-        """Return the motion at a time since the beginning of the segment, from 0 to `duration_s`."""
+        """Return the motion at a time in seconds after the beginning of the segment. The time is from 0 to
+        `duration_s`.
+        """
 
 
 class RestSegment:
@@ -73,11 +75,10 @@ class RestSegment:
 
 
 class StraightLine:
-    """A straight line. The speed changes from `from_ms` to `speed_ms`, and at the end to `to_ms`, with the acceleration
-    `accel_ms2`.
-
-    On a short line the speed profile is triangular. The line must be long enough for the change from `from_ms` to
-    `to_ms`. The heading is the direction of the line. On a vertical line, the heading does not change.
+    """A straight line. At the beginning, the speed changes from `from_ms` to `speed_ms`. At the end it changes to
+    `to_ms`. Both changes have the acceleration `accel_ms2`. On a short line, the vehicle does not reach `speed_ms`. The
+    line must be long enough for the change from `from_ms` to `to_ms`. The heading is the direction of the line. On a
+    vertical line, the heading does not change.
     """
 
     def __init__(
@@ -147,7 +148,7 @@ class CircularArc:
 
 
 class ClimbingSegment:
-    """A level segment to which a climb or descent is added, at `rate_ms` to the altitude `up_m`."""
+    """A level segment with an additional climb or descent to the altitude `up_m`, at the vertical speed `rate_ms`."""
 
     def __init__(self, level: MotionSegment, up_m: float, rate_ms: float) -> None:
         self._level, self._up_m = level, up_m
@@ -197,7 +198,7 @@ class PlannedMotion:
 
     @property
     def rests_from_s(self) -> float:
-        """The time from which the position does not change any more. Infinity if it always changes."""
+        """The time at which the vehicle stops moving for good. It is infinity if the vehicle never stops."""
         return self._begin_s[-1] if isinstance(self._segments[-1], RestSegment) else self.end_s
 
     def at(self, now_s: float) -> MotionState:

@@ -14,7 +14,7 @@ class FrameSplitter:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Add bytes, and return the frames that are complete now.
+        """Add bytes, and return the frames that these bytes complete.
 
         The splitter stores less than one frame, which has at most 292 bytes.
         """

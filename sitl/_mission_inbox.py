@@ -1,9 +1,9 @@
 """Implement the vehicle's side of the MAVLink mission protocol: receive a mission, and send the current one.
 
-The vehicle requests a mission item by item. The mission replaces the old one when it is complete. The vehicle needs no
-timers, because a client without an answer sends MISSION_COUNT again, which restarts the transfer. Results equal those
-of ArduPilot (https://mavlink.io/en/services/mission.html; MAV_MISSION_RESULT). Item 0 is the home position. The vehicle
-keeps its own home position.
+The vehicle requests one mission item after another. A new mission replaces the old mission when it is complete. The
+vehicle needs no timers, because a client without an answer sends MISSION_COUNT again, which restarts the transfer.
+Results equal those of ArduPilot (https://mavlink.io/en/services/mission.html; MAV_MISSION_RESULT). Item 0 is the home
+position. The vehicle keeps its own home position.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class MissionInbox:
 
     def __init__(self, vehicle: Autopilot) -> None:
         self._vehicle = vehicle
-        self._expected: int | None = None  # items of the mission that is coming in
+        self._expected: int | None = None  # number of items in the mission that is being received
         self._items: list[Any] = []
 
     def receive(self, kind: str, message: Any) -> Iterable[Any]:
@@ -91,7 +91,9 @@ def _sender(message: Any) -> tuple[int, int]:
 
 
 def _with_integers(item: Any) -> Any:
-    """Convert a MISSION_ITEM, which has degrees as floats, to a MISSION_ITEM_INT. Large values are limited."""
+    """Convert a MISSION_ITEM, whose degrees are floats, to a MISSION_ITEM_INT, whose degrees are integers. Values that
+    are too large become the largest integer.
+    """
     x, y = (round(degrees * 1e7) if abs(degrees) <= 180 else 2**31 - 1 for degrees in (item.x, item.y))
     fields = (item.param1, item.param2, item.param3, item.param4, x, y, item.z)
     converted = mavlink.MAVLink_mission_item_int_message(
@@ -109,7 +111,7 @@ def _check(item: Any) -> int:
         return int(mavlink.MAV_MISSION_UNSUPPORTED_FRAME)
     for name in ("param1", "param2", "param3", "param4"):
         value = getattr(item, name)
-        if math.isinf(value) or (math.isnan(value) and name != "param4"):  # NaN there is "the yaw you like"
+        if math.isinf(value) or (math.isnan(value) and name != "param4"):  # in param4, NaN means any yaw
             return int(getattr(mavlink, f"MAV_MISSION_INVALID_{name.upper()}"))
     if abs(item.x) > 90e7:
         return int(mavlink.MAV_MISSION_INVALID_PARAM5_X)

@@ -42,7 +42,7 @@ _COMMANDS = {
 
 
 def on_earth(place: LocalPlace, home: Home) -> tuple[int, int]:
-    """Return latitude and longitude in 1e-7 degrees of a place in metres from home."""
+    """Return the latitude and longitude of a place, in units of 1e-7 degrees. `place` is in metres from home."""
     there = home.offset(place.north_m, place.east_m)
     return round(there.lat_deg * 1e7), round(there.lon_deg * 1e7)
 
@@ -91,8 +91,8 @@ class MissionItems:
 class MissionUpload:
     """The upload of a mission. The vehicle requests each item, and finally accepts or refuses the mission.
 
-    `ask` begins the upload, and restarts it after RESEND_S without an answer. `refused` is the MAV_MISSION_RESULT of a
-    vehicle that rejects the mission.
+    `ask` begins the upload. If the vehicle does not answer for RESEND_S seconds, `ask` restarts it. If the vehicle
+    rejects the mission, `refused` is its MAV_MISSION_RESULT.
     """
 
     def __init__(self, link: PilotLink, mission: MissionItems) -> None:

@@ -13,10 +13,12 @@ MOST_COMMANDS = 1000
 """Maximum number of recorded commands. Further commands are only counted."""
 
 _ASKS_ONLY = re.compile(r"MAV_CMD_(REQUEST_|GET_|SET_MESSAGE_INTERVAL$|RUN_PREARM_CHECKS$|DO_SEND_BANNER$)")
-"""Names of commands that only make a vehicle answer. Ground stations send them automatically."""
+"""Names of commands that only request an answer from a vehicle. Ground stations send them automatically."""
 
 _AT_THE_STICKS = frozenset({"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"})
-"""Names of messages that are sent many times per second. Consecutive messages form one entry."""
+"""Names of messages that a ground station sends many times per second. Consecutive messages of the same name form one
+entry.
+"""
 
 _COMMANDS = frozenset(
     {
@@ -35,7 +37,7 @@ _COMMANDS = frozenset(
     }
 )
 _SETTINGS = frozenset({"PARAM_SET"})
-"""Names of messages that change a vehicle but do not fly it."""
+"""Names of messages that change the settings of a vehicle but do not steer it."""
 
 _ADDRESS = frozenset({"target_system", "target_component", "command", "mavpackettype"})
 
@@ -50,7 +52,7 @@ class CommandLog:
     def note(self, message: Any, vehicle_ids: Iterable[int], at_s: float) -> bool:
         """Record a message to these vehicles at mission second `at_s`, if it is a command.
 
-        Return true if the operator flies the vehicles from now on.
+        Return true if the operator takes over the vehicles from the pilot with this message.
         """
         kind = message.get_type()
         if kind not in _COMMANDS | _SETTINGS or _ASKS_ONLY.match(_command(message) or ""):

@@ -22,9 +22,11 @@ from sitl.vehicle import Home
 
 STATION_SYSTEM = 255  # ArduPilot's default for the ground station
 STATION_PARAMETERS = ("MAV_GCS_SYSID", "SYSID_MYGCS")
-"""Names of the parameter with the system ID of the vehicle's ground station: since ArduPilot 4.7, and before."""
+"""Two names of the parameter that contains the system ID of the vehicle's ground station: the name since ArduPilot 4.7,
+and the older name.
+"""
 PILOT_SYSTEMS = (254, 253)
-"""System IDs of the pilot. The second one is used for a vehicle that itself has the first ID."""
+"""System IDs of the pilot. The pilot uses the second ID if its vehicle itself has the first ID."""
 HEARTBEAT_INTERVAL_S = 1.0  # wall time
 MAX_HEARTBEAT_INTERVAL_S = 2.0  # simulated: ArduPilot's ground station failsafe acts after 5 (FS_GCS_TIMEOUT)
 LOW_M = 2.0  # a vehicle below this may lie on the ground
@@ -48,11 +50,7 @@ class PilotLink(asyncio.Protocol):
 
     The link sends two kinds of heartbeats. The heartbeats of the pilot have the pilot's system ID. The heartbeats of a
     ground station have the ID that the vehicle expects from its ground station, because its failsafe acts without such
-    heartbeats. The heartbeats of a ground station stop while `station_is_heard` is false. A run with a real ground
-    station sets `plays_station` to false.
-
-    `heard` is set when data arrives and when the connection ends. `closed` is set only when the connection ends. Times
-    in `heard_at`, `heartbeat_at` and `position_at` come from time.monotonic().
+    heartbeats. If the run has a real ground station, the link sends only the heartbeats of the pilot.
     """
 
     def __init__(self, sysid: int, sock: socket.socket, tlog: Path, speedup: float, home: Home) -> None:
@@ -66,12 +64,18 @@ class PilotLink(asyncio.Protocol):
         self.tlog_path = tlog
         self.state = VehicleState()
         self.closed = asyncio.Event()
+        """An event that is set when the connection ends."""
         self.heard = asyncio.Event()
+        """An event that is set when data arrives, and when the connection ends."""
         self.heard_at = time.monotonic()
+        """Time of the last data from the vehicle. This time and the next two are values of time.monotonic()."""
         self.heartbeat_at: float | None = None
         self.position_at: float | None = None
         self.heartbeats = 0
         self.plays_station = self.station_is_heard = True
+        """`plays_station` is false if the run has a real ground station. While either of the two values is false, the
+        link sends no heartbeats of a ground station.
+        """
         self.foreign_sysid: int | None = None
         self.acks: dict[int, int] = {}  # MAV_CMD: the last MAV_RESULT
         self.parameters: dict[str, float] = {}
@@ -106,7 +110,7 @@ class PilotLink(asyncio.Protocol):
         self._first_time: tuple[float, float] | None = None  # wall, simulated
         self._last_time: tuple[float, float] | None = None
         self._estimate_is_good = False
-        self._knows_its_height: bool | None = None  # above its home: whether it did when its estimate got good
+        self._knows_its_height: bool | None = None  # whether its height was right when its estimate became good
 
     async def start(self) -> None:
         """Start to read and log messages, and to send heartbeats."""
@@ -125,10 +129,9 @@ class PilotLink(asyncio.Protocol):
 
     @property
     def real_time_factor(self) -> float | None:
-        """The simulated seconds per second of real time since the first message, divided by the speedup. None if too
-        little time has passed.
-
-        With the value 1.0, the machine is fast enough.
+        """The number of simulated seconds per second of wall time since the first message, divided by the speedup. The
+        value is 1.0 if the machine is fast enough, and less if it is too slow. It is None if too little time has
+        passed.
         """
         if self._first_time is None or self._last_time is None:
             return None
@@ -296,7 +299,7 @@ class PilotLink(asyncio.Protocol):
 
     def _on_sys_status(self, message: Any) -> None:
         check = mavlink.MAV_SYS_STATUS_PREARM_CHECK
-        # firmware older than 4.0 does not report its pre-arm checks; it is asked to arm and says no
+        # Firmware older than 4.0 does not report its pre-arm checks. It refuses the command to arm instead.
         reports = message.onboard_control_sensors_present & check
         self.state.ready_to_arm = not reports or bool(message.onboard_control_sensors_health & check)
         estimator_bit = message.onboard_control_sensors_present & mavlink.MAV_SYS_STATUS_AHRS
@@ -308,11 +311,11 @@ class PilotLink(asyncio.Protocol):
         self.position_at = self.heard_at
         self._on_time(message)
         if not self._estimate_is_good or (message.lat == 0 and message.lon == 0):
-            return  # ArduPlane 4.7 says after its boot that it is near 0 N, 0 E, and a rover that its altitude is 0
+            return  # after boot, ArduPlane 4.7 reports a place near 0 N, 0 E, and a rover an altitude of 0
         height_m, says_m = message.alt / 1e3 - self.home.alt_m, message.relative_alt / 1e3
-        if self._knows_its_height is None:  # a rover of 4.7 reports 584 m above its home all the time
+        if self._knows_its_height is None:  # a rover of 4.7 always reports 584 m above home
             self._knows_its_height = abs(says_m - height_m) < HEIGHTS_DIFFER_M
-        if self._knows_its_height:  # the altitude above the sea is frozen once a copter of 4.7 has lost its GPS
+        if self._knows_its_height:  # without GPS, a copter of 4.7 does not update its altitude above the sea
             height_m = says_m
         self.state.position = ReportedPosition(
             message.lat / 1e7,

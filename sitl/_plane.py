@@ -1,8 +1,8 @@
 """Compute the motion of a plane in arcs and straight lines, never slower than its minimum flying speed.
 
 The values are those of ArduPlane's SITL (plane.parm), or measurements with ArduPlane 4.7 where this is noted. Turns are
-as short as possible, as in the paths of Dubins (1957). ArduPlane's L1 controller flies turns that differ by some tens
-of metres.
+as short as possible, as in the paths of Dubins (1957). The turns of ArduPlane's L1 controller differ from these turns
+by some tens of metres.
 """
 
 from __future__ import annotations
@@ -25,35 +25,33 @@ from sitl._kinematics import (
 )
 
 CRUISE_MS = 22.0  # AIRSPEED_CRUISE
-OVER_GROUND = (
-    1.064  # metres over the ground for each that its airspeed sensor counts, measured: the air is thin up there
-)
+OVER_GROUND = 1.064  # measured: ground speed / indicated air speed without wind, above 1 because of thin air
 CLIMB_MS = 5.0  # TECS_CLMB_MAX
-LOITER_RADIUS_M = 96.4  # clockwise, at CRUISE_MS; measured, of WP_LOITER_RAD 80, which grows in thin air
+LOITER_RADIUS_M = 96.4  # measured: at CRUISE_MS; WP_LOITER_RAD is 80 m, and the radius grows in thin air
 LOITER_RADIUS_M_PER_MS = 0.95  # measured: change of the radius per metre per second
-ROLL_S = 1.4  # measured: before it turns to a circle
-SWING_M = 120.0  # measured: how far before a place it begins to swing out for its circle
-JOIN_RAD = 1.1  # measured: how far to the left of straight ahead it leaves a place that it is to circle
-REACHED_M = 40.0  # measured: 20 to 28, and 52 before it turns round
+ROLL_S = 1.4  # measured: time before the plane turns towards a circle
+SWING_M = 120.0  # measured: distance to the centre at which the plane turns out for its circle
+JOIN_RAD = 1.1  # measured: angle to the left at which a plane inside its circle flies to the circle
+REACHED_M = 40.0  # measured: 20 to 28 m, and 52 m before a turn back
 TURN_RADIUS_M = 55.0  # measured
-WIDE_TURN_RADIUS_M, WIDE_TURN_RAD = 110.0, 1.0  # measured: small turns are flown less tightly
-RATHER_LEFT_M = 60.0  # measured: before a circle to the right it swings out to the left
-STILL_RIGHT_M = 80.0  # measured: a right turn continues unless the other way is shorter by this
-SWAY_M = 2.0  # measured: it comes to that line from outside its turn, sways over it, and turns round to where it was
-LINE_AHEAD_M = 147.0  # how far ahead, on the line between two places, it aims at to come back to it
-HEADING_RAD = math.radians(10.0)  # as near as it heads for the next place when it leaves a circle
-LOW_M = 10.0  # low enough to land from a circle of LOITER_RADIUS_M
+WIDE_TURN_RADIUS_M, WIDE_TURN_RAD = 110.0, 1.0  # measured: turns of small angles have a larger radius
+RATHER_LEFT_M = 60.0  # measured: the plane prefers a left turn before it circles to the right
+STILL_RIGHT_M = 80.0  # measured: a right turn continues unless a left turn is shorter by this
+SWAY_M = 2.0  # measured: distance by which the plane crosses the line before it follows the line
+LINE_AHEAD_M = 147.0  # distance along the line to the point at which a returning plane aims
+HEADING_RAD = math.radians(10.0)  # maximum error of the direction to the next place when the plane leaves a circle
+LOW_M = 10.0  # altitude from which the plane can land after a circle of LOITER_RADIUS_M
 
-SPOOL_UP_S = 0.7  # the take-off, measured
+SPOOL_UP_S = 0.7  # measured, as the other values of the take-off
 RUNWAY_ACCEL_MS2 = 8.0
-RUNWAY_M = CRUISE_MS**2 / (2 * RUNWAY_ACCEL_MS2)  # from standing to flying
+RUNWAY_M = CRUISE_MS**2 / (2 * RUNWAY_ACCEL_MS2)  # distance on the runway before the plane lifts off
 TAKE_OFF_CLIMB_MS, TAKE_OFF_MS = 10.0, 26.5
-LEVEL_OFF_M = 30.0  # straight on, before it turns
-LEVEL_M = 30.0  # in its mode TAKEOFF it turns once it is so high (three times TKOFF_LVL_ALT),
-AHEAD_M = 200.0  # TKOFF_DIST: to circle a place so far ahead of where it stood
+LEVEL_OFF_M = 30.0  # distance straight ahead before the first turn
+LEVEL_M = 30.0  # altitude of the first turn in mode TAKEOFF (three times TKOFF_LVL_ALT)
+AHEAD_M = 200.0  # TKOFF_DIST: distance from the start to the centre of the circle in mode TAKEOFF
 
-LANDING_MS = 17.5  # the landing, measured
-ROLL_OUT_M, PAST_M = 60.0, 9.0  # how far before its place it touches down, and behind it stands
+LANDING_MS = 17.5  # measured, as the other values of the landing
+ROLL_OUT_M, PAST_M = 60.0, 9.0  # the plane touches down before its place, and stops behind it
 ROLL_OUT_ACCEL_MS2 = LANDING_MS**2 / (2 * (ROLL_OUT_M + PAST_M))
 
 
@@ -84,10 +82,9 @@ class PlaneMotion:
     def loiter(
         self, start: MotionState, place: LocalPlace, speed_ms: float, seconds: float, after: LocalPlace | None = None
     ) -> Sequence[MotionSegment]:
-        """Circle clockwise around the place for `seconds`, counted from the turn onto the circle.
-
-        From inside, the plane crosses the circle straight. From outside, it flies towards the place and passes it on
-        its left.
+        """Circle clockwise around the place for `seconds`, counted from the turn onto the circle. A plane that is
+        inside the circle flies straight until it crosses the circle. A plane that is outside flies towards the place
+        and passes to the left of it.
         """
         path, radius_m = _PlanePath(start, speed_ms * OVER_GROUND, place.up_m, CLIMB_MS), loiter_radius_m(speed_ms)
         if math.dist(start.point[:2], place[:2]) < radius_m:
@@ -122,10 +119,10 @@ class PlaneMotion:
 
 
 def _until_heading_for(there: LocalPlace, centre: LocalPlace, here: MotionState) -> float:
-    """Return the angle in radians for which the plane continues on a circle until it flies towards a place, within
-    ArduPlane's tolerance.
+    """Return the angle in radians through which a plane on a circle must continue until it flies towards the place
+    `there`, within ArduPlane's tolerance.
 
-    Return 0 if the place is so near that the plane never flies towards it.
+    Return 0 if the place is so near the circle that the plane never flies towards it.
     """
     away_m, radius_m = math.dist(centre[:2], there[:2]), math.dist(centre[:2], here.point[:2])
     if away_m < 1.05 * radius_m:
@@ -163,9 +160,10 @@ class _PlanePath:
         self._add(CircularArc(self._end, centre, turn_rad, self.speed_ms))
 
     def fly_by(self, place: LocalPlace, reached_m: float, rather_left_m: float = 0.0) -> None:
-        """Turn towards `place` by the shorter turn, and fly straight until the distance is `reached_m`.
+        """Turn towards `place`, and fly straight until the distance to `place` is `reached_m`.
 
-        The right turn is chosen only if it is shorter by more than `rather_left_m`.
+        The plane takes the shorter path of a left turn and a right turn. It turns right only if this path is shorter by
+        more than `rather_left_m`.
         """
         here = self._end
         if math.dist(here.point[:2], place[:2]) <= max(reached_m, NEAR_M):
@@ -174,7 +172,7 @@ class _PlanePath:
         turn = _turn_towards(here, place, WIDE_TURN_RADIUS_M, rather_left_m)
         if turn is None or abs(turn.turn_rad) > WIDE_TURN_RAD:
             turn = _turn_towards(here, place, TURN_RADIUS_M, rather_left_m)
-        if turn is None:  # neither way: it is beside and too close, so first get away from it
+        if turn is None:  # the place is inside the circles of both turns, so fly straight first
             self.straight(2 * TURN_RADIUS_M)
             self.fly_by(place, reached_m, rather_left_m)
             return
@@ -195,7 +193,7 @@ class _PlanePath:
 def _lift_off(
     start: MotionState, altitude_m: float, straight_to_m: float
 ) -> tuple[Sequence[MotionSegment], _PlanePath]:
-    """Return the motion on the ground before the take-off, and a path that climbs to `altitude_m`."""
+    """Return the segments on the ground before the take-off, and a path that climbs to `altitude_m`."""
     run = StraightLine(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
     path = _PlanePath(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
     path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
@@ -226,8 +224,8 @@ def _fly_by(
 
 
 class _TurnToPlace(NamedTuple):
-    """A turn after which a place is straight ahead: its centre, its clockwise angle, and the distance that remains
-    after it.
+    """A turn after which a place is straight ahead. The fields are the centre of the turn, its clockwise angle, and the
+    distance from the end of the turn to the place.
     """
 
     centre: tuple[float, float]
@@ -236,7 +234,9 @@ class _TurnToPlace(NamedTuple):
 
 
 def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather_left_m: float) -> _TurnToPlace | None:
-    """Return the turn with the shorter path. Return None if the place is inside the circles of both turns."""
+    """Return the left or right turn, whichever gives the shorter path to the place. Return None if the place is inside
+    the circles of both turns.
+    """
     ways = []
     for side in (1, -1):  # to the right, to the left
         centre = _beside(start, side * radius_m)
@@ -247,7 +247,7 @@ def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather
         leaves = math.atan2(east, north) - side * math.acos(radius_m / away_m)
         enters = start.yaw_rad - side * math.pi / 2
         turn_rad = side * (leaves - enters) % math.tau
-        if math.tau - turn_rad < NEAR_M:  # straight ahead, but for rounding
+        if math.tau - turn_rad < NEAR_M:  # the place is straight ahead, apart from rounding errors
             turn_rad = 0.0
         ways.append(_TurnToPlace(centre, side * turn_rad, math.sqrt(away_m**2 - radius_m**2)))
     lengths_m = {way: abs(way.turn_rad) * radius_m + way.ahead_m for way in ways}
@@ -260,8 +260,8 @@ def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather
 
 
 def _back_on_line(here: LocalPlace, before: LocalPlace, place: LocalPlace) -> LocalPlace | None:
-    """Return the point to aim at on the line between two places. Return None if the plane can aim at the second place
-    itself.
+    """Return the point on the line between two places towards which the plane flies to return to the line. Return None
+    if the plane can fly directly to the second place.
     """
     north, east = place.north_m - before.north_m, place.east_m - before.east_m
     length_m = math.hypot(north, east)
@@ -279,13 +279,15 @@ def _bearing_rad(here: LocalPlace, there: LocalPlace) -> float:
 
 
 def _on_circle(place: LocalPlace, radius_m: float, bearing_rad: float) -> LocalPlace:
-    """Return the point on the circle around a place that lies in this direction from its centre."""
+    """Return the point on a circle around `place` that lies in the direction `bearing_rad` from `place`."""
     north_m, east_m = radius_m * math.cos(bearing_rad), radius_m * math.sin(bearing_rad)
     return LocalPlace(place.north_m + north_m, place.east_m + east_m, place.up_m)
 
 
 def _towards(place: LocalPlace, other: LocalPlace, length_m: float) -> LocalPlace:
-    """Return the point at this distance from `place` towards `other`, but not beyond `other`."""
+    """Return the point on the line from `place` to `other` that is `length_m` away from `place`. If `other` is nearer,
+    return `other`.
+    """
     away_m = max(math.dist(place[:2], other[:2]), NEAR_M)
     part = min(1.0, length_m / away_m)
     north_m, east_m = (a + part * (b - a) for a, b in zip(place[:2], other[:2], strict=True))

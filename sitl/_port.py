@@ -1,7 +1,8 @@
 """One TCP port of the embedded vehicle, for at most one client. It never blocks, and its memory is limited.
 
-A client that reads too slowly loses telemetry, because the vehicle does not wait for it. ArduPilot waits if the speedup
-is above 1. A second client can connect, but receives nothing until the first disconnects, as with ArduPilot.
+A client that reads too slowly loses telemetry, because the vehicle does not wait for a client. ArduPilot, in contrast,
+waits if the speedup is above 1. A second client can connect, but receives nothing until the first disconnects, as with
+ArduPilot.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class VehiclePort:
     def _accept(self, _events: int) -> None:
         try:
             self._client, _ = self._listener.accept()
-        except OSError:  # gone again already
+        except OSError:  # the client has already disconnected
             return
         self._client.setblocking(False)
         self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -66,7 +67,7 @@ class VehiclePort:
     def send(self) -> None:
         """Send the waiting messages, or discard them if the client is too slow.
 
-        Only complete batches are discarded, so the client never receives part of a message.
+        The port either sends or discards all waiting messages, so the client never receives part of a message.
         """
         if self._client is None or self.channel is None:
             return

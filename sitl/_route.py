@@ -1,6 +1,6 @@
-"""Convert a flight plan to a route with a place, an altitude and a speed for each leg, and an approach for a plane.
-
-The pilot flies this route, and track.py computes the track from the same route. The two therefore agree.
+"""Convert a flight plan to a route. A route has a place, an altitude and a speed for each leg. If a plane lands, the
+route also contains its approach. The pilot flies this route, and track.py computes the track from the same route.
+Flight and track therefore agree.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from sitl._models import MODELS
 from sitl.plan import GoTo, Land, Loiter, Plan, TakeOff
 from sitl.vehicle import VehicleType
 
-SLOWEST = 0.25  # share of the commanded speed below which a vehicle never arrives
+SLOWEST = 0.25  # a vehicle below this share of the commanded speed is too slow
 SLOWEST_CLIMB_MS = 0.25
 GRACE_S = 120.0
 
 CLIMBED = 0.95  # share of the commanded altitude that counts as reached, as in ArduPilot's tests
 NEAR_M: dict[VehicleType, float] = {"copter": 2.0, "plane": 120.0, "rover": 5.0}
-"""Distance in metres at which a place counts as reached in GUIDED mode: WPNAV_RADIUS, 1.5 times WP_LOITER_RAD, and
-about WP_RADIUS.
+"""Distance in metres at which a place counts as reached in GUIDED mode. It is WPNAV_RADIUS for a copter, 1.5 times
+WP_LOITER_RAD for a plane, and about WP_RADIUS for a rover.
 """
 NEAR_UP_M = 10.0
 
-APPROACH_SLOPE = 0.1  # of a plane: it begins to land ten times as far away as it is high
+APPROACH_SLOPE = 0.1  # altitude / distance at which a plane begins to land
 
 Kind = Literal["take_off", "go_to", "loiter", "land"]
 
@@ -37,7 +37,7 @@ class Waypoint:
     to stay.
     """
 
-    leg: str  # of the plan, in words: "leg 2 of 5 (...)"
+    leg: str  # description of the leg in the plan, such as "leg 2 of 5 (...)"
     kind: Kind
     place: LocalPlace
     speed_ms: float
@@ -70,7 +70,9 @@ def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Wa
 
 
 def limit_s(waypoints: Sequence[Waypoint], index: int) -> float:
-    """Return the time limit, in simulated seconds, for the flight from one waypoint to the next."""
+    """Return the maximum number of simulated seconds from the completion of the previous waypoint to the completion of
+    this one.
+    """
     waypoint = waypoints[index]
     start = waypoints[index - 1].place if index else LocalPlace(0.0, 0.0, 0.0)
     way_s = math.dist(start[:2], waypoint.place[:2]) / (SLOWEST * waypoint.speed_ms)
@@ -85,7 +87,9 @@ def is_near(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) ->
 
 
 def to_go_m(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
-    """Return the remaining distance over the ground to the waypoint in metres. It is negative inside the tolerance."""
+    """Return the distance over the ground in metres until the waypoint counts as reached. The result is negative if it
+    already counts as reached.
+    """
     return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
 
 

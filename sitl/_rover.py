@@ -16,7 +16,7 @@ CORNER_MS = 0.5  # it does not stop completely at a corner
 
 @dataclass(frozen=True)
 class RoverMotion:
-    """The motion of a rover: straight lines on level ground, with almost a stop at each place.
+    """The motion of a rover. It drives in straight lines on level ground, and almost stops at each place.
 
     A standing rover waits `start_s` before it moves. At corners it turns at `corner_rads` radians per second. The
     default values were measured with ArduRover 4.7 in AUTO mode, in which it smooths corners.

@@ -21,5 +21,5 @@ def text_of(path: Path, limit: int) -> str:
         return path.read_text(encoding="utf-8")
     except OSError as error:
         raise VehicleError(f"{str(path)[:MAX_SHOWN]} cannot be read: {error.strerror}") from None
-    except ValueError:  # not UTF-8, or a name with NUL in it
+    except ValueError:  # the text is not UTF-8, or the path contains NUL
         raise VehicleError(f"{str(path)[:MAX_SHOWN]!r} is not a text file") from None

@@ -1,7 +1,6 @@
-"""Write the telemetry log, which contains each received MAVLink frame after its time of arrival.
-
-The format is that of MAVProxy, Mission Planner and pymavlink (`.tlog`). The time is in microseconds since the Unix
-epoch as a big-endian u64, and its two lowest bits number the link.
+"""Write the telemetry log. For each received MAVLink frame, it contains the time of arrival and then the frame. The
+format is that of MAVProxy, Mission Planner and pymavlink (`.tlog`). The time is a big-endian u64 in microseconds since
+the Unix epoch. Its two lowest bits are replaced by the number of the link.
 """
 
 from __future__ import annotations

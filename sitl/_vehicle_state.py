@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class ReportedPosition:
-    """A reported position in degrees, with its heights in metres above sea level and above home.
-
-    The movement is in metres per second north, east and up. The heading is in degrees clockwise from north. It is None
-    if unknown.
+    """A position that a vehicle has reported, in degrees. The heights are in metres above sea level and above home. The
+    velocity is in metres per second to the north, to the east and upwards. The heading is in degrees clockwise from
+    north, or None if the vehicle does not know its heading.
     """
 
     lat_deg: float
@@ -26,7 +25,9 @@ class ReportedPosition:
 
 @dataclass(frozen=True)
 class Battery:
-    """The voltage and the remaining share (0 to 1) of a battery. A value of None is unknown."""
+    """The voltage of a battery, and the share of its charge that is left, from 0 to 1. A value is None if the vehicle
+    did not report it.
+    """
 
     voltage_v: float | None
     left: float | None
@@ -59,13 +60,13 @@ class VehicleState:
     version: FirmwareVersion | None = None
     armed: bool = False
     ready_to_arm: bool | None = None
-    position: ReportedPosition | None = None  # as it last said while its estimate was good
-    has_moved: bool = False  # it was armed and off its home
+    position: ReportedPosition | None = None  # the last one with a good estimate
+    has_moved: bool = False  # true if it was ever armed and away from its home
     battery: Battery | None = None
-    time_s: float | None = None  # simulated, since boot
-    item: int | None = None  # of the mission, where it is heading
-    reached: int | None = None  # the last item of the mission that it says it has reached
-    texts: collections.deque[str] = field(default_factory=lambda: collections.deque(maxlen=20))  # latest last
+    time_s: float | None = None  # simulated seconds since boot
+    item: int | None = None  # number of the mission item to which it flies
+    reached: int | None = None  # number of the last mission item that it reported as reached
+    texts: collections.deque[str] = field(default_factory=lambda: collections.deque(maxlen=20))  # the latest is last
     messages: int = 0
-    garbage: int = 0  # stretches of bytes that were no message
-    log_error: str | None = None  # why the telemetry log ends early, when it does
+    garbage: int = 0  # number of byte sequences that were no message
+    log_error: str | None = None  # reason if the telemetry log ended early

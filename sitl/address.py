@@ -23,7 +23,7 @@ class ListenAddress:
         host, _, port = text.rpartition(":")
         bracketed = host.startswith("[") and host.endswith("]")
         host = host[1:-1] if bracketed else host
-        odd = ":" in host and not bracketed  # whose end is the port?
+        odd = ":" in host and not bracketed  # without brackets, the beginning of the port is ambiguous
         if not host or odd or bracketed != _is_ipv6(host) or not (port.isascii() and port.isdigit()):
             raise VehicleError(f"a ground station is HOST:PORT, for example 127.0.0.1:14550, not {text!r:.80}")
         if len(host) > 253 or any(not letter.isprintable() or letter.isspace() for letter in host):

@@ -1,9 +1,9 @@
 """List ArduPilot's frames: the type of vehicle, the model name, and the default parameters of each.
 
-The table contains the frames of ArduPilot's sim_vehicle.py that ArduPilot's own simulation flies. The default
-parameters are files of ArduPilot's Tools/autotest, which are applied in order. Names must match exactly. ArduPilot's
-programs compare only the beginning of a name. They accept `hexacopter` as `hexa`, but such a vehicle never takes off
-without the parameters of a hexa.
+The table contains the frames of ArduPilot's sim_vehicle.py that ArduPilot's own simulation can fly. The default
+parameters are files of ArduPilot's Tools/autotest. The vehicle reads them in the order of the list. A user must give
+the exact name of a frame. ArduPilot's programs compare only the beginning of a name. They would accept `hexacopter` as
+`hexa`, but the vehicle would lack the parameters of a hexa, and would never take off.
 """
 
 from __future__ import annotations
@@ -147,8 +147,8 @@ _TABLE = _table()
 
 
 def stacked(vehicle_type: VehicleType) -> list[str]:
-    """Return the names of the parameter files that frames use in addition to the usual file of the vehicle type. Only
-    frames of the usual program for this type are included.
+    """Return the names of the parameter files that frames of this vehicle type use in addition to the usual file of the
+    type. Frames that need a different program than the usual one are ignored.
     """
     program, own = BINARIES[vehicle_type], DEFAULTS[vehicle_type]
     frames = (frame for frame in _TABLE.values() if frame.program == program)

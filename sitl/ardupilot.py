@@ -2,8 +2,9 @@
 
 The command line is that of ArduPilot's SITL (`arducopter --help`, developer documentation "SITL Simulator"). Each
 vehicle is instance 0 in its own network namespace, so all vehicles have the same ports. Builds with CAN need a
-multicast route in this namespace, or exit with status 1. The directory of a vehicle contains copies of its parameters,
-and `eeprom.bin` and `logs/` from ArduPilot. The run directory therefore documents the parameters of each vehicle.
+multicast route in this namespace, or exit with status 1. The directory of a vehicle contains copies of its parameter
+files. ArduPilot also writes `eeprom.bin` and `logs/` there. The run directory therefore documents the parameters of
+each vehicle.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ from sitl.vehicle import (
 )
 
 OWN_DEFAULTS = "vehicle.parm"
-ENVIRONMENT = "ARDUPILOT_SITL"  # a directory that holds binaries and, better, their default parameters
+ENVIRONMENT = "ARDUPILOT_SITL"  # a directory with binaries, and possibly their default parameters
 
-ANSWER_LIMIT_S = 5.0  # of our time
-PATIENT_S = 32_000.0  # simulated; LOG_FILE_TIMEOUT has 16 bits
+ANSWER_LIMIT_S = 5.0  # wall time
+PATIENT_S = 32_000.0  # simulated seconds; LOG_FILE_TIMEOUT has 16 bits
 
 WAY_OUT = "give the path of an ArduPilot SITL binary, or fly embedded vehicles"
 
@@ -60,8 +61,8 @@ _ELF_NAMES = {number: name for machines in _ELF_MACHINES.values() for number, na
 class ArduPilot:
     """A kind of vehicle that runs ArduPilot SITL: an executable, its files of default parameters, and its settings.
 
-    `defaults` are the parameter files next to the executable. `missing` are files that its frame needs but that are not
-    there.
+    `defaults` are the parameter files next to the executable. `missing` are the names of parameter files that the frame
+    needs but that do not exist.
     """
 
     binary: Path
@@ -125,7 +126,7 @@ class ArduPilot:
                     f"{ENVIRONMENT} is {named}, which is not a directory: set it to the directory that holds {program}"
                 )
             present = [name for name in BINARIES.values() if (directory / name).exists()]
-            if (directory / program).exists() or not present:  # a directory with nothing in it is a mistake
+            if (directory / program).exists() or not present:  # a directory without binaries is a mistake of the user
                 return cls._checked(directory / program, ENVIRONMENT, vehicle_type, setup)
         if on_path := shutil.which(program, path=environ.get("PATH", "")):
             return cls._checked(Path(on_path), "PATH", vehicle_type, setup)
@@ -182,10 +183,8 @@ class ArduPilot:
             raise NoProgramError(f"no {self.setup.debugger} is on PATH: install it, or leave out `debugger`")
 
     def _check_model(self, frame: str) -> None:
-        """Raise VehicleError if the binary does not offer the frame.
-
-        An older binary lacks some frames. It would confuse such a frame with another frame whose name has the same
-        beginning.
+        """Raise VehicleError if the binary does not offer the frame. An older binary lacks some frames. If it were
+        started with such a frame, it would simulate another frame whose name has the same beginning.
         """
         offered = models(self.binary)
         words = self.frame.lower().split("-")
@@ -196,7 +195,7 @@ class ArduPilot:
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
         """Write the parameters of the vehicle to `directory`, and return the command. Raises VehicleError."""
         check_launch(sysid, home, speedup)
-        # names, not paths: ArduPilot takes a comma in a path for the end of it
+        # names instead of paths, because a path may contain a comma, which separates the files
         files = [path.name for path in self.defaults]
         try:
             for path in self.defaults:
@@ -216,7 +215,7 @@ class ArduPilot:
                 *("-I", "0"),
                 *("--defaults", ",".join([*files, OWN_DEFAULTS])),
                 *("--speedup", f"{speedup:g}"),
-                *("--serial0", "tcp:0"),  # the default waits for a client before anything runs, the clock included
+                *("--serial0", "tcp:0"),  # by default, ArduPilot starts nothing before a client connects
                 *self.setup.arguments,
             ]
         )
@@ -235,10 +234,10 @@ class ArduPilot:
                 return {"LOG_FILE_TIMEOUT": PATIENT_S}
 
     def _bounded(self) -> list[str]:
-        """The beginning of a command line that limits the size of each file to the maximum size of the log.
-
-        ArduPilot treats the limit as a slow disk, and stops writing. It would start another log after LOG_FILE_TIMEOUT
-        seconds. `ulimit -f` counts blocks of 512 bytes (POSIX).
+        """The beginning of a command line that limits the size of each file that ArduPilot writes. The limit is the
+        maximum size of the log. When a log reaches the limit, ArduPilot behaves as if the disk were slow, and stops
+        writing. It would start another log after LOG_FILE_TIMEOUT seconds. `ulimit -f` counts blocks of 512 bytes
+        (POSIX).
         """
         if not self.setup.log_mib:
             return []
@@ -253,8 +252,8 @@ _DEBUGGERS: dict[Debugger | None, tuple[str, ...]] = {
     ),
     "valgrind": ("valgrind", "--log-file=valgrind.log", "--soname-synonyms=somalloc=nouserintercepts"),
 }
-"""Debugger -> the beginning of its command line. gdb prints the stack of each thread to the output of the vehicle if it
-crashes.
+"""Debugger -> the beginning of its command line. If the vehicle crashes, gdb prints the stack of each thread to the
+output of the vehicle.
 """
 
 
@@ -285,7 +284,7 @@ def build_of(binary: Path) -> FirmwareVersion | None:
 
 
 _BUILD = re.compile(rb"Ardu(?:Copter|Plane|Rover) V(\d[\w.-]{0,30}) \(([0-9a-f]{7,12})\)", re.ASCII)
-MAX_BINARY_BYTES = 200_000_000  # one with its debugging information has 80 MB
+MAX_BINARY_BYTES = 200_000_000  # a binary with debugging information has 80 MB
 
 
 def default_parameters(binary: Path, name: str) -> Path | None:
@@ -307,12 +306,12 @@ def _own_defaults(sysid: int) -> str:
 
 
 def _not_a_program(head: bytes) -> str | None:
-    """Return the reason why a file that begins with these bytes is not a usable binary. Return None if it may be
-    usable.
+    """Return the reason why a file is not a usable binary. The argument contains the first bytes of the file. Return
+    None if the file may be usable.
     """
     if not head:
         return "is empty"
-    if head.startswith(b"#!"):  # a wrapper of the user's own
+    if head.startswith(b"#!"):  # a script of the user that starts a binary
         return None
     if not head.startswith(b"\x7fELF") or len(head) < 20:
         return "is not a program"

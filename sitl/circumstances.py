@@ -1,9 +1,10 @@
 """Simulate faults and weather of a vehicle, by parameters of ArduPilot's simulation (SIM_...).
 
 The names of these parameters differ between versions. A fault therefore has several alternative sets of parameters. The
-alternative of the current version is first. The first alternative whose parameters all exist is used. ArduPilot does
-not answer a request for an unknown parameter, and it answers requests in order. An answer about a later alternative
-therefore shows that the earlier ones do not exist. A value counts as set when the vehicle reports it.
+alternative for the current version is first. The pilot uses the first alternative whose parameters all exist. ArduPilot
+answers requests for parameters in order, and does not answer a request for an unknown parameter. An answer about a
+later alternative therefore shows that the parameters of the earlier alternatives do not exist. A parameter counts as
+set when the vehicle reports the new value.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ if TYPE_CHECKING:  # a scenario names circumstances, and imports no MAVLink for 
     from sitl._pilot_link import PilotLink
 
 ANSWER_S = 3.0
-"""Time limit for an answer in seconds. It is divided by the speedup if the speedup is below 1. A vehicle answers within
-one main loop.
+"""Maximum number of seconds to wait for an answer. If the speedup is below 1, the limit is divided by the speedup. A
+vehicle answers within one main loop.
 """
 ASK_AGAIN_S = 0.5
 LOOK_S = 0.01
@@ -42,11 +43,11 @@ class NotSimulatedError(VehicleError):
 
 @dataclass(frozen=True)
 class SimulatedFailure:
-    """An event to simulate, such as a GPS failure. `what` completes "simulate ...". Each element of `ways` is a set of
-    parameters that causes the event.
+    """An event to simulate, such as a GPS failure. `what` names the event, and completes a sentence that begins with
+    "simulate". Each element of `ways` is a set of parameters that causes the event.
 
-    `station_is_heard` states whether the vehicle is in contact with its ground station from now on. None does not
-    change the contact.
+    If `station_is_heard` is true or false, it states whether the vehicle receives heartbeats of its ground station from
+    now on. If it is None, this does not change.
     """
 
     what: str
@@ -80,12 +81,14 @@ FENCE_LIFTED = SimulatedFailure("a flight without a fence", ({"FENCE_ENABLE": 0.
 
 
 def battery(volts: float) -> SimulatedFailure:
-    """Return the event that the battery has this voltage from now on."""
+    """Return an event: the battery has this voltage from now on."""
     return SimulatedFailure(f"a battery of {volts:g} V", ({"SIM_BATT_VOLTAGE": volts},))
 
 
 def wind(speed_ms: float, from_deg: float) -> SimulatedFailure:
-    """Return the event that wind blows at this speed from a direction, in degrees clockwise from north."""
+    """Return an event: from now on, wind blows at this speed from this direction. The direction is in degrees clockwise
+    from north.
+    """
     return SimulatedFailure(f"wind of {speed_ms:g} m/s", ({"SIM_WIND_SPD": speed_ms, "SIM_WIND_DIR": from_deg},))
 
 

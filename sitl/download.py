@@ -1,9 +1,9 @@
 """Download files over HTTP, with limits on size and silence. An interrupted download is resumed.
 
-The received part is stored in `NAME.part`. `NAME.part.json` has the total size, and the validator of the file (ETag or
-Last-Modified). The missing part is requested with Range and If-Range (RFC 9110, sections 13.1.5 and 14.2). If the
-answer does not fit, the download restarts. Proxies come from the environment (`https_proxy`, `no_proxy`:
-urllib.request.getproxies).
+The received part is stored in `NAME.part`. `NAME.part.json` has the total size of the file, and the version mark (ETag
+or Last-Modified) that the server sent. The missing part is requested with Range and If-Range (RFC 9110, sections 13.1.5
+and 14.2). If the answer does not fit, the download restarts. Proxies come from the environment (`https_proxy`,
+`no_proxy`: urllib.request.getproxies).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ STALL_S = 20.0
 CHUNK = 1 << 16  # bytes
 
 Progress = Callable[[int, int], None]
-"""A function that receives the downloaded and the total number of bytes."""
+"""A function that is called with the number of bytes that were downloaded so far and the total number of bytes."""
 
 
 class DownloadError(VehicleError):
@@ -163,14 +163,16 @@ def _broken_off(url: str) -> DownloadError:
 
 
 def _endless(url: str) -> DownloadError:
-    """Return the error for an answer without a size. Without a size, the harness cannot check that the downloaded file
-    is complete.
+    """Return the error for an answer that does not state the size of the file. The harness needs the size to check that
+    the downloaded file is complete.
     """
     return DownloadError(f"{urlsplit(url).netloc} does not say how large {url} is: use another --url")
 
 
 def _kept(part: Path, noted: Path) -> tuple[int, _PartialDownload] | None:
-    """Return the size and origin of an earlier partial download. Return None if no earlier part exists."""
+    """Return the number of bytes of an earlier partial download, and the size and version mark of the complete file.
+    Return None if no earlier part exists.
+    """
     try:
         have, origin = part.stat().st_size, _PartialDownload(**json.loads(noted.read_text()))
         return (have, origin) if have else None

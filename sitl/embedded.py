@@ -2,10 +2,10 @@
 
     python -m sitl.embedded --type plane --sysid 3 --home -35.363262,149.165237,584,270 --speedup 20
 
-A small process with one thread, which needs only the standard library and a MAVLink dialect. It listens on 127.0.0.1 on
-the three ports of ArduPilot SITL and answers like ArduPilot, so the same pilot flies both. Its clock runs `speedup`
-times as fast as wall time, but the amount of data that it sends per second of wall time is limited. SIGTERM ends it
-with exit status 0.
+The vehicle is a small process with one thread. It needs only the standard library and a MAVLink dialect. It listens on
+127.0.0.1 on the three ports of ArduPilot SITL and answers like ArduPilot. The pilot therefore does not distinguish
+between the embedded vehicle and ArduPilot. Its clock runs `speedup` times as fast as wall time, but the amount of data
+that it sends per second of wall time is limited. SIGTERM ends it with exit status 0.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from sitl.vehicle import (
     check_launch,
 )
 
-MIN_BATCH_INTERVAL_S = 0.05  # of our time: however fast simulated time runs, telemetry is sent 20 times a second
-MAX_SLEEP_S = 1.0  # a client may have turned off everything; landing and status texts still happen on time
-MAX_DELAY_S = 0.25  # a sleep that takes longer than it should by more was no sleep: the process was stopped
+MIN_BATCH_INTERVAL_S = 0.05  # wall time: telemetry is sent at most 20 times per second at any speedup
+MAX_SLEEP_S = 1.0  # limits the delay of landings and texts if a client has switched off all messages
+MAX_DELAY_S = 0.25  # a sleep that is late by more than this means that the process was suspended
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Embedded:
                 *(sys.executable, "-P", "-m", "sitl.embedded"),
                 *("--type", self.vehicle_type),
                 *("--sysid", str(sysid)),
-                f"--home={home}",  # one word: a southern latitude begins with a minus sign
+                f"--home={home}",  # one argument, because a southern latitude begins with a minus sign
                 *("--speedup", f"{speedup:g}"),
             ]
         )
@@ -152,7 +152,8 @@ class _BootClock:
     def read(self, slept_s: float) -> float:
         """Return the time on the clock after the process slept for `slept_s` seconds.
 
-        A much longer sleep means that the process was stopped, and is not counted.
+        If the time that has really passed is much longer, the process was suspended. The clock does not count the
+        additional time.
         """
         at = time.monotonic()
         self.now_s += min(at - self._read_at, slept_s + MAX_DELAY_S) * self._speedup

@@ -8,9 +8,10 @@ source tree at the same commit. A tag is not sufficient: `latest` has none, and 
 commit before its tag. A mirror (`base`) replaces both hosts, with the same paths.
 
 This module was written without access to the server, from ArduPilot's build scripts and from published listings. It
-therefore does not rely on the following properties. The server may send no validators, and then a download is not
-resumed. It may not support ranges, and then a download restarts. The form of its listings may differ, and then an error
-message does not list the versions. The server publishes no checksums.
+therefore works without the following properties of the server. If the server sends no version mark of a file (ETag or
+Last-Modified), an interrupted download is not resumed. If it does not support ranges, the download restarts. If its
+listings have an unexpected form, an error message does not list the available versions. The server publishes no
+checksums.
 """
 
 from __future__ import annotations
@@ -67,7 +68,9 @@ class _ProcessorKind:
 _X86_64 = _ProcessorKind("SITL_x86_64_linux_gnu", "x86_64", re.compile(rb"\x7fELF\x02\x01.{12}\x3e\x00", re.DOTALL))
 _ARM = _ProcessorKind("SITL_arm_linux_gnueabihf", "32-bit ARM", re.compile(rb"\x7fELF\x01\x01.{12}\x28\x00", re.DOTALL))
 _BOARDS = {"x86_64": _X86_64, "aarch64": _ARM, "armv7l": _ARM}
-"""Boards by platform.machine(). Both are little endian, with 64 and 32 bits and e_machine 62 and 40."""
+"""Value of platform.machine() -> board. Binaries for both boards are little endian. The first has 64 bits and e_machine
+62. The second has 32 bits and e_machine 40.
+"""
 _FROM_SOURCE = "build ArduPilot SITL from source and set ARDUPILOT_SITL to its directory"
 
 
@@ -83,7 +86,7 @@ class InstallWatcher(Protocol):
     """An object that is informed about the progress of an installation."""
 
     def waits(self) -> None:
-        """Report that another installation of this vehicle must finish first."""
+        """Report that the installation waits, because another process is installing a binary for this vehicle."""
 
     def downloads(self, done: int, total: int) -> None:
         """Report the number of bytes of the binary that were downloaded, and its size."""
@@ -237,7 +240,9 @@ class _ReleaseServer:
         return None
 
     def _no_such_version(self) -> RequestError:
-        """Return the error for a release that does not exist, with the existing releases if the server lists them."""
+        """Return the error for a release that does not exist. The error lists the existing releases if the server lists
+        them.
+        """
         try:
             listing = fetch_text(self._releases, TEXT_LIMIT, self._stall_s)
         except DownloadError:
@@ -312,7 +317,9 @@ def _locked(home: Path, watcher: InstallWatcher) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _ways_out(home: Path) -> Iterator[None]:
-    """Add a solution to the message of network errors, and convert disk errors to CacheError."""
+    """Return a context manager. It adds a solution to the message of a network error, and converts a disk error to
+    CacheError.
+    """
     try:
         yield
     except UnreachableError as error:

@@ -40,7 +40,8 @@ class GroundStation(asyncio.DatagramProtocol):
     ) -> None:
         """Create the object. Callers use `open` instead. `now` returns the mission second, for the log of commands.
 
-        `taken_over` is called with the vehicles that the operator flies from now on.
+        `taken_over` is called when an operator takes over vehicles from the pilot. Its argument contains these
+        vehicles.
         """
         self._address = address
         self._now = now
@@ -80,8 +81,8 @@ class GroundStation(asyncio.DatagramProtocol):
         self._vehicles[sysid] = vehicle
 
     def reach(self, sysid: int, *, reachable: bool) -> None:
-        """Start or stop forwarding between a vehicle and the ground station. While forwarding is stopped, messages are
-        lost.
+        """Start or stop forwarding between a vehicle and the ground station. Messages that arrive while forwarding is
+        stopped are lost.
         """
         if reachable:
             self._out_of_reach.discard(sysid)
@@ -161,7 +162,7 @@ class GroundStation(asyncio.DatagramProtocol):
         self._full = False
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore this error. It only means that no program listens at the address now."""
+        """Ignore the error. It means that no program listens at the address of the ground station at the moment."""
 
 
 class _VehicleConnection(asyncio.Protocol):

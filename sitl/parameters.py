@@ -18,7 +18,7 @@ from sitl.vehicle import VehicleError
 MAX_BYTES = 1_000_000  # all parameters of an ArduCopter 4.7 have 35 kB
 MAX_PARAMETERS = 5_000
 MAX_LINE_SHOWN = 60
-LARGEST = 3.4028235e38  # of 32 bits
+LARGEST = 3.4028235e38  # largest float of 32 bits
 
 OURS = frozenset({"SYSID_THISMAV", "MAV_SYSID"})
 """Parameters that only the harness may set. A user must not set them."""

@@ -30,8 +30,8 @@ from sitl.plan import By, Plan
 from sitl.procedure import ArmingPreparation, HopelessError, PilotProcedure, ProcedureStep
 from sitl.vehicle import FlightError, Home, VehicleType
 
-SILENCE_S = 10.0  # of our time; a vehicle says something every simulated second
-LEAST_WAIT_S = 3.0  # of our time: however fast simulated time runs, a busy machine is given this long for a step
+SILENCE_S = 10.0  # wall time; a vehicle sends messages every simulated second
+LEAST_WAIT_S = 3.0  # wall time: minimum time for each step at any speedup, because the machine may be busy
 ASK_AGAIN_S = 2.0  # wall time without a position after which telemetry is requested again
 
 
@@ -67,7 +67,9 @@ class Pilot:
 
     @property
     def real_time_factor(self) -> float | None:
-        """The simulated seconds per second, divided by the speedup. With the value 1.0, the machine is fast enough."""
+        """The number of simulated seconds per second of wall time, divided by the speedup. The value is 1.0 if the
+        machine is fast enough, and less if it is too slow.
+        """
         return self.link.real_time_factor
 
     async def start(self) -> None:
@@ -100,8 +102,8 @@ class Pilot:
     async def get_ready(self, flight: PilotProcedure) -> None:
         """Execute the steps before arming. Return when all steps have stayed complete for READY_FOR_S seconds.
 
-        ArduPilot repeats its checks, and has further checks in other modes. It may therefore report first that it is
-        ready, and then that it is not. Raises FlightError.
+        One report that the vehicle is ready is not enough. ArduPilot repeats its checks, and has further checks in
+        other modes, so it may later report that it is not ready. Raises FlightError.
         """
         await self._pursue(ArmingPreparation(flight, self.state))
 
@@ -134,7 +136,9 @@ class Pilot:
         return values
 
     def shortfall(self, flight: PilotProcedure) -> str | None:
-        """Return a sentence if the vehicle should have left its home position but has not. Otherwise return None."""
+        """Return an error sentence if the vehicle should have left its home position but is still there. Otherwise
+        return None.
+        """
         if self.state.has_moved or self._terminated or self._handed_over or self._befallen:
             return None
         awaited = self._awaited.name if self._awaited else "its end"
@@ -195,7 +199,7 @@ class Pilot:
     def _telemetry_is_missing(self) -> bool:
         link = self.link
         stale = link.position_at is None or time.monotonic() - link.position_at > ASK_AGAIN_S
-        boots = not link.state.ready_to_arm and not link.has_armed  # it may acknowledge and forget
+        boots = not link.state.ready_to_arm and not link.has_armed  # it may acknowledge a request and then forget it
         return stale or boots
 
     def _failed(self, procedure: PilotProcedure, awaited: str, reason: str) -> FlightError:
@@ -228,13 +232,13 @@ class _StepWaitingTimes:
         self._link = link
         self._flown_s: defaultdict[ProcedureStep, float] = defaultdict(float)
         self._waited_s: defaultdict[ProcedureStep, float] = defaultdict(float)
-        self._step: ProcedureStep | None = None  # that was waited for until now
+        self._step: ProcedureStep | None = None  # the step for which the pilot waited until now
         self._time_s = link.state.time_s
         self._at = time.monotonic()
-        self.patience_s = 0.0  # of our time: then it is worth looking again, even if nothing is heard
+        self.patience_s = 0.0  # wall time until the next time limit may pass
 
     def lost(self) -> str | None:
-        """Return the reason if the connection to the vehicle is lost. Otherwise return None."""
+        """Return the reason why the vehicle counts as lost. Return None if it does not count as lost."""
         now = time.monotonic()
         if self._link.closed.is_set():
             return "it ended the connection"
@@ -246,14 +250,16 @@ class _StepWaitingTimes:
         return None
 
     def overdue(self, step: ProcedureStep) -> str | None:
-        """Return the reason if a time limit of the step has passed. Otherwise return None."""
+        """Return a text about the time limit that the step has exceeded. Return None if the step has exceeded no time
+        limit.
+        """
         link, now = self._link, time.monotonic()
         if self._step is not None:
             if self._time_s is not None and link.state.time_s is not None:
                 self._flown_s[self._step] += max(0.0, link.state.time_s - self._time_s)
             self._waited_s[self._step] += now - self._at
         self._step, self._time_s, self._at = step, link.state.time_s, now
-        # a vehicle that crawls must end, too: no step takes longer than in real time
+        # a very slow simulation must fail, too: a step may not take longer than in real time
         wall_limit_s = max(step.limit_s, step.limit_s / link.speedup)
         silent_s = now - min(self._streams().values())
         self.patience_s = min(wall_limit_s - self._waited_s[step], self._silence_limit_s - silent_s)
@@ -268,8 +274,9 @@ class _StepWaitingTimes:
         return SILENCE_S / min(1.0, self._link.speedup)
 
     def _streams(self) -> dict[str, float]:
-        """Return text about a silent stream -> time of its last message. Heartbeats and positions are included only if
-        the vehicle has sent any.
+        """Return the time of the last message in each stream: of all messages, of heartbeats, and of positions.
+        Heartbeats and positions are included only if the vehicle has sent any. Each key is the text to report if the
+        stream is silent.
         """
         times = {"it has sent no heartbeat": self._link.heartbeat_at, "it has sent no position": self._link.position_at}
         return {"it has been silent": self._link.heard_at, **{what: at for what, at in times.items() if at is not None}}

@@ -17,9 +17,9 @@ By = Literal["mission", "guided"]
 """`mission`: the vehicle flies the uploaded plan in AUTO mode. `guided`: the pilot commands each leg in GUIDED mode."""
 
 MAX_LEGS = 100
-MAX_DISTANCE_M = 100_000.0  # the earth is flat up to here, near enough
+MAX_DISTANCE_M = 100_000.0  # up to this distance, a flat earth is accurate enough
 MAX_ALTITUDE_M = 5_000.0
-MAX_LOITER_S = 65_535.0  # ArduPilot keeps the seconds of a NAV_LOITER_TIME in 16 bits
+MAX_LOITER_S = 65_535.0  # ArduPilot stores the seconds of a NAV_LOITER_TIME in 16 bits
 
 SPEED_LIMITS_MS: dict[VehicleType, tuple[float, float]] = {
     "copter": (0.5, 20.0),  # WPNAV_SPEED goes to 2000 cm/s

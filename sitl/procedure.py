@@ -42,7 +42,9 @@ class HopelessError(Exception):
 
 
 class PilotProcedure(Protocol):
-    """A procedure that a pilot executes. `purpose` completes an error message that begins with "did not"."""
+    """A procedure that a pilot executes. `purpose` is its purpose as a verb phrase. Error messages contain it after
+    "did not".
+    """
 
     purpose: str
 

@@ -1,4 +1,5 @@
-"""Connect one client to the embedded vehicle, as over one serial port of ArduPilot: MAVLink without a socket.
+"""Connect one client to the embedded vehicle. The connection transports MAVLink without a socket, and corresponds to
+one serial port of ArduPilot.
 
 Each `ClientChannel` has its own parser, sequence numbers, message intervals and incomplete mission.
 """
@@ -27,7 +28,7 @@ NO_POSITION = (
     | mavlink.POSITION_TARGET_TYPEMASK_Y_IGNORE
     | mavlink.POSITION_TARGET_TYPEMASK_Z_IGNORE
 )
-TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # of a plane; what else can be set is in _failsafes.py
+TAKE_OFF_ALTITUDE = "TKOFF_ALT"  # only for a plane; _failsafes.py has the other parameters
 SYSTEM_ID = "SYSID_THISMAV"
 
 
@@ -48,7 +49,7 @@ class ClientChannel:
         self._autopilot.listeners.remove(self)
 
     def receive(self, data: bytes) -> None:
-        """Process bytes from the client. They may have any content and arrive in any pieces."""
+        """Process bytes from the client. The bytes may be invalid, and may begin or end inside a message."""
         for message in self._mav.parse_buffer(data) or ():
             kind = message.get_type()
             if kind == "HEARTBEAT":
@@ -85,8 +86,8 @@ class ClientChannel:
         self._mav.seq = (self._mav.seq + 1) % 256
 
     def send_due(self) -> None:
-        """Send each message that is due, once. A slow client receives the latest state, and not every message that it
-        missed.
+        """Send each message whose time has come. If a message is due several times because the last call was long ago,
+        send it only once, with the current state.
         """
         now_s = self._autopilot.now_s
         for message_id, due_s in self._due_s.items():
@@ -167,8 +168,8 @@ class ClientChannel:
         return vehicle.go_to(vehicle.place(message.frame, message.x, message.y, message.z))
 
     def _position_target(self, message: Any) -> None:
-        """Process a message with a complete target position, to which the vehicle sends no answer. A plane ignores the
-        message, as ArduPlane does.
+        """Process a message that contains a complete target position. The vehicle sends no answer to this message. A
+        plane ignores the message, as ArduPlane does.
         """
         vehicle = self._autopilot
         whole = not message.type_mask & NO_POSITION and message.coordinate_frame in FRAMES
@@ -222,7 +223,7 @@ class ClientChannel:
     def _set_interval(self, message_id: float, interval_us: float) -> int:
         """Execute MAV_CMD_SET_MESSAGE_INTERVAL, and return its result code. The interval is in microseconds.
 
-        An interval of 0 stands for the default, and -1 switches the message off.
+        An interval of 0 stands for the default interval. A negative interval stops the message.
         """
         if message_id not in STREAMS or not math.isfinite(interval_us):
             return int(mavlink.MAV_RESULT_FAILED)

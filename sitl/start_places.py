@@ -1,4 +1,5 @@
-"""Read start positions from files in ArduPilot's formats: named locations, and the offsets of a swarm.
+"""Read start positions from files in ArduPilot's formats: a file of named locations, and a file with the offset of each
+vehicle in a swarm.
 
     locations.txt      CMAC=-35.363261,149.165230,584,353     latitude, longitude, metres above sea level, heading
     swarminit.txt      1=20,-20,0,90                          instance; metres east, north and up, optional heading
@@ -20,7 +21,7 @@ from sitl.vehicle import Home, VehicleError
 LOCATIONS = "locations.txt"
 MAX_BYTES = 1_000_000
 MAX_INSTANCE = 10_000
-MAX_OFFSET_M = 100_000.0  # the earth is flat up to here, near enough
+MAX_OFFSET_M = 100_000.0  # up to this distance, a flat earth is accurate enough
 MAX_SHOWN = 60
 
 
@@ -29,8 +30,8 @@ class PlaceError(VehicleError):
 
 
 class HomeOffset(NamedTuple):
-    """An offset in metres from the first home position. If the heading is None, it is that of the first home
-    position.
+    """An offset in metres from the first home position. If `heading_deg` is None, the vehicle has the heading of the
+    first home position.
     """
 
     east_m: float

@@ -31,8 +31,8 @@ SENSORS = (
     | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
 FENCE = mavlink.MAV_SYS_STATUS_GEOFENCE
-"""The fence sensor, which is reported as healthy even without a fence, as ArduPilot does. Otherwise MAVProxy would
-report a breach of the fence.
+"""The fence sensor. The vehicle reports it as healthy even if no fence is set, as ArduPilot does. Otherwise MAVProxy
+would report a breach of the fence.
 """
 NOT_YET = mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_AHRS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
@@ -47,7 +47,7 @@ def heartbeat(vehicle: Autopilot) -> Any:
         base_mode,
         MODES[vehicle.vehicle_type][vehicle.mode],
         _state(vehicle),
-        3,  # MAVLink 2 still says 3 here
+        3,  # MAVLink 2 has the value 3 here, too
     )
 
 
@@ -59,7 +59,7 @@ def _state(vehicle: Autopilot) -> int:
 
 
 def _health(vehicle: Autopilot) -> int:
-    """Return the flags of the healthy sensors, and of functions that depend on them."""
+    """Return the MAVLink flags of all healthy sensors and healthy functions."""
     acting = vehicle.failsafes.acting
     low = any(failsafe.startswith("battery") for failsafe in acting)
     unwell = mavlink.MAV_SYS_STATUS_SENSOR_BATTERY if low else 0
@@ -67,7 +67,7 @@ def _health(vehicle: Autopilot) -> int:
     unwell |= FENCE if "fence" in acting else 0
     if not vehicle.ready:
         unwell |= NOT_YET
-    if vehicle.has_booted and vehicle.vehicle_type != "rover":  # without GPS they reckon on
+    if vehicle.has_booted and vehicle.vehicle_type != "rover":  # without GPS they estimate their position
         unwell &= ~mavlink.MAV_SYS_STATUS_AHRS
     return int((SENSORS | FENCE) & ~unwell)
 
@@ -105,7 +105,7 @@ def attitude(vehicle: Autopilot) -> Any:
 
 def global_position_int(vehicle: Autopilot) -> Any:
     motion = vehicle.motion
-    # as ArduPilot before its first fix: nowhere
+    # 0 N, 0 E, as ArduPilot reports before its first GPS fix
     place = vehicle.home.offset(motion.north_m, motion.east_m) if vehicle.has_booted else Home(0.0, 0.0)
     return mavlink.MAVLink_global_position_int_message(
         _boot_ms(vehicle),
@@ -132,7 +132,9 @@ def home_position(vehicle: Autopilot) -> Any:
 
 
 def autopilot_version(vehicle: Autopilot) -> Any:
-    """Return the message with the version of this package, without a commit. It is sent only on request."""
+    """Return the message with the version of this package. The message contains no commit. The vehicle sends it only on
+    request.
+    """
     parts = [min(part, 255) for part in release(_installed())]
     number = int.from_bytes([*parts, mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL], "big")
     capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT

@@ -47,10 +47,11 @@ def track(
 ) -> VehicleTrack:
     """Return the path of a vehicle that begins to fly `plan` at mission second `begin_s`.
 
-    Before that, the vehicle stands at home. After the plan it stays, or circles if it is a plane, unless it has landed.
-    `home_offset` is the position of home in metres north, east and up from the centre of the field. `heading_deg` is
-    the heading of home. Without a plan, a copter takes off to `takeoff_altitude_m` and stays, a plane circles, and a
-    rover stands. Raises PlanError if the type cannot fly the plan.
+    Before `begin_s`, the vehicle stands at home. After a plan without a landing, a copter or rover stays at the last
+    place, and a plane circles around it. `home_offset` is the position of home in metres north, east and up from the
+    centre of the field. `heading_deg` is the heading of home. Without a plan, a copter takes off to
+    `takeoff_altitude_m` and stays, a plane circles, and a rover stands. Raises PlanError if the type cannot fly the
+    plan.
     """
     start = MotionState(yaw_rad=math.radians(heading_deg))
     segments: Sequence[MotionSegment]
@@ -63,7 +64,9 @@ def track(
 
 
 def _mission(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState) -> Sequence[MotionSegment]:
-    """Return the segments for the waypoints in AUTO mode, and for staying after the last one without end."""
+    """Return the segments of a flight in AUTO mode. The last segment is infinite: the vehicle stays at the last
+    waypoint.
+    """
     model, last = MODELS[vehicle_type], waypoints[-1]
     segments: list[MotionSegment] = [RestSegment(start, 0.0)]
     for before, waypoint, after in zip((None, *waypoints), waypoints, (*waypoints[1:], None), strict=False):
@@ -85,8 +88,8 @@ def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mot
 def _manoeuvre(
     model: MotionModel, waypoint: Waypoint, start: MotionState, before: Waypoint | None, after: Waypoint | None
 ) -> Sequence[MotionSegment]:
-    """Return the segments for one waypoint, beginning at the current motion. They depend on the waypoints `before` and
-    `after` it.
+    """Return the segments for one waypoint. They begin with the motion `start`. `before` and `after` are the previous
+    and the next waypoint.
     """
     led = before.place if before is not None and before.kind in ("go_to", "loiter") else None
     match waypoint.kind:

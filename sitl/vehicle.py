@@ -24,9 +24,9 @@ STATION_PORT = 5763  # ArduPilot SITL: serial2
 METRES_PER_DEGREE = 111_319.5  # of latitude; ArduPilot's own scale (WGS 84 equatorial radius)
 SPACING_M = 5.0
 
-READY_S = 10.0  # simulated seconds from the boot of an embedded vehicle until it knows where it is and can be armed
+READY_S = 10.0  # simulated seconds after which a booted embedded vehicle knows its position and can be armed
 
-MAX_SYSID = 255  # MAVLink: u8 system ID, 0 is a broadcast
+MAX_SYSID = 255  # a MAVLink system ID is a u8, and 0 means all systems
 
 
 class VehicleError(Exception):
@@ -112,7 +112,7 @@ class Launch:
     pilot_port: int = PILOT_PORT
     agent_port: int = AGENT_PORT
     station_port: int = STATION_PORT
-    env: Mapping[str, str] = field(default_factory=dict)  # to be set on top of the orchestrator's own
+    env: Mapping[str, str] = field(default_factory=dict)  # variables to add to the orchestrator's environment
 
 
 class VehicleKind(Protocol):
@@ -126,7 +126,7 @@ class VehicleKind(Protocol):
 
     @property
     def frame(self) -> str | None:
-        """The name of the frame in the program. None if the program has only one frame."""
+        """The name by which the program knows the frame. None if the program has only one frame."""
 
     @property
     def sha256(self) -> str | None:
@@ -138,7 +138,7 @@ class VehicleKind(Protocol):
 
     @property
     def lack(self) -> str | None:
-        """A sentence with a solution about a missing requirement for flight. None if nothing is missing."""
+        """A sentence about a missing requirement for a flight, and what the user can do. None if nothing is missing."""
 
     @property
     def uses_udp(self) -> bool:
@@ -166,10 +166,11 @@ def check_launch(sysid: int, home: Home, speedup: float) -> None:
 
 
 def place_in_field(index: int, spacing_m: float = SPACING_M) -> tuple[float, float]:
-    """Return the home of the vehicle with this index (from 0) in metres north and east of the centre of the field.
+    """Return the home position of the vehicle with this index, in metres north and east of the centre of the field.
+    Indexes begin at 0.
 
     The places have the pattern of sunflower seeds. Two places are at least about `spacing_m` apart. The pattern allows
-    any number of vehicles, and an additional vehicle does not move the others.
+    any number of vehicles. The home of a vehicle does not depend on the number of vehicles.
     """
     radius = spacing_m * math.sqrt(index)
     bearing = index * math.pi * (3 - math.sqrt(5))  # the golden angle

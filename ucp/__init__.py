@@ -1,8 +1,8 @@
 """An implementation of the Uniform Chain Protocol: blocks, chain, messages, and the 20 event handlers of Algorithms
 1-20.
 
-`__all__` lists the public names. A name is imported at its first use, because every agent process imports this package.
-A lazy import keeps its start fast.
+`__all__` lists the public names. Python imports a public name only when a program first uses it. Every agent process
+imports this package, and it therefore starts faster.
 """
 
 from typing import TYPE_CHECKING
@@ -105,7 +105,7 @@ _NAMES_OF = {
         "Trigger",
     ),
 }
-"""Module -> its public names, to import at their first use."""
+"""Module -> its public names. Python imports the module when a program first uses one of these names."""
 _MODULE_OF = {name: module for module, names in _NAMES_OF.items() for name in names}
 
 if not TYPE_CHECKING:  # a type checker would accept any name

@@ -1,11 +1,11 @@
 """Delay the answers of an agent by a random time, if the setting `answer_spread_s` is above 0.
 
-One agent asks, and all others answer at the same moment. On a radio channel that they share, many of these answers
-collide. With `answer_spread_s`, each agent delays its answer by a different part of this time.
+When one agent sends a query, all other agents answer at the same moment. On a shared radio channel, many of these
+answers collide. With `answer_spread_s`, each agent delays its answer by a different part of this time.
 
-The delay is computed from the datagram. An agent therefore draws no random number, a repeated run sends at the same
-times, and a checker can compute the delay. A hash of the datagram is as good as a random number here: no two datagrams
-are equal, because each contains its sender and its sequence number.
+The delay is computed from a hash of the datagram. An agent therefore draws no random number, a repeated run sends at
+the same times, and a checker can compute the delay. A hash is as good as a random number here, because no two datagrams
+are equal. Each datagram contains its sender and its sequence number.
 """
 
 from heapq import heappop, heappush
@@ -25,8 +25,8 @@ ANSWERS = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceRespo
 """Messages that the agent delays. Algorithms 3, 9, 13 and 17 send them."""
 
 Outgoing = tuple[int, Message, RecordedBytes | None]
-"""An outgoing message: its sequence number, the message, and the datagram for the trace. The datagram is None without a
-trace.
+"""An outgoing message: its sequence number, the message, and the datagram for the trace. The datagram is None if the
+agent writes no trace.
 """
 
 
@@ -54,7 +54,7 @@ class WaitingAnswers:
     def exchange(self, outbox: list[Outgoing], now: float) -> list[Outgoing]:
         """Add the answers in `outbox` to the waiting answers. Return all messages to send now, in order.
 
-        An answer that has waited comes before the messages of the current input.
+        Answers whose waiting time is over come before the other messages in `outbox`.
         """
         others = []
         for outgoing in outbox:

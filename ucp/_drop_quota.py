@@ -1,8 +1,8 @@
-"""A limit for the size of dropped datagrams in the trace, because any sender can send such datagrams.
+"""Limit how many bytes the dropped datagrams take in the trace, because any sender can send such datagrams.
 
 A flood of datagrams that are dropped would fill the disk of a vehicle. The agent therefore writes complete datagrams
-only within a quota. It counts the other datagrams and writes their number. The trace thus contains or counts each
-datagram, and its size does not depend on the flood.
+only within a quota. It counts the other datagrams and writes their number. The trace therefore contains or counts each
+datagram, and a flood does not make the trace much larger.
 """
 
 from collections import Counter
@@ -30,8 +30,8 @@ class DropQuota:
         self._counts: Counter[str] = Counter()
 
     def lines(self, entry: DroppedDatagram) -> Iterator[DroppedDatagram]:
-        """Yield the trace entries to write now: this dropped datagram if it is within the quota, and the counts that
-        are due.
+        """Yield the trace entries to write now, after a datagram was dropped. `entry` is the entry of this datagram. It
+        is among the result if it is within the quota. Otherwise it is counted. The counts follow if they are due.
         """
         self._left_bytes = min(QUOTA_BYTES, self._left_bytes + (entry.t - self._at_s) * BYTES_PER_S)
         self._at_s = entry.t
@@ -45,8 +45,8 @@ class DropQuota:
             yield from self.counts(entry.t)
 
     def counts(self, t: float) -> Iterator[DroppedDatagram]:
-        """Yield one entry per reason with the number of datagrams that were dropped and not written since the last
-        count.
+        """Yield one entry per reason for a drop. The entry contains the number of datagrams that were dropped for this
+        reason since the previous count, and that the trace does not contain.
         """
         self._counted_at_s = t
         for reason, count in self._counts.items():

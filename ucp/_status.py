@@ -4,7 +4,7 @@ from ucp.agent import Agent
 
 
 def status_of(agent: Agent) -> dict[str, object]:
-    """Return the values of the status that the agent core knows. The caller adds all other values."""
+    """Return the part of the status that follows from the state of the agent. The caller adds all other values."""
     state = agent.state
     return {
         "agent_id": agent.agent_id,

@@ -4,10 +4,10 @@ Theory of operation
 -------------------
 
 An agent collects loggable events in blocks, and holds a chain of its own and other agents' blocks. It keeps this chain
-equal to those of its neighbours. It is a set of 20 event handlers (Algorithms 1-20). Each has one of three triggers: a
-message arrives, a timer expires, or a local event happens, which the vehicle or another handler triggers. The tables
-`ON_MESSAGE`, `ON_TIMER` and `ON_LOCAL_EVENT` below map triggers to handlers. `ucp.commit` and `ucp.reconcile` contain
-the handlers, and contract/HANDLERS.md draws which handler triggers which.
+equal to the chains of its neighbours. The agent consists of 20 event handlers (Algorithms 1-20). Each handler has one
+of three kinds of triggers: a message arrives, a timer expires, or a local event happens. The vehicle or another handler
+triggers a local event. The tables `ON_MESSAGE`, `ON_TIMER` and `ON_LOCAL_EVENT` below map triggers to handlers.
+`ucp.commit` and `ucp.reconcile` contain the handlers, and contract/HANDLERS.md draws which handler triggers which.
 
 Commit: a full block joins the deque. The agent proposes the front of the deque, with the top chain hash of its chain.
 For 10 seconds all other agents vote: an agent approves if its own chain has the same top chain hash. With a majority of
@@ -32,8 +32,8 @@ passes input and time, and the agent returns datagrams and the time of its next 
 `now` is mission time in seconds and never goes back. Equal inputs give equal outputs.
 
 A handler runs to its end. Then the local events that it triggered run in order, and only then the next input. The
-thesis has re-entrant locks, which guard the state between threads. An agent has one thread and needs none. For the same
-reason, the thesis's test of a flag before it takes the lock cannot race.
+thesis has re-entrant locks, which guard the state between threads. An agent has one thread and needs none. In the
+thesis, a handler tests a flag before it takes the lock. In this agent no other handler can change the flag in between.
 
 A datagram that is not a well-formed message from another agent on the roster has no effect. `dropped` counts it.
 """
@@ -114,9 +114,10 @@ HANDLERS: dict[str, EventHandler[Any]] = {
 class Agent:
     """A UCP agent without I/O: the caller passes inputs and the time, and sends the messages that the agent returns.
 
-    `agent_id` is 1 to 65535. `roster` holds the IDs of all agents. `initial_data` is the data of the inception block,
-    the same for all agents of a mission. `handlers` replace handlers by wrong ones (see `ucp.quirks`). `seal` encrypts
-    event data. With `tracing`, `trace` returns each handler run. All times are mission seconds; `state` is read-only.
+    `agent_id` is 1 to 65535. `roster` holds the IDs of all agents. `initial_data` is the data of the inception block.
+    It is the same for all agents of a mission. `handlers` are wrong handlers that replace the correct handlers of the
+    same names (see `ucp.quirks`). `seal` is a function that encrypts event data. If `tracing` is true, the method
+    `trace` returns each handler run. All times are mission seconds. The caller may read `state` but must not change it.
 
     Call `receive_datagram(data, now)` and `add_event(event, now)` for input, and `handle_timer(now)` when
     `next_timer()` is due. After each call, broadcast what `datagrams_to_send()` returns. Raises ValueError for an
@@ -155,7 +156,9 @@ class Agent:
             self.replace_handlers(handlers)
 
     def replace_handlers(self, wrong: Iterable[EventHandler[Any]]) -> None:
-        """Replace the handlers of these names by wrong handlers. All other handlers become correct again."""
+        """Use these handlers in place of the correct handlers of the same names. All other handlers become correct
+        again.
+        """
         handlers = HANDLERS | {handler.name: handler for handler in wrong}
         self._on_message = {message: handlers[handler.name] for message, handler in ON_MESSAGE.items()}
         self._on_timer = {timer: handlers[handler.name] for timer, handler in ON_TIMER.items()}
@@ -164,8 +167,8 @@ class Agent:
     # Inputs
 
     def receive_datagram(self, data: bytes, now: float) -> None:
-        """Handle a datagram from the broadcast port. It never raises an exception; `dropped` counts invalid
-        datagrams.
+        """Handle a datagram from the broadcast port. The method never raises an exception for an invalid datagram. It
+        drops the datagram and counts it in `dropped`.
         """
         try:
             sender, sequence, message = decode(data)
@@ -194,7 +197,7 @@ class Agent:
             self._run_triggered()
 
     def add_event(self, event: LoggableEvent, now: float) -> None:
-        """Log an event. Raises ValueError if it is larger than `max_event_bytes`."""
+        """Log an event. Raises ValueError if the event is larger than `max_event_bytes`."""
         self.check_size(event)
         trace_input = RecordedBytes(None, event) if self._tracing else None
         self._handle(now, EventTrigger(event.event_id), trace_input, self._on_local_event["Build Data Block"], event)
@@ -250,7 +253,7 @@ class Agent:
         self.release_answers(now)
 
     def release_answers(self, now: float) -> None:
-        """Let `datagrams_to_send` return the answers that were delayed until `now`."""
+        """Make `datagrams_to_send` return also the delayed answers whose time to send is at most `now`."""
         if self._waiting_answers is not None:
             self._core.now = now
 
@@ -262,8 +265,9 @@ class Agent:
     def boot(self, recovered: StoredState, now: float) -> None:
         """Restore the state that the agent stored on disk before it ended. Call this before any other input.
 
-        Timers, votes and the current block are lost. A reconcile in progress ends as if no agent had answered
-        (Algorithm 20): the rest of the stack goes back onto the chain, then the deque's front is proposed again.
+        Timers, votes and the current block are lost. A reconcile that was in progress ends as if no agent had answered
+        (Algorithm 20). The agent commits the rest of the stack to its chain again, and then proposes the front of the
+        deque again.
         """
         core = self._core
         core.now = now
@@ -290,12 +294,16 @@ class Agent:
         return outbox
 
     def _due_to_send(self) -> list[Outgoing]:
-        """Return the messages to broadcast now, in order. The setting `answer_spread_s` delays answers."""
+        """Return the messages to broadcast now, in order. Answers that the setting `answer_spread_s` still delays are
+        not included.
+        """
         outbox = self._take_outbox()
         return outbox if self._waiting_answers is None else self._waiting_answers.exchange(outbox, self._core.now)
 
     def datagrams_to_send(self) -> list[bytes]:
-        """Return the datagrams to broadcast now, in order. The setting `answer_spread_s` delays answers."""
+        """Return the datagrams to broadcast now, in order. Answers that the setting `answer_spread_s` still delays are
+        not included.
+        """
         return [encode(self.agent_id, sequence, message) for sequence, message, _ in self._due_to_send()]
 
     def trace(self) -> list[Entry]:
@@ -319,7 +327,9 @@ class Agent:
         handler: EventHandler[Any],
         *inputs: object,
     ) -> None:
-        """Run a handler, then all handlers that it triggers, in order. The trace records `trace_input` as the input."""
+        """Run a handler, and then all handlers that it triggers, in order. `trace_input` is the input as the trace
+        records it.
+        """
         core = self._core
         core.now, core.running = now, handler
         branch = handler.run(core, *inputs)
@@ -380,7 +390,9 @@ def drop_reason(agent_id: int, roster: Container[int], sender: int, message: Mes
 
 
 def tally_of(core: Core, handler: EventHandler[Any]) -> Tally | None:
-    """Return the counters of a handler for the trace: its votes, or its choice. Return None if it has neither."""
+    """Return the counters that the trace records for a run of this handler. They are the handler's counts of votes, or
+    the count of the block that it chose. Return None if the handler has no counters.
+    """
     if handler.tally is None:
         return None
     if handler.tally == "majority_response_block_hash":

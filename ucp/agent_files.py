@@ -1,4 +1,6 @@
-"""Write the files of an agent. The chain export is replaced as a whole. Trace and log grow line by line."""
+"""Write the files of an agent. Each write of the chain export replaces the whole file. The trace and the log grow line
+by line.
+"""
 
 import contextlib
 import errno
@@ -22,9 +24,8 @@ def write_json_atomically(path: Path, document: dict[str, Any]) -> None:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Replace the content of `path` completely or not at all. Raises OSError, for example on a full disk.
-
-    A lone surrogate, which JSON allows and UTF-8 does not, becomes a question mark.
+    """Replace the content of `path` completely or not at all. Raises OSError, for example if the disk is full. A lone
+    surrogate in the text becomes a question mark, because JSON allows it but UTF-8 does not.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -42,7 +43,7 @@ def write_atomically(path: Path, text: str) -> None:
 class ReservedSpace:
     """Disk space that is reserved for the chain export, so that no other file takes it.
 
-    An unnamed file holds the space, so the space is free again when the process ends.
+    A file without a name takes the space. The operating system frees this space when the process ends.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -112,7 +113,7 @@ class TraceFile:
 
 
 def leave_space(file: BinaryIO) -> None:
-    """Raise OSError if the file system has only the space left that stores and exports need."""
+    """Raise OSError if the free space of the file system is only enough for stores and chain exports."""
     system = os.fstatvfs(file.fileno())
     if system.f_bavail * system.f_frsize < min(
         MAX_KEPT_FREE_BYTES, system.f_blocks * system.f_frsize * KEPT_FREE_SHARE
@@ -121,7 +122,9 @@ def leave_space(file: BinaryIO) -> None:
 
 
 def end_of_last_line(file: BinaryIO) -> int:
-    """Return the position after the last complete line of the file. Return 0 if no line is complete."""
+    """Return the number of bytes from the beginning of the file to the end of its last complete line. Return 0 if no
+    line is complete.
+    """
     end = file.seek(0, os.SEEK_END)
     while end:
         begin = max(0, end - CHUNK_BYTES)

@@ -1,7 +1,7 @@
 """Define blocks and their hashes (Section 3.4, eq. 3.1-3.5).
 
-A block does not contain its chain hash (eq. 3.2), which belongs to a position in a chain (`ucp.chain`). A block
-therefore does not change if it is popped and committed again.
+A block does not contain its chain hash (eq. 3.2), because the chain hash depends on the blocks below it in a chain
+(`ucp.chain`). A block therefore does not change if an agent pops it and commits it again.
 """
 
 from functools import lru_cache
@@ -24,7 +24,9 @@ LATEST_US = 2**64 - 1
 """Latest timestamp in microseconds."""
 
 CHAIN_HASHES_KEPT = 4096
-"""Number of chain hashes in the cache. The agents of one process and the checker compute the same chain hashes."""
+"""Maximum number of chain hashes in the cache. The cache saves time, because the agents of one process and the checker
+compute the same chain hashes.
+"""
 
 BLOCK_FIELDS = {"agent_id": FieldKind.U32, "timestamp_us": FieldKind.U64}
 """The header of a block."""

@@ -1,6 +1,6 @@
-"""The chain of an agent: a stack of blocks on the inception block, with indexes by block hash and by chain hash.
-
-Each query of a handler takes one dictionary look-up, regardless of the number of blocks.
+"""The chain of an agent. It is a stack of blocks with the inception block at the bottom. Two dictionaries find a block
+by its block hash and by its chain hash. Each query of a handler therefore takes one dictionary look-up, regardless of
+the number of blocks.
 """
 
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from ucp.block import Block, InceptionBlock, next_chain_hash
 class Chain:
     """The chain of an agent: an inception block and the blocks that were committed after it.
 
-    `len(chain)` and iteration leave the inception block out. Iteration starts at the oldest block.
+    `len(chain)` does not count the inception block. Iteration omits it, and starts at the oldest other block.
     """
 
     def __init__(self, inception: InceptionBlock) -> None:

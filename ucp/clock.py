@@ -1,4 +1,6 @@
-"""Measure mission time in seconds since the start of a mission. It runs `speedup` times as fast as wall time."""
+"""Measure mission time, in seconds since the start of a mission. Mission time runs `speedup` times as fast as wall
+time.
+"""
 
 import time
 
@@ -29,8 +31,8 @@ class MissionClock:
         return max(0.0, (time.monotonic() - self._started) * self.speedup)
 
     def timestamp_us(self, now: float) -> int:
-        """Return the mission time `now` as microseconds since the Unix epoch. With a speedup, this time runs ahead of
-        wall time.
+        """Convert the mission time `now` to microseconds since the Unix epoch. If the speedup is above 1, the result is
+        later than the wall time.
         """
         return (self.epoch_us or 0) + round(now * MICROSECONDS)
 

@@ -31,7 +31,9 @@ class UnsupportedCommandError(CommandError):
 
 
 class ControlServer:
-    """A server that executes the functions in `commands` by name. When it ends, it removes its socket file."""
+    """A server for the control socket. A request names a command, and the server calls the function of this name in
+    `commands`. When the server ends, it removes its socket file.
+    """
 
     def __init__(self, path: Path, commands: dict[str, Command], loop: Loop) -> None:
         self._path = path

@@ -1,7 +1,6 @@
-"""The operations with which event handlers change the state of their agent.
-
-Handlers use this interface of an agent, and callers use `ucp.agent`. A handler may send, start and trigger only what it
-declares. Anything else raises an error.
+"""The operations with which event handlers change the state of their agent. Event handlers use this interface, and
+callers of an agent use `ucp.agent`. A handler may use only the messages, timers and local events that it declares. An
+operation with any other message, timer or local event raises an error.
 """
 
 from collections.abc import Callable, Iterable
@@ -21,13 +20,10 @@ Seal = Callable[[bytes, int], bytes]
 
 
 class Core(AgentState):
-    """The state of an agent, and the operations of its handlers. The results of a handler stay here until the agent
-    collects them.
+    """The state of an agent, and the operations of its handlers.
 
-    `outbox` is a list of (sequence number, message, recorded datagram) to broadcast. `changes`, `announced` and
-    `started` contain the changes, messages and timers of the running handler, as a trace has them. These three and the
-    recorded datagrams exist only with `tracing`. `sealed` is the event data that the handler encrypted. The trace needs
-    it, because a replay cannot encrypt it again.
+    The object stores the results of a handler until the agent collects them. If `tracing` is false, it records no
+    `changes`, `announced` and `started`, and no datagrams in `outbox`.
     """
 
     running: EventHandler[Any]
@@ -44,12 +40,19 @@ class Core(AgentState):
     ) -> None:
         super().__init__(agent_id, initial_data, settings)
         self.outbox: list[tuple[int, Message, RecordedBytes | None]] = []
+        """The messages to broadcast, as (sequence number, message, recorded datagram)."""
         self.changes: list[tuple[str, str]] = []
+        """The changes by the running handler, in the form of a trace line."""
         self.announced: list[SentMessage] = []
+        """The messages that the running handler has sent, in the form of a trace line."""
         self.started: dict[str, float] = {}
+        """Timer that the running handler has started -> its duration in mission seconds."""
         if seal is not None and settings.max_block_bytes + SEAL_BYTES > MAX_EVENT_DATA_BYTES:
             raise ValueError(f"with sealed event data, max_block_bytes is at most {MAX_EVENT_DATA_BYTES - SEAL_BYTES}")
         self.sealed: bytes | None = None
+        """The event data that the running handler encrypted, or None. The trace contains it, because a replay cannot
+        encrypt the event data again.
+        """
         self._seal = seal
         self._tracing = tracing
         self._sequence = 0
@@ -99,7 +102,7 @@ class Core(AgentState):
                 self.newest_block_timestamp_us = max(self.newest_block_timestamp_us, block.timestamp_us)
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Return the event data of the block under construction, encrypted if the mission requires it
+        """Return the event data of the block under construction. The data is encrypted if the mission requires this
         (`ucp.secure`).
         """
         events = bytes(self.current_block)

@@ -1,7 +1,7 @@
 """Define loggable events, their encoding in a block, and the random generator of Algorithm 21.
 
-`event_data` of a block is a run of events, each `timestamp_us (u64) || event_id (u8, 1..254) || length (u16) || data`,
-big-endian (Section 4.1).
+The `event_data` of a block is a sequence of encoded events. An encoded event is `timestamp_us (u64) || event_id (u8,
+1..254) || length (u16) || data`, big-endian (Section 4.1).
 """
 
 from random import Random
@@ -19,8 +19,8 @@ MAX_EVENT_BYTES = EVENT_HEADER_BYTES + 256
 
 MEAN_TIME_BETWEEN_EVENTS_S = 30.0
 MAX_MEAN_S = 31 * 86400.0
-"""Maximum mean interval of random events in seconds. It is longer than any mission. With a longer mean, the search for
-the next event would take minutes.
+"""Maximum mean interval of random events in seconds. The limit is longer than any mission. If it were longer still, the
+search for the next event could take minutes.
 """
 TRIAL_PERIOD_S = 1.0
 EVENT_DATA_BYTES = (32, 64, 128, 256)
@@ -73,7 +73,7 @@ def decode_events(event_data: bytes) -> list[LoggableEvent]:
 
 
 def decode_event(event_data: bytes, offset: int) -> tuple[LoggableEvent, int]:
-    """Return the event that begins at `offset`, and the position after it. Raises MalformedEventsError."""
+    """Return the event that begins at `offset`, and the offset at which the event ends. Raises MalformedEventsError."""
     body = offset + EVENT_HEADER_BYTES
     if body > len(event_data):
         raise MalformedEventsError(f"event header at byte {offset} is cut off")
@@ -86,7 +86,8 @@ def decode_event(event_data: bytes, offset: int) -> tuple[LoggableEvent, int]:
 
 
 class RandomEvents:
-    """The random event source of Algorithm 21: each second, with probability 1/mean, an event with random ID and data.
+    """The random event source of Algorithm 21. Once per second it logs an event with probability 1 / mean interval. The
+    event has a random ID and random data.
 
     The thesis does not specify the period of the loop. This implementation tries once per second, and each agent starts
     at a random fraction of a second.

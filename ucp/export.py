@@ -14,8 +14,9 @@ def export_chain(
 ) -> dict[str, object]:
     """Return the chain export of an agent as a JSON object.
 
-    The chain is listed from its oldest block, the deque from its front, and the reconcile stack to its top. In a
-    secured mission, `signatures` has the signature of each block by block hash.
+    The list of the chain begins with the oldest block. The list of the deque begins with its front. The list of the
+    reconcile stack ends with its top. In a secured mission, `signatures` maps each block hash to the signature of the
+    block.
     """
     inception = state.chain.inception
 

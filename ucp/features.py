@@ -35,8 +35,8 @@ FEATURES: dict[str, Callable[[Mapping[str, Any]], bool]] = {
     **{feature: _has(name, value) for feature, (name, value) in ALTERNATIVES.items()},
     **{name: _is_not_zero(name) for name, number in NUMBERS.items() if number.is_feature},
 }
-"""Feature -> function that returns true if a mission file needs it. The mission file must contain all keys, except the
-settings in `ucp.settings.ADDED`.
+"""Feature -> function that returns true if a mission file needs this feature. The mission file must contain all keys.
+Only the settings in `ucp.settings.ADDED` may be missing.
 """
 
 

@@ -1,7 +1,6 @@
-"""Define an event handler: the function for one of Algorithms 1-20, and its declarations.
-
-A handler declares its branches, and the messages, timers and local events that it may send, start and trigger.
-`ucp.core` enforces the declarations, and `docs.generate.handlers` draws the protocol from them.
+"""Define event handlers. An event handler is the function for one of Algorithms 1-20, together with its declarations. A
+handler declares its branches, the messages that it may send, the timers that it may start, and the local events that it
+may trigger. `ucp.core` enforces the declarations, and `docs.generate.handlers` draws the protocol from them.
 """
 
 import re
@@ -39,7 +38,9 @@ class EventHandler(Generic[P]):
     starts: tuple[str, ...]
     triggers: tuple[LocalEvent, ...]
     tally: str | None = None
-    """Name of the state attribute with the counters or the choice of this handler. None if the handler has neither."""
+    """Name of the state attribute that contains the counters or the choice of this handler. None if the handler has no
+    such attribute.
+    """
 
     @property
     def title(self) -> str:
@@ -57,10 +58,9 @@ def event_handler(
     triggers: tuple[LocalEvent, ...] = (),
     tally: str | None = None,
 ) -> Callable[[Callable[P, str]], EventHandler[P]]:
-    """Return a decorator that declares a function as the handler of Algorithm `algorithm`.
-
-    `branches` has all return values. `sends`, `starts` and `triggers` have the allowed messages, timers and local
-    events. `tally` is the attribute of the state with its counters or its choice.
+    """Return a decorator that declares a function as the handler of Algorithm `algorithm`. `branches` contains all
+    values that the function may return. `sends`, `starts` and `triggers` contain the messages, timers and local events
+    that it may use. `tally` is the name of the state attribute with the counters or the choice of the handler.
     """
 
     def declare(run: Callable[P, str]) -> EventHandler[P]:

@@ -1,4 +1,4 @@
-"""Decide which messages can have an effect on an agent, so that a simulation need not deliver the others.
+"""Decide which messages can have an effect on an agent. A simulation need not deliver the other messages.
 
 All messages are broadcast, so each of N agents receives the messages of all others. Most of them have no effect: an
 answer matters only to agents that sent the query, and an agent that reconciles answers no message. This module decides
@@ -26,13 +26,16 @@ from ucp.settings import Settings
 from ucp.state import AgentState
 
 Question = tuple[type[Message], bytes]
-"""An open query of an agent: the type of the expected answers, and the block or chain that they concern.
+"""An open query of an agent. It consists of the type of the expected answers, and the hash of the block or chain that
+they concern.
 
 An agent can have two open queries: one of its vote (type Block Add Response), and one of its reconcile.
 """
 
 ONLY_COUNTED = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceResponse))
-"""Answers that only change a counter (Algorithms 4, 10 and 14). Their handlers send no message and change no timer."""
+"""Types of answers that only change a counter (Algorithms 4, 10 and 14). Their handlers send no message and change no
+timer.
+"""
 
 ASKED: dict[type[Message], Callable[[Any, Settings], Question]] = {
     BlockAddRequest: lambda message, settings: (
@@ -54,8 +57,8 @@ ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
     NextInSequenceResponse: lambda message: (NextInSequenceResponse, message.chain_hash),
     BlockResponse: lambda message: (BlockResponse, message.block.block_hash),
 }
-"""Type of an answer -> function that returns the open query that it answers. The answer has no effect on agents without
-this query.
+"""Type of an answer -> function that returns the query to which the answer belongs. The answer has no effect on agents
+for which this query is not open.
 """
 
 STILL_ASKED: dict[type[Message], Callable[[AgentState], bool]] = {
@@ -64,7 +67,7 @@ STILL_ASKED: dict[type[Message], Callable[[AgentState], bool]] = {
     NextInSequenceResponse: lambda state: state.phase_two_timer.active,
     BlockResponse: lambda state: state.phase_three_timer.active,
 }
-"""Answer -> function that returns true if the agent still waits for answers of this type."""
+"""Type of an answer -> function that returns true if the agent still waits for answers of this type."""
 
 MATTERS: dict[type[Message], Callable[[AgentState, int, Any], bool]] = {
     BlockAddRequest: lambda state, sender, message: not state.reconcile_in_progress,

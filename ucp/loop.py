@@ -1,7 +1,8 @@
 """An event loop for sockets, timers and signals, smaller than asyncio.
 
-`asyncio` offers the same functions. But its import takes longer than all other steps of an agent's start together, and
-as much memory. With more agents than processors, the start of a swarm would mostly consist of this import.
+`asyncio` offers the same functions. But the import of `asyncio` takes longer than all other steps of an agent's start
+together. It also takes as much memory as all other steps. With more agents than processors, the start of a swarm would
+mostly consist of this import.
 """
 
 import heapq

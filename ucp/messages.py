@@ -47,7 +47,7 @@ class MalformedDatagramError(ValueError):
 
 @dataclass(unsafe_hash=True, slots=True)
 class BlockAddRequest:
-    """A request for votes on a block to append after the position with this chain hash (Algorithms 2 and 3)."""
+    """A request for votes: should this block follow the block with this chain hash? (Algorithms 2 and 3)"""
 
     NAME: ClassVar[str] = "Block Add Request"
     WIRE: ClassVar[Fields] = {"block_hash": FieldKind.HASH, "chain_hash": FieldKind.HASH}
@@ -93,7 +93,9 @@ class BlockAddResponse:
 
 @dataclass(unsafe_hash=True, slots=True)
 class CommitBlock:
-    """The announcement of a committed block (Algorithms 5, 6 and 20), with the hash of the chain up to this block."""
+    """The announcement that the sender has committed a block (Algorithms 5, 6 and 20). `chain_hash` is the chain hash
+    of this block in the sender's chain.
+    """
 
     NAME: ClassVar[str] = "Commit Block"
     WIRE: ClassVar[Fields] = {"chain_hash": FieldKind.HASH, "block": FieldKind.BLOCK}
@@ -263,7 +265,7 @@ _FIXED_BYTES: dict[type[Message], int] = {
     message: HEADER.size + struct_of({name: kind for name, kind in message.WIRE.items() if kind not in VARIABLE}).size
     for message in TYPE_CODES
 }
-"""Length in bytes of each type of datagram, without the part of variable length."""
+"""Type of a message -> length in bytes of its datagram, without the part of variable length."""
 _MORE_BYTES: dict[type[Message], Callable[[Any], int]] = {
     BlockAddResponse: lambda message: HASH_BYTES if message.chain_hash else 0,
     CommitBlock: lambda message: BLOCK_HEADER.size + len(message.block.event_data),
@@ -342,7 +344,7 @@ def _flag(body: bytes) -> bool:
 
 
 def decode_block(body: bytes) -> Block:
-    """Parse an encoded block. Raises MalformedDatagramError for a block that no message could carry."""
+    """Parse an encoded block. Raises MalformedDatagramError if the bytes are not a valid block."""
     if not BLOCK_HEADER.size < len(body) <= BLOCK_HEADER.size + MAX_EVENT_DATA_BYTES:
         raise MalformedDatagramError("wrong length")
     agent_id, timestamp_us = BLOCK_HEADER.unpack_from(body)

@@ -23,7 +23,9 @@ most 16 MiB.
 """
 MAX_SPEEDUP = 1000.0
 LATEST_EPOCH_US = 2**63 - 1
-"""Latest start of a mission. Timestamps after it still fit into the 64 bits of a block timestamp."""
+"""Latest start of a mission, in microseconds since the Unix epoch. The timestamps of such a mission still fit into the
+64 bits of a block timestamp.
+"""
 MAX_NAME = 40
 """Maximum number of characters of an unknown name in an error message."""
 
@@ -70,12 +72,7 @@ class Security:
 
 @dataclass(frozen=True)
 class Mission:
-    """The content of a mission file.
-
-    `epoch_us` is the start of the mission in microseconds since the Unix epoch. If it is None, the agent waits for the
-    command `start`. `speedup` is the number of mission seconds per second of wall time. `store` is the file of the
-    agent's store, relative to the directory of the mission file. If it is None, the agent has no store.
-    """
+    """The content of a mission file."""
 
     agent_id: int
     roster: tuple[int, ...]
@@ -86,8 +83,13 @@ class Mission:
     quirks: dict[str, bool | float]
     seed: int
     speedup: float
+    """Number of mission seconds per second of wall time."""
     epoch_us: int | None
+    """Start of the mission in microseconds since the Unix epoch. If it is None, the agent waits for the command
+    `start`.
+    """
     store: str | None = None
+    """File of the agent's store, relative to the directory of the mission file. None if the agent has no store."""
     security: Security | None = None
 
 

@@ -1,9 +1,9 @@
 """Run one agent as a process: `python -m ucp.node MISSION_FILE`. With `--virtual`, run `ucp.virtual` instead.
 
-The process drives `ucp.agent.Agent` with a UDP broadcast socket, the clock, and an event source. Next to the mission
-file it writes `<id>.chain.json`, `<id>.trace.jsonl`, `<id>.log`, a store if the mission names one, and the control
-socket `<id>.control` while it runs. SIGTERM exports the chain and ends the process. contract/CONTRACT.md defines the
-behaviour of any agent under test. This agent is the default.
+The process drives `ucp.agent.Agent` with a UDP broadcast socket, the clock, and an event source. It writes the files
+`<id>.chain.json`, `<id>.trace.jsonl` and `<id>.log` next to the mission file, and a store if the mission names one.
+While it runs, its control socket `<id>.control` is there too. On SIGTERM the process exports the chain and ends.
+contract/CONTRACT.md defines the behaviour of every agent under test. The harness uses this agent by default.
 """
 
 import base64
@@ -173,7 +173,7 @@ class Node:
             except OSError:  # no further datagram, or the network is down for a while
                 return
             if address == self.mission.network.address or not self.clock.running:
-                continue  # the echo of our own broadcast
+                continue  # the agent's own broadcast
             self._feed(partial(self.agent.receive_datagram, data))
 
     def log_event(self, event_id: int, data: bytes) -> None:
@@ -193,9 +193,9 @@ class Node:
     def _feed(self, feed: Callable[[float], None]) -> None:
         """Give the agent one input. Then write its records, broadcast its messages, and set its next timer.
 
-        Store and trace come before the broadcast, because the process can be killed in between. A dropped datagram
-        changes neither the store nor a timer, and any sender can cause many of them. These steps are therefore skipped
-        for dropped datagrams.
+        The node writes store and trace before it broadcasts, because the process can be killed between these steps. A
+        dropped datagram changes neither the store nor a timer, and any sender can cause many of them. These steps are
+        therefore skipped for dropped datagrams.
         """
         feed(self.clock.now())
         entries, datagrams = self.agent.trace(), self.agent.datagrams_to_send()
@@ -409,8 +409,9 @@ def _broadcast_socket(mission: Mission) -> socket.socket:
 
 
 def main(arguments: list[str], node: Callable[[Mission, Path], Node] = Node) -> int:
-    """Run an agent. Return exit status 0, 1 without an export, 2 for a wrong mission or a used port, or 127 for a
-    missing feature.
+    """Run an agent, and return its exit status. The status is 0 on success, and 1 if the chain could not be exported.
+    It is 2 if the mission is invalid or the port is in use. It is 127 if the mission needs a feature that the agent
+    lacks.
     """
     if arguments == ["--virtual"]:
         from ucp.virtual import main as serve

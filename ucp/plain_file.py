@@ -1,10 +1,10 @@
 """Read files of unknown origin within limits of time and memory.
 
-A file that another person or another machine made may be endless, huge, or no file at all: a program that reads a FIFO
-may wait forever, and a program that reads `/dev/zero` fills its memory. Parsed JSON takes more memory than its text:
-each `[],` of three bytes becomes 64 bytes. Every reader in this project therefore opens files with `open_plain_file`,
-reads at most a given number of bytes, and counts the values of a JSON text before it parses the text. Its functions
-raise OSError or ValueError with a description for the user.
+A file that another person or another machine made may be endless, huge, or not a regular file. A program that reads a
+FIFO may wait forever. A program that reads `/dev/zero` fills its memory. Parsed JSON takes more memory than its text.
+For example, the three bytes `[],` become 64 bytes. Every reader in this project therefore opens files with
+`open_plain_file`, reads at most a given number of bytes, and counts the values of a JSON text before it parses the
+text. The functions of this module raise OSError or ValueError with a description for the user.
 """
 
 import contextlib
@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 MAX_JSON_WEIGHT = 250_000
-"""Maximum weight of a JSON text, a measure of its memory. A list or an object weighs 5, and any other value 1. A value
-of the wrong type takes 400 bytes in a validation error, so a text of the maximum weight takes about 100 MiB.
+"""Maximum weight of a JSON text. The weight estimates how much memory the parsed text takes. A list or an object weighs
+5, and any other value 1. A value of the wrong type takes 400 bytes in a validation error, so a text of the maximum
+weight takes about 100 MiB.
 """
 
 _CHUNK_BYTES = 64 * 1024
@@ -85,8 +86,8 @@ def parse_json(text: str | bytes, *, strict: bool = True, most_weight: int = MAX
 
 
 def parse_json_at(text: str, position: int) -> tuple[Any, int]:
-    """Parse the JSON value that begins at this position. Return the value and the position after it. Raises
-    ValueError.
+    """Parse the JSON value that begins at index `position` of the text. Return the value, and the index after its end.
+    Raises ValueError.
     """
     with _limits(text, MAX_JSON_WEIGHT):
         return json.JSONDecoder().raw_decode(text, position)

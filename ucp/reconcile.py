@@ -20,7 +20,7 @@ from ucp.messages import (
 )
 
 IS_TOP_OF_CHAIN = b""
-"""The reserved candidate "Is Top Of Chain" among the candidates of phase 2. It sorts before every block hash."""
+"""The candidate of phase 2 that stands for the reserved answer "Is Top Of Chain". It sorts before every block hash."""
 
 
 @event_handler(7, "already in progress", "begun", triggers=("Reconcile Phase 1",))
@@ -177,10 +177,9 @@ def most_named(candidates: Mapping[bytes, Sequence[int]]) -> list[bytes]:
 
 
 def without_minority_top(candidates: Mapping[bytes, Sequence[int]]) -> Mapping[bytes, Sequence[int]]:
-    """Return the candidates of phase 2, without "Is Top Of Chain" if too few agents named it for a majority.
-
-    Agents that answer with a block would disapprove the next proposal of this agent (Algorithms 3 and 5). The vote of
-    this agent itself counts for "Is Top Of Chain".
+    """Return the candidates of phase 2. Omit "Is Top Of Chain" if the agents that named it are not a majority. This
+    agent counts itself among them. The agents that named a block would disapprove the next proposal of this agent
+    (Algorithms 3 and 5).
     """
     with_us = 1 + candidates.get(IS_TOP_OF_CHAIN, (0,))[0]
     blocks = {candidate: counted for candidate, counted in candidates.items() if candidate != IS_TOP_OF_CHAIN}

@@ -159,7 +159,7 @@ def _event_or_raw(block: Packet, before: list[Any], last: Packet | None, rest: b
 
 
 class Block(Packet):
-    """A block in a message. Event data that are not whole events appear as Raw at the end of `events`."""
+    """A block in a message. Event data that is not a sequence of complete events is Raw at the end of `events`."""
 
     name = "Block"
     fields_desc = _fields(

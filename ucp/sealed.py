@@ -1,12 +1,11 @@
 """Find out whether a mission encrypts its event data. If so, the inception block ends with the public key of the depot.
-
-This module only reads and writes this key. The module `ucp.secure.sealing` encrypts.
+This module only reads and writes this key. The module `ucp.secure.sealing` encrypts the event data.
 """
 
 DEPOT_TAG = b"UCP depot key"
 DEPOT_KEY_BYTES = 32
 SEAL_BYTES = 48
-"""Number of bytes by which sealed event data is longer: an ephemeral public key in front, and a tag at the end."""
+"""Number of bytes that encryption adds to event data: an ephemeral public key before the data, and a tag after it."""
 
 
 def sealed_to(initial_data: bytes) -> bytes | None:
@@ -18,5 +17,7 @@ def sealed_to(initial_data: bytes) -> bytes | None:
 
 
 def seal_to(initial_data: bytes, depot: bytes) -> bytes:
-    """Return inception block data with this public key, so that the mission encrypts its event data."""
+    """Return the data of an inception block with this public key added. A mission with this data encrypts its event
+    data.
+    """
     return initial_data + DEPOT_TAG + depot

@@ -1,10 +1,12 @@
-"""The settings of an agent: timers, sizes, interpretations of ambiguous passages in the thesis, and protocol changes.
+"""The settings of an agent. They are durations of timers, sizes, interpretations of ambiguous passages in the thesis,
+and changes of the protocol.
 
-Each setting is declared once, as a field of `Settings`. The declaration has its allowed values and its effect.
-Other modules read the declarations and do not name the settings: features, schemas, the table in contract/CONTRACT.md,
-the variants of the conformance test, the changes that `explore` tries, and the constants of the TLA+ specification. A
-new setting needs a field here and the handler that acts on it. `Annotated` carries a declaration because it needs no
-import of `dataclasses`, which would delay the start of an agent.
+Each setting is declared once, as a field of `Settings`. The declaration has its allowed values and its effect. Other
+parts of the project read the declarations and do not contain the names of settings. These parts are the features, the
+schemas, the table in contract/CONTRACT.md, the variants of the conformance test, the changes that `explore` tries, and
+the constants of the TLA+ specification. A new setting therefore needs only a field here and a change of the handler
+that uses it. The declaration is part of the field's type (`Annotated`). Field options of `dataclasses` would need an
+import that delays the start of an agent.
 """
 
 import math
@@ -31,8 +33,8 @@ class NumberSetting:
     high: float
     whole: bool = False
     is_feature: bool = False
-    """True if an agent needs a feature, named like the setting, for each value other than the default. Missions and
-    traces omit the default.
+    """True if each value other than the default is a feature that the agent must support. The feature has the name of
+    the setting. Missions and traces omit the default.
     """
 
 
@@ -57,8 +59,8 @@ class ChoiceSetting:
     it.
     """
     constant: str | None = None
-    """The constant in the TLA+ specification that is true if the setting does not have its default. None without
-    one.
+    """Name of the constant in the TLA+ specification that is true if the setting does not have its default value. None
+    if there is no such constant.
     """
 
     @property
@@ -180,10 +182,9 @@ class Settings:
                 raise ValueError(f"{name} must be {choice.allowed}, not {shown(value)}")
 
     def to_json(self) -> dict[str, Any]:
-        """Return the settings as JSON for missions and traces. Newer settings (`ADDED`) with their default value are
-        omitted.
-
-        An agent that does not know a newer setting can then play a mission that does not need this setting.
+        """Return the settings as a JSON object for missions and traces. Newer settings (`ADDED`) are omitted if they
+        have their default value. An agent that does not know a newer setting can therefore run a mission that does not
+        need this setting.
         """
         usual = Settings()
         values = {name: getattr(self, name) for name in self.__match_args__}

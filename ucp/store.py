@@ -72,17 +72,18 @@ class SecuredState:
 
 @dataclass(slots=True)
 class StoredState:
-    """The stored blocks of an agent (chain, deque and reconcile stack), and the hashes of the blocks that it completed.
-
-    The chain has its oldest block first, the deque its front first, the stack its top last. `secured` is None without
-    keys.
-    """
+    """The stored state of an agent."""
 
     completed: list[bytes] = field(default_factory=list)
+    """Hashes of the blocks that the agent completed."""
     chain: list[Block] = field(default_factory=list)
+    """Blocks of the chain without the inception block. The oldest is first."""
     deque: list[Block] = field(default_factory=list)
+    """Blocks of the deque. The front is first."""
     stack: list[Block] = field(default_factory=list)
+    """Blocks of the reconcile stack. The top is last."""
     secured: SecuredState | None = None
+    """Additional data of a secured agent. None if the mission has no keys."""
 
     @classmethod
     def of(cls, state: AgentState) -> "StoredState":
@@ -147,7 +148,7 @@ class Store:
 
     def __init__(self, path: Path, state: AgentState) -> None:
         self.problem: str | None = None
-        """The disk error that ended the store early. None without an error."""
+        """The disk error after which the agent stopped writing the store. None if there was no error."""
         self._path = path
         self._state = state
         self._header = {
@@ -254,7 +255,9 @@ def read_store(path: Path) -> tuple[Any, StoredState]:
 
 
 def block_on_disk(agent_id: int, timestamp_us: int, event_data: bytes) -> Block:
-    """Return a block that was read from the disk. Raises ValueError if it is invalid, or too large for a message."""
+    """Decode a block that was read from the disk. Raises ValueError if the block is invalid, or too large for a
+    message.
+    """
     try:
         return decode_block(BLOCK_HEADER.pack(agent_id, timestamp_us) + event_data)
     except struct.error as error:

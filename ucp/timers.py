@@ -1,5 +1,5 @@
-"""A timer as in the thesis (Section 3.2). It expires once, and can be paused and resumed. The caller passes the
-time.
+"""A timer as in the thesis (Section 3.2). It expires once, and can be paused and resumed. Its methods take the time as
+an argument.
 """
 
 

@@ -1,7 +1,8 @@
 """The trace of an agent. It has a line of JSON for each handler run, and for each input that runs no handler.
 
-A trace contains all inputs completely, including dropped datagrams, so the run of the agent can be repeated from it.
-`changes` is complete: a replay of the changes gives the contents of chain, deque and reconcile stack after each step.
+A trace contains all inputs completely, so the run of the agent can be repeated from its trace. Only dropped datagrams
+above a quota are counted instead (`ucp._drop_quota`). `changes` lists all changes of a step. A reader that applies the
+changes knows the contents of chain, deque and reconcile stack after each step.
 
 In a line, datagrams, events and stores are encoded in base64. In memory they are encoded only when their text is
 needed.
@@ -219,7 +220,7 @@ def header_line(
     clock: dict[str, Any],
     secured: bool = False,
 ) -> str:
-    """Return the first line of a trace: agent, mission, settings and clock."""
+    """Return the first line of a trace. It contains the agent, the mission, the settings and the clock."""
     header = {
         "schema": SCHEMA,
         "agent_id": agent_id,

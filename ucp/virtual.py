@@ -1,8 +1,9 @@
 """Run one agent in virtual time: `python -m ucp.node --virtual`.
 
-The program reads lines of JSON from standard input. Each line has an input and its time. The program answers with a
-line on standard output: its broadcasts, the time of its next timer, and its trace lines. It has no socket, no file and
-no clock. A line with a mission starts a new agent. contract/CONTRACT.md defines these lines for all agents.
+The program reads lines of JSON from standard input. Each line has an input and its time. The program answers each line
+with one line on standard output. The answer contains the agent's broadcasts, the time of its next timer, and its trace
+lines. The program uses no socket, no file and no clock. A line with a mission starts a new agent. contract/CONTRACT.md
+defines these lines for all agents.
 """
 
 import base64

@@ -1,6 +1,7 @@
-"""Define the rules by which a radio decides when to send: in its own time slot, or as its duty cycle allows.
+"""Define two rules by which a radio decides when to send. With the first rule, it sends only in its own time slots.
+With the second, it sends immediately unless its duty cycle forbids this.
 
-The rule of IEEE 802.11 is in `netem.channel._contention`.
+The module `netem.channel._contention` contains the rule of IEEE 802.11.
 """
 
 from __future__ import annotations
@@ -20,28 +21,37 @@ class ChannelAccess(Protocol):
     """A rule for access to the channel. Stations are numbered from 0, and times are nanoseconds."""
 
     next_due: int
-    """The time at which the next station will send if nothing changes. It is NEVER if no station has a frame."""
+    """The time at which the next station will send, unless a frame begins or a new frame is queued before. It is NEVER
+    if no station has a frame.
+    """
 
     def take_due(self) -> list[int]:
         """Return the stations that send at the time `next_due`, and remove them from the waiting stations."""
 
     def wait(self, frame: RadioFrame, now: int, active: Collection[RadioFrame]) -> None:
-        """Choose the sending time of `frame`. `active` contains the frames on the air."""
+        """Choose the time at which the sender of `frame` will send it. `active` contains the frames that are on the air
+        now.
+        """
 
     def begun(self, frames: list[RadioFrame], now: int) -> None:
-        """Update the waiting stations when frames begin. `take_due` returned the senders of these frames before."""
+        """Update the sending times of waiting stations, because these frames begin. `take_due` has just returned the
+        senders of these frames.
+        """
 
     def ended(self, frame: RadioFrame, waiting: RadioFrame | None, now: int, active: Collection[RadioFrame]) -> None:
-        """Update the waiting stations when `frame` ends. `waiting` is the next frame of its sender."""
+        """Update the sending times of waiting stations, because `frame` ends. `waiting` is the next frame in the queue
+        of its sender, or None.
+        """
 
     def too_long(self, airtime_ns: int) -> bool:
-        """Return true if the rule never allows a frame with this airtime."""
+        """Return true if the rule never allows a frame that takes this time on the air."""
 
 
 class DutyCycle:
-    """The access rule of a station that sends immediately, unless it has used up its duty cycle. // After a frame of T
-    seconds, its station may send again T / duty seconds after the beginning of this frame (ETSI EN 300 220, as LoRaWAN
-    devices apply it).
+    """The access rule of stations that send immediately, unless their duty cycle forbids this.
+
+    After a frame of T seconds, the station is silent until T / duty seconds after the beginning of this frame. This is
+    the duty cycle of ETSI EN 300 220, as LoRaWAN devices apply it.
     """
 
     def __init__(self, count: int, radio: LoraRadio | TimeSlotRadio) -> None:

@@ -2,22 +2,24 @@
 capture.
 
 The model does no I/O and reads no clock. The events of the model are the beginnings and the ends of frames. The caller
-advances the model to a given time. The same calls with the same seed give the same result on every machine: times are
-integers of nanoseconds, powers come from tables, and each station has a random stream of its own for its backoff.
+advances the model to a given time. The same calls with the same seed give the same result on every machine, for three
+reasons. Times are whole nanoseconds. Powers come from tables. Each station draws its backoff from its own random number
+generator.
 
-A receiver begins to receive a frame if it does not send and receives no other frame, if the power of the frame is at
-least `sensitivity_dbm`, and if the frame is `preamble_db` stronger than noise and all other frames together. The last
-condition must hold during `capture_window_s`. Within this time the receiver changes to a stronger frame (capture
-effect). The frame is received if the ratio of its power to noise and all other frames never falls below `sinr_db`, and
-if the receiver does not begin to send.
+A receiver begins to receive a frame under three conditions. First, the receiver neither sends nor receives another
+frame. Second, the power of the frame is at least `sensitivity_dbm`. Third, the frame is stronger by `preamble_db` than
+the noise and all other frames together. The third condition must hold for `capture_window_s` from the beginning of the
+frame. Within this time the receiver can change to a stronger frame (capture effect). The receiver loses the frame if it
+begins to send before the end of the frame. It also loses the frame if the ratio of the frame's power to the noise and
+all other frames ever falls below `sinr_db`.
 
-Two stations that do not hear each other do not wait for each other: they are hidden from each other, and their frames
-collide at a receiver between them. A station that receives no frame senses the sum of all powers, and waits until this
-sum falls below `energy_dbm`.
+Two stations that do not hear each other do not wait for each other. Their frames collide at a receiver that hears both
+(hidden stations). A station that receives no frame senses the sum of all powers, and waits until this sum falls below
+`energy_dbm`.
 
-The model neglects the propagation time, which is 1 us for 300 m and part of the slot time, and draws no bit errors: a
-ratio of signal to interference decides. In a frame of 100 bytes, the step from no errors to certain errors takes about
-2 dB.
+The model neglects the propagation time, which is 1 us for 300 m and is part of the slot time. The model draws no bit
+errors. A fixed ratio of signal to interference decides whether a receiver loses a frame. In reality, a frame of 100
+bytes goes from almost never lost to almost always lost within about 2 dB of this ratio.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ from netem.radio import Place
 
 
 class Channel:
-    """The radio channel between `vehicles`, which are numbered from 0 in this order.
+    """The radio channel between `vehicles`. The channel numbers the vehicles from 0, in the order of this argument.
 
     Times are seconds, and must not decrease from call to call. All vehicles are at the same place until the first call
     of `move`.
@@ -57,8 +59,8 @@ class Channel:
         self._finished: list[EndedTransmission] = []
         self._numbers = count()
         self._airtimes: dict[int, int | None] = {}
-        """Data bytes of a message -> nanoseconds on the air, or None if the radio cannot send a message of this
-        length.
+        """Number of data bytes in a message -> nanoseconds that the message takes on the air. The value is None if the
+        radio cannot send a message of this length.
         """
         self._silence = [linear(round(100 * radio.noise_dbm))] * len(vehicles)
         self._energy = self._silence[0] + linear(round(100 * energy_dbm)) if isinstance(radio, WifiRadio) else math.inf
@@ -67,9 +69,8 @@ class Channel:
         self._capture_window = nanoseconds(radio.capture_window_s)
 
     def send(self, sender: int, now: float, data_bytes: int) -> int | FrameFate:
-        """Queue a message of this length. Return the number of its frame, or the reason why it is never sent.
-
-        Return Fate.QUEUE or Fate.TOO_LONG if the radio drops the message.
+        """Put a message of this length into the queue of its sender. Return the number of the message's frame. If the
+        radio drops the message, return FrameFate.QUEUE or FrameFate.TOO_LONG instead.
         """
         now_ns = nanoseconds(now)
         if self._next_end <= now_ns or self._access.next_due <= now_ns:
@@ -150,12 +151,13 @@ class Channel:
         self._access.begun(sensed, now)
 
     def _overlap(self, frames: list[RadioFrame], now: int) -> list[RadioFrame]:
-        """Decide which receivers begin to receive these frames. For each frame, mark the receivers at which other
-        frames disturb it.
+        """Decide which receivers begin to receive each of these frames. For each frame on the air, record the receivers
+        at which other frames disturb it.
 
-        Return the frames that additional stations sense from now on.
+        Return the frames that more stations sense from now on than before.
 
-        A power p is sufficient if p >= ratio (total - p), which is p (1 + 1 / ratio) >= total.
+        A frame with power p is strong enough if p >= ratio * (total - p), which is the same as p * (1 + 1 / ratio) >=
+        total.
         """
         for frame in self._active:
             frame.deaf |= frame.reach.heard & self._sending
@@ -179,9 +181,10 @@ class Channel:
         return self._sum_energy(air, totals)
 
     def _sum_energy(self, air: list[RadioFrame], totals: Sequence[float]) -> list[RadioFrame]:
-        """Let stations sense the sum of the powers of all frames, until this sum falls below their detection level.
+        """Mark stations at which the powers of all frames together reach the detection level. Such a station senses the
+        channel as busy until the sum of the powers falls below this level.
 
-        Return the frames that additional stations sense from now on.
+        Return the frames that more stations sense from now on than before.
         """
         level = self._energy
         by_end = sorted(air, key=lambda frame: frame.ends_ns, reverse=True)
@@ -212,8 +215,8 @@ class Channel:
 
 
 def _sufficient(frame: RadioFrame, totals: Sequence[float], ratio: float) -> int:
-    """Return the receivers, as bits, at which the power of the frame times `ratio` is at least the total power of all
-    frames.
+    """Return the receivers at which the power of the frame times `ratio` is at least the total power of all frames.
+    Each bit of the result stands for one receiver.
     """
     receivers = 0
     for number in [number for number, power in enumerate(frame.reach.powers) if power * ratio >= totals[number]]:

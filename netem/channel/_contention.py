@@ -31,7 +31,9 @@ class CarrierSense:
     def __init__(self, radio: WifiRadio, draws: Sequence[Random]) -> None:
         self.next_due = NEVER
         self._due: dict[int, int] = {}
-        """Station with a waiting frame -> the time at which it will send this frame if nothing changes."""
+        """Station with a waiting frame -> the time at which the station will send this frame, unless another frame
+        begins before.
+        """
         self._draws = draws
         self._choices = radio.contention_window + 1
         self._slot = nanoseconds(radio.slot_s)
@@ -39,11 +41,13 @@ class CarrierSense:
         self._eifs = nanoseconds(radio.eifs_s)
         self._sense = nanoseconds(radio.sense_s)
         self._left = [0] * len(draws)
-        """Number of slots that each station still has to count down, at the time `_from`."""
+        """Number of slots that each station has to count down from its time in `_from` on."""
         self._from = [0] * len(draws)
         """The time at which each station begins or began to count down."""
         self._resting: dict[int, int] = {}
-        """Station without a further frame that counts down after its last one -> the time at which it has finished."""
+        """Station without a waiting frame that still counts down after its last frame -> the time at which the
+        countdown ends.
+        """
         self._over: deque[RadioFrame] = deque()
         """Frames that ended less than EIFS ago."""
 
@@ -67,8 +71,8 @@ class CarrierSense:
         self.next_due = min(self.next_due, due)
 
     def begun(self, frames: list[RadioFrame], now: int) -> None:
-        """Make each station that receives these frames wait. A station whose sending time is earlier than `now` sends
-        nevertheless.
+        """Make each station wait that senses these frames. A station sends nevertheless if its sending time is at most
+        `sense_s` after `now`, because it cannot sense the frames so soon.
         """
         all_due, all_from, all_left, slot, notices = self._due, self._from, self._left, self._slot, now + self._sense
         resting = self._resting
@@ -141,7 +145,7 @@ class CarrierSense:
         self.next_due = min(self._due.values(), default=NEVER)
 
     def _counted(self, station: int, now: int) -> int:
-        """Subtract the slots that have passed, and return the number of remaining slots of this station."""
+        """Subtract the slots that have passed from this station's number of slots. Return the remaining number."""
         left = self._left[station]
         if left and now > self._from[station]:
             passed = (now - self._from[station]) // self._slot

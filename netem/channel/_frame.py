@@ -1,4 +1,4 @@
-"""Represent a frame, from the queue of its sender to the end of its transmission."""
+"""Represent a radio frame, from the time at which its sender queues it to the end of its transmission."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from netem.channel._parameters import NANOSECONDS
 
 
 class FrameFate(StrEnum):
-    """The result of a frame at one receiver. A frame with one of the last two results was never on the air."""
+    """The result of a frame at one receiver. A frame with the result QUEUE or TOO_LONG was never on the air."""
 
     RECEIVED = "received"
     COLLISION = "collision"
-    """Frames collided: the receiver sensed other frames at the same time, or it was receiving another frame."""
+    """The frame collided with other frames: they were too strong at the receiver, or the receiver was already receiving
+    another frame.
+    """
     HALF_DUPLEX = "half_duplex"
     """The receiver was sending a frame itself at this time."""
     FADE = "fade"
@@ -32,8 +34,8 @@ class FrameFate(StrEnum):
 
 @dataclass(slots=True, eq=False)
 class RadioFrame:
-    """A frame, from the queue of its sender to the end of its transmission. Times are nanoseconds. In a set of
-    receivers, each bit stands for one receiver.
+    """A radio frame, from the time at which its sender queues it to the end of its transmission. Times are in
+    nanoseconds. A set of receivers is an integer in which each bit stands for one receiver.
     """
 
     number: int
@@ -104,11 +106,13 @@ class EndedTransmission:
 
     @property
     def received(self) -> int:
-        """The receivers that received the frame, as bits. Receiver 0 is the lowest bit."""
+        """The receivers that received the frame. Each bit stands for one receiver. Receiver 0 is the lowest bit."""
         return self._frame.received
 
     def lost(self) -> dict[FrameFate, int]:
-        """Return the receivers that lost the frame, as bits, for each reason."""
+        """Return reason -> the receivers that lost the frame for this reason. Each bit of the value stands for one
+        receiver.
+        """
         frame, reach = self._frame, self._frame.reach
         lost = {
             FrameFate.COLLISION: frame.collided,

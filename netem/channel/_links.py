@@ -1,14 +1,15 @@
-"""Compute the power with which each vehicle receives each other one, from path loss over distance and from shadowing.
+"""Compute the power with which each vehicle receives each other vehicle. The power depends on the path loss over the
+distance and on shadowing.
 
-Shadowing is a normal deviation in decibels, equal in both directions of a link. It is correlated: after a vehicle has
-moved, or after some time, a part of the old deviation remains (Gudmundson, Correlation Model for Shadow Fading in
-Mobile Radio Systems, Electronics Letters 27(23), 1991). If both ends of a link move, both movements change the
-shadowing (Wang, Tameh, Nix, Joint Shadowing Process in Urban Peer-to-Peer Radio Channels, IEEE Transactions on
-Vehicular Technology 57(1), 2008). Links are independent of each other, even if two vehicles fly side by side, because
-the model has no map of obstacles.
+Shadowing is a normally distributed deviation of the power in decibels. It is equal in both directions of a link. After
+a vehicle has moved, or after some time, the deviation is new, but a part of the old deviation remains (Gudmundson,
+Correlation Model for Shadow Fading in Mobile Radio Systems, Electronics Letters 27(23), 1991). If both ends of a link
+move, both movements change the shadowing (Wang, Tameh, Nix, Joint Shadowing Process in Urban Peer-to-Peer Radio
+Channels, IEEE Transactions on Vehicular Technology 57(1), 2008). Links are independent of each other, even if two
+vehicles fly side by side, because the model has no map of obstacles.
 
-Powers are integers of 0.01 dB, and sums of powers use the entries of a table. The rounded values are equal on all
-machines.
+Powers are whole multiples of 0.01 dB. To add powers, the module converts them to linear values with a table. The
+results are therefore equal on all machines.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from netem.channel._parameters import NANOSECONDS, Radio, nanoseconds
 from netem.radio import MIN_DISTANCE_M, Place
 
 STEP = 0.1
-"""Amount of time and movement after which the shadowing is drawn again. Its correlation with the old shadowing has then
-fallen to exp(-STEP), about 0.9.
+"""Amount of time and movement after which the shadowing is drawn again, as a share of the time or distance in which the
+correlation falls to 1/e. The correlation of the new with the old shadowing is then exp(-STEP), about 0.9.
 """
 
 _SILENT = -1_000_000
@@ -190,8 +191,9 @@ class RadioLinks:
         return _MeanReach(levels, near, far, cut)
 
     def _path_loss(self, one: Place, other: Place) -> int:
-        """Return the path loss between two places: the greater of the log-distance model and the model of two rays over
-        flat ground.
+        """Return the path loss between two places in 0.01 dB. The result is the path loss of the log-distance model. If
+        the radio has the ground model of two rays over flat ground, the result is the greater path loss of the two
+        models.
 
         The model of two rays is from Rappaport, Wireless Communications, 2nd ed., eq. 4.52, far from the antennas.
         """
@@ -206,15 +208,17 @@ class RadioLinks:
         return _centibels(loss_db)
 
     def _age(self, now_ns: int) -> None:
-        """Let the shadowing change according to the time and the movement since its last change."""
+        """Replace the shadowing values. How much of the old values remains depends on the time and the movement since
+        the last change.
+        """
         elapsed_s = (now_ns - self._shadowed_at) / NANOSECONDS
         self._shadowed_at = now_ns
         self._ages_at = now_ns + nanoseconds(STEP * self._radio.shadowing_s)
         self._shift(elapsed_s / self._radio.shadowing_s)
 
     def _shift(self, exponent: float | None) -> None:
-        """Replace the random shadowing values. Each new value keeps a part of the previous one. Without an exponent, it
-        keeps nothing.
+        """Replace the random shadowing values. Each new value keeps a part of the old value: exp(-`exponent`) without
+        movement, and less with movement. If `exponent` is None, the new values do not depend on the old ones.
         """
         shadow, moved_m = self._shadow, self._moved_m
         known = -1.0

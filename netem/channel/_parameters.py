@@ -1,8 +1,8 @@
 """Define the properties of radios: power, reception, the form of frames, and the rule for access to the channel.
 
 Each kind of radio is a class. Its fields are the keys of `network.channel` in a scenario, with the unit in the name. In
-this module times are seconds. The model of the channel counts whole nanoseconds, because it must recognise equal times:
-two stations collide if they start in the same slot.
+this module times are seconds. The model of the channel uses whole nanoseconds, because it must recognise equal times.
+For example, two stations collide if they start in the same slot.
 """
 
 from __future__ import annotations

@@ -7,7 +7,9 @@ import math
 from netem.channel._parameters import LoraRadio, Radio, TimeSlotRadio, WifiRadio
 
 _UDP_OVER_80211 = 24 + 4 + 8 + 20 + 8
-"""Bytes that a frame has in addition to the data: MAC header and frame check sequence, LLC and SNAP, IPv4, and UDP."""
+"""Number of bytes that a frame has in addition to the data. They are the MAC header and frame check sequence, the LLC
+and SNAP headers, the IPv4 header, and the UDP header.
+"""
 
 _THERMAL_DBM_PER_HZ = -174.0
 

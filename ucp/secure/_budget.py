@@ -1,22 +1,24 @@
-"""A limit for the processor time that forged datagrams take.
+"""Limit the processor time that an agent spends on forged datagrams.
 
 Two steps of opening a datagram are expensive. A budget limits their number: it holds some tokens, and each step takes
-one. Without tokens, the agent drops the datagram before the step.
+one. If no token is left, the agent drops the datagram before the step.
 
 - *Wrong signatures.* Each takes more than 100 us. An attacker without keys cannot make an agent verify a signature,
   because the authenticated encryption covers it. An attacker with the keys of one vehicle can. Each sender has a budget
   of its own, so that forgeries in its name do not affect the datagrams of other senders.
-- *Keys of an unknown boot.* To derive them takes longer than all other steps for a datagram with a wrong tag. An
-  attacker without keys can invent any number of boots. One budget serves all senders, because the attacker also chooses
-  the sender, and would exhaust the smaller share of one sender with fewer datagrams. The accepted boots of all senders
-  need no token, because the agent keeps their keys.
+- *Keys of an unknown boot.* To derive these keys takes longer than all other steps for a datagram with a wrong tag. An
+  attacker without keys can invent any number of boots. All senders share one budget. If each sender had a smaller
+  budget of its own, an attacker could exhaust the budget of one sender with fewer datagrams, because the attacker also
+  chooses the sender. The accepted boots of all senders need no token, because the agent keeps their keys.
 """
 
 import math
 
 
 class TokenBudget:
-    """A budget of at most `burst` tokens. It gains `per_s` tokens each mission second. Infinity sets no limit."""
+    """A budget of at most `burst` tokens. It gains `per_s` tokens each mission second. If `per_s` is infinite, there is
+    no limit.
+    """
 
     __slots__ = ("_burst", "_per_s", "_since_s", "_tokens")
 

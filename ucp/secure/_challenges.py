@@ -1,9 +1,11 @@
-"""Challenge messages, with which a receiver makes a sender prove that it is active now (compare Echo in RFC 9175).
+"""Challenge messages. With them a receiver makes a sender prove that the sender is active now (compare Echo in RFC
+9175).
 
-An incarnation that has not received everything since the start of the mission cannot distinguish a new datagram from a
-recorded one: its replay windows are incomplete. It broadcasts a *challenge*. Each other vehicle answers with an *echo*,
-which names the challenge and the sender's next sequence. An echo is signed, and it cannot have been recorded before the
-challenge. From then on, the receiver accepts datagrams of this sender from this sequence on.
+A vehicle that boots during a mission has missed earlier datagrams. Its replay windows are therefore incomplete, and it
+cannot distinguish a new datagram from a recorded one. It broadcasts a *challenge*. Each other vehicle answers with an
+*echo*. An echo names the challenge, and the next sequence number that the sender of the echo will use. The sender signs
+the echo, and an attacker cannot have recorded the echo before the challenge. After the echo, the receiver accepts
+datagrams of this sender from this sequence number on.
 
 A receiver also challenges a sender whose boot is older than the known one. The boot may be recorded, or the sender may
 have lost its clock and its disk.
@@ -11,9 +13,9 @@ have lost its clock and its disk.
 The receiver collects the echoes for `TRUST_DELAY_S`, or until all vehicles have answered. During this time it receives
 the revocations that it missed, before it trusts any sender.
 
-Challenges and echoes may be recorded as well. A receiver therefore answers each challenge once, and accepts one echo of
-each sender to a challenge. After it has accepted a later boot of a sender, older challenges to this sender no longer
-count. A repeated challenge or echo is dropped before its signature is verified.
+An attacker may also record and replay challenges and echoes. A receiver therefore answers each challenge once, and
+accepts one echo of each sender to a challenge. After a receiver has accepted a later boot of a sender, it ignores
+echoes to older challenges of this sender. A repeated challenge or echo is dropped before its signature is verified.
 """
 
 CHALLENGE_INTERVAL_S = 5.0
@@ -39,7 +41,7 @@ class PendingChallenges:
         self._pending: dict[int, int] = {}
         """Agent to which a challenge was sent -> sequence number of the newest challenge to this agent."""
         self._closed: dict[int, int] = {}
-        """Sender -> sequence number from which on its echoes count."""
+        """Sender -> least sequence number of a challenge. Echoes of this sender to earlier challenges do not count."""
 
     @property
     def is_due(self) -> bool:
@@ -69,7 +71,7 @@ class PendingChallenges:
         return is_newest and sequence >= self._closed.get(sender, 0)
 
     def close(self, sender: int, next_sequence: int) -> None:
-        """Count echoes of this sender only to challenges from this sequence number on."""
+        """From now on, ignore echoes of this sender to challenges with a lower sequence number than this one."""
         self._closed[sender] = next_sequence
 
 

@@ -1,17 +1,18 @@
 """Epochs of the group secret: periods of mission time, each with its own secret.
 
 Mission time is divided into epochs. A one-way function computes the group secret of an epoch from the secret of the
-epoch before it. A vehicle keeps the secrets of the clock's epoch and of the one before, and erases older ones. An
-attacker who captures the vehicle therefore cannot decrypt older datagrams.
+epoch before it. A vehicle keeps the secrets of its clock's present epoch and of the epoch before, and erases older
+secrets. An attacker who captures the vehicle therefore cannot decrypt older datagrams.
 
 The clocks of the vehicles need not agree, and the clock of a vehicle may be lost after a reboot:
 
-- Only the vehicle's own clock erases secrets. The clock's epoch is at least that of the bundle, plus the time since the
-  start. A clock that shows 1970 therefore does not take the vehicle back.
-- A vehicle opens datagrams of any epoch up to `MAX_EPOCHS_AHEAD` after its clock's. They do not move its clock.
-- A vehicle sends in the latest epoch that it has received, so that vehicles with a faster clock can open its
-  datagrams. It follows others up to `MAX_EPOCHS_FOLLOWED` epochs only. An attacker with the keys of one vehicle can
-  thus make others send in a later epoch, but all vehicles can still open their datagrams.
+- Only the vehicle's own clock erases secrets. The epoch of a clock that was set back is wrong. The vehicle therefore
+  never uses an epoch before the epoch of its bundle plus the number of epochs since its start.
+- A vehicle opens datagrams of any epoch up to `MAX_EPOCHS_AHEAD` epochs after its clock's epoch. Such datagrams do not
+  change its clock.
+- A vehicle sends in the latest epoch that it has received, so that vehicles with a faster clock can open its datagrams.
+  It is never more than `MAX_EPOCHS_FOLLOWED` epochs ahead of its own clock. An attacker with the keys of one vehicle
+  can therefore make other vehicles send in a later epoch, but all vehicles can still open their datagrams.
 """
 
 import math
@@ -51,7 +52,9 @@ class EpochSecrets:
         self._previous_secret: bytes | None = None
         """The secret of the epoch before the clock's epoch. None if this incarnation never had it."""
         self._later: deque[bytes] = deque()
-        """The secrets of epochs after the clock's epoch, as far as datagrams required them."""
+        """The secrets of the epochs after the clock's epoch, in order. They are computed only when a datagram of such
+        an epoch arrives.
+        """
         self._followed = 0
         self._started_s: float | None = None
         self._until_s = -math.inf

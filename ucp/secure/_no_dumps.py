@@ -10,7 +10,7 @@ def forbid_core_dumps() -> None:
     """Let the kernel write no core dump of this process, neither to a file nor to a program, and deny access to its
     memory to other programs of the user.
 
-    Programs that it starts are limited to core dumps of no size.
+    Programs that the process starts can write only empty core dumps.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_CORE)
     resource.setrlimit(resource.RLIMIT_CORE, (0, hard))

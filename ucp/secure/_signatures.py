@@ -36,7 +36,7 @@ class BlockSignatures:
         return self._by_hash
 
     def is_genuine(self, block: Block, signature: bytes) -> bool:
-        """Return whether the agent named in the block has signed it. Keep a valid signature.
+        """Return whether the block has a valid signature of the agent that the block names. Keep a valid signature.
 
         The agent must be on the roster.
         """

@@ -1,7 +1,7 @@
 """The sequence numbers that a receiver has accepted from a sender: the sliding window of RFC 6479.
 
-The window is a ring of machine words, one more than its size requires. It moves on by clearing whole words, and never
-shifts a bit.
+The window is a ring of machine words. It has one word more than its size requires. To move the window, the receiver
+clears whole words and never shifts bits.
 """
 
 WINDOW = 1024

@@ -88,8 +88,8 @@ class PublicKeys:
 class Bundle:
     """The keys of one vehicle: the public keys, its private key, and the group secret of epoch `epoch`.
 
-    `started_us` is the start of the last incarnation with this bundle, in microseconds UTC. It is None if no agent has
-    used the bundle.
+    `started_us` is the time at which the last incarnation with this bundle started, in microseconds since the Unix
+    epoch (UTC). It is None if no agent has used the bundle.
     """
 
     public: PublicKeys

@@ -49,13 +49,15 @@ NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
 """Type of a message -> its name."""
 
 REQUEST_FIELDS = {"request_sender": FieldKind.U32, "request_boot": FieldKind.BOOT, "request_sequence": FieldKind.U32}
-"""Fields that identify the request that a response answers. They are encrypted in front of the response's body."""
+"""Fields that identify the request that a response answers. They come before the response's body, and are encrypted
+with it.
+"""
 REQUEST = struct_of(REQUEST_FIELDS)
 REQUEST_OF = {2: 1, 5: 4, 7: 6, 9: 8}
 """Type of a response -> type of the request that it answers."""
 REQUESTS = frozenset(REQUEST_OF.values())
 WITH_BLOCK = frozenset((3, 9))
-"""Types of the messages that carry a block. The signature of the block is encrypted after the block."""
+"""Types of the messages that carry a block. The signature of the block follows the block, and is encrypted with it."""
 
 
 class ClearHeader(NamedTuple):
@@ -111,7 +113,7 @@ ADDED_BYTES: dict[str, int] = {
     + (SIGNATURE_BYTES if code in WITH_BLOCK else 0)
     for message, code in TYPE_CODES.items()
 }
-"""Name of a message -> number of additional bytes in its secured datagram."""
+"""Name of a message -> number of bytes by which its secured datagram is longer than its plain datagram."""
 
 
 def sealed_bytes(message: Message) -> int:

@@ -1,8 +1,8 @@
 """The signed head of a chain export, which protects the whole export against changes.
 
 Signatures of blocks cover neither the order nor the number of blocks. The head covers both, and all other content of
-the export: a reader of the export recomputes the head's values and verifies the vehicle's signature. An attacker
-without the vehicle's private key can therefore alter nothing in its export.
+the export. A reader of the export computes the values of the head again, and verifies the vehicle's signature of the
+head. An attacker without the vehicle's private key can therefore alter nothing in its export.
 
 `boot` and `number` order the exports of a vehicle, even if its clock was set back.
 """

@@ -1,7 +1,8 @@
 """Read and write files with keys.
 
 A key file is JSON of limited size. A secret file that other users can read is rejected. A file is written completely or
-not at all. Error messages never show the value of a key: they name its place and the permitted format.
+not at all. Error messages never show the value of a key. They name the key's place in the file and the permitted
+format.
 """
 
 import contextlib

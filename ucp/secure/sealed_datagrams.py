@@ -1,6 +1,6 @@
 """Functions that decrypt and parse a sealed datagram. Their results depend only on bytes and keys, not on a receiver.
 
-A process that plays many vehicles may therefore cache the results for all of them (`CryptoFunctions`). Each session
+A process that simulates many vehicles may therefore cache the results for all of them (`CryptoFunctions`). Each session
 decides on its own whether a datagram is fresh, answers a request, and comes from a sender that is not revoked.
 """
 
@@ -36,7 +36,7 @@ class AnsweredRequest(NamedTuple):
 
 
 NO_REQUEST = AnsweredRequest(0, bytes(BOOT_BYTES), 0)
-"""The value in a response that answers no request. No real request has the sender 0."""
+"""The value that a response contains if it answers no request. No real request has the sender 0."""
 
 
 class OpenedDatagram(NamedTuple):
@@ -45,14 +45,14 @@ class OpenedDatagram(NamedTuple):
     clear: ClearHeader
     datagram: Datagram
     recorded: RecordedBytes
-    """The trace records this plain datagram (version 1) with the same content."""
+    """The plain datagram (version 1) with the same content. The trace records it."""
     request: AnsweredRequest | None
     """The request that this datagram answers. None if it is not a response."""
     block_signature: bytes
 
 
 def signing_domain(mission: bytes) -> bytes:
-    """Return the mission's prefix of all signed bytes: a tag, and the mission ID."""
+    """Return the bytes that precede all signed datagrams of this mission: a tag, and the mission ID."""
     return _DATAGRAM + mission
 
 

@@ -1,4 +1,5 @@
-"""Seal event data so that only the depot can read it. The vehicles that carry it, and their captors, cannot.
+"""Seal event data so that only the depot can read it. The vehicles that carry the data cannot read it, and neither can
+attackers that capture a vehicle.
 
 Sealing is HPKE (RFC 9180) in base mode: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, and one message per
 key. `info` contains mission, agent and timestamp, so sealed data of one block is not valid in another block.

@@ -1,9 +1,8 @@
-"""An agent of a secured mission. It has the interface of `Agent`, and seals and opens its datagrams.
-
-The handlers of the protocol do not change. They receive a message only if it is authentic and fresh, and its sender is
-not revoked. If the message carries a block, the block's maker has signed it. If the message is a response, it answers
-the newest known request of its type. A new revocation is stored and forwarded. All other datagrams are counted in
-`dropped` and change no state of the agent.
+"""An agent of a secured mission. It has the interface of `Agent`, and seals and opens its datagrams. The handlers of
+the protocol do not change. They receive a message only if the message is authentic and fresh, and its sender is not
+revoked. If the message carries a block, the agent that completed the block must have signed it. If the message is a
+response, it must answer the newest known request of its type. A new revocation is stored and forwarded. All other
+datagrams are counted in `dropped` and change no state of the agent.
 
 The trace contains datagrams in their plain form, so the harness reads and judges it like any other trace. Only dropped
 datagrams are recorded as they were received.
@@ -239,7 +238,9 @@ class SecuredAgent(Agent):
 
     @property
     def started_us(self) -> int:
-        """The start of this incarnation in microseconds UTC, as its datagrams contain it."""
+        """The time at which this incarnation started, in microseconds since the Unix epoch (UTC). Its datagrams contain
+        this time.
+        """
         (started_us,) = _BOOT_TIME.unpack_from(self.session.boot)
         return int(started_us)
 

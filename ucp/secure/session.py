@@ -1,10 +1,10 @@
 """Seal and open the datagrams of one incarnation of a vehicle.
 
-The construction follows Group OSCORE (RFC 10021). The sender signs the datagram, derives its own key from the group
-secret, and encrypts and authenticates datagram and signature with it (AEAD). Because of the signature, a vehicle with
-the group secret cannot send in the name of another vehicle. Because the encryption covers the signature, a sender
-without the group secret cannot make a receiver verify one. Each datagram contains all data that a receiver needs, so
-there are no round trips.
+The construction follows Group OSCORE (RFC 10021). The sender signs the datagram, and derives a key of its own from the
+group secret. With this key it encrypts and authenticates the datagram and the signature (AEAD). Because of the
+signature, a vehicle with the group secret cannot send in the name of another vehicle. Because the encryption covers the
+signature, a sender without the group secret cannot make a receiver verify one. Each datagram contains all data that a
+receiver needs, so there are no round trips.
 
 A receiver does its cheapest checks first. A datagram changes no state of the session before its signature is verified.
 """
@@ -45,16 +45,17 @@ from ucp.secure.sealed_datagrams import (
 )
 
 WRONG_SIGNATURES_PER_S = 1000.0
-"""Wrong signatures of senders that a receiver verifies per mission second. Their verification takes a tenth of a
-processor core.
+"""Maximum number of wrong signatures of all senders that a receiver verifies per mission second. The verification takes
+a tenth of a processor core.
 """
 REVOCATIONS_PER_S = 50.0
-"""Wrong signatures of the authority that a receiver verifies per mission second."""
+"""Maximum number of wrong signatures of the authority that a receiver verifies per mission second."""
 WRONG_SIGNATURES_AT_ONCE = 32
 """Maximum number of tokens of a budget for wrong signatures."""
 UNKNOWN_BOOTS_PER_S = 5000.0
-"""Datagrams of unknown boots whose keys a receiver derives per mission second. A radio with 6 Mbit/s carries fewer
-datagrams. They take a twentieth of a processor core."""
+"""Maximum number of datagrams of unknown boots per mission second whose keys a receiver derives. A radio with 6 Mbit/s
+carries fewer datagrams. The derivation takes a twentieth of a processor core.
+"""
 UNKNOWN_BOOTS_AT_ONCE = 1000
 """Maximum number of tokens of the budget for unknown boots."""
 
@@ -81,8 +82,9 @@ class Session:
     """The keys and counters with which one incarnation of a vehicle seals and opens datagrams.
 
     `boot` consists of the incarnation's start in microseconds UTC (8 bytes) and 8 random bytes. `save_bundle` is called
-    with the new bundle at once, so that a later incarnation knows of this one, and after each change of the epoch.
-    If `has_budgets` is false, the number of wrong signatures and of unknown boots has no limit.
+    with the new bundle immediately, so that a later incarnation can detect this incarnation. It is called again after
+    each change of the epoch. If `has_budgets` is false, the number of wrong signatures and of unknown boots has no
+    limit.
     """
 
     def __init__(
@@ -110,10 +112,11 @@ class Session:
         before the start.
         """
         self._held: dict[int, _SenderIncarnation] = {}
-        """The boots of senders that have answered a challenge but that this vehicle does not trust yet."""
+        """Sender -> its incarnation. These senders have answered a challenge, but this vehicle does not trust them yet.
+        """
         self._challenged_by = {agent_id: ReceivedChallenges() for agent_id in self.public_keys}
         self._echoes: list[AnsweredRequest] = []
-        """The challenges that this vehicle still has to answer."""
+        """The received challenges that this vehicle still has to answer."""
         self._next_sequence = 0
         """The sequence number after the greatest one that this vehicle has used."""
         self._domain = signing_domain(self.mission)
@@ -340,7 +343,7 @@ class Session:
     ) -> tuple[SenderKeys, bytes, UnverifiedSignature]:
         """Return keys, body and unverified signature of a datagram.
 
-        Raises MalformedDatagramError for a wrong tag, and without a token for its keys.
+        Raises MalformedDatagramError if the tag is wrong, or if the budget has no token to derive the keys.
         """
         keys = self._keys_of(clear, now)
         return keys, *self.crypto.decrypt(keys, datagram, clear, self._domain, self.public_keys[clear.sender])
@@ -361,8 +364,8 @@ class Session:
         self._budgets[sender].take()
 
     def is_newest_request(self, request: AnsweredRequest, code: int) -> bool:
-        """Return true if a response of type `code` to this request counts. It does not count if a newer request of the
-        same type and sender is known.
+        """Return true if a response of type `code` to this request counts. The response does not count if a newer
+        request of the same type and sender is known.
 
         If this vehicle sent the request, it must be the newest request of this vehicle. If another vehicle sent the
         request, this vehicle need not have received it.

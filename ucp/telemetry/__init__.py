@@ -1,4 +1,4 @@
-"""The event source `mavlink`: it converts the MAVLink telemetry of a vehicle to loggable events.
+"""The event source `mavlink`. It converts the MAVLink telemetry of a vehicle to loggable events.
 
 `TelemetryEvents` translates the bytes of a vehicle into pairs of event ID and data. It does no I/O, and its methods
 take the time as an argument. `VehicleConnection` connects to the vehicle and passes its bytes to the translator.
@@ -22,23 +22,23 @@ Vehicle time is the number of milliseconds since the vehicle's boot, by the vehi
 simulated time. A mode is ArduPilot's custom_mode. One position in 10 s fills about nine blocks of 1024 bytes in the 20
 minutes of the thesis's mission.
 
-A position is an event only while the vehicle reports a good estimate (MAV_SYS_STATUS_AHRS of SYS_STATUS). For some
-seconds after its boot, ArduPlane reports a position near 0 N, 0 E with a bad estimate.
+The translator logs a position only while the vehicle reports a good position estimate (MAV_SYS_STATUS_AHRS of
+SYS_STATUS). For some seconds after its boot, ArduPlane reports a position near 0 N, 0 E with a bad estimate.
 
-While ArduPilot cannot be armed, it repeats the reasons every 30 s as texts `PreArm: ...`. Each such text is an event
-once, until the mode or the arming changes.
+While ArduPilot cannot be armed, it repeats the reasons every 30 s as texts `PreArm: ...`. The translator makes an event
+of each such text only once, until the mode changes or the vehicle is armed or disarmed.
 
-Failsafes are read from fields, not from texts. While a failsafe acts (radio, battery, ground station, EKF, terrain,
-dead reckoning), ArduPilot's HEARTBEAT has the state MAV_STATE_CRITICAL. A crashed plane has MAV_STATE_EMERGENCY. Bits
-of MAV_SYS_STATUS_SENSOR in SYS_STATUS that are enabled and unhealthy name the failed sensors: RC receiver, battery,
-compass, GPS, geofence, and AHRS, the estimate of attitude and position. A breached geofence or a lost compass does not
-make the state critical. The bits count only while the vehicle is armed or its state is critical, because the estimate
-is not healthy before a flight. Each change of state or sensors is an event, and so is the end of the failsafe. A
-failsafe of the ground station has no bit. To see its name, log `text` too.
+The translator detects failsafes from message fields, not from texts. While a failsafe acts (radio, battery, ground
+station, EKF, terrain, dead reckoning), ArduPilot's HEARTBEAT has the state MAV_STATE_CRITICAL. A crashed plane has
+MAV_STATE_EMERGENCY. Bits of MAV_SYS_STATUS_SENSOR in SYS_STATUS that are enabled and unhealthy name the failed sensors:
+RC receiver, battery, compass, GPS, geofence, and AHRS, the estimate of attitude and position. A breached geofence or a
+lost compass does not make the state critical. The bits count only while the vehicle is armed or its state is critical,
+because the estimate is not healthy before a flight. Each change of state or sensors is an event, and so is the end of
+the failsafe. A failsafe of the ground station has no bit. To see its name, log `text` too.
 
 Battery levels are multiples of 10 %, and below 20 % also multiples of 5 %. The event occurs at the first known charge,
-if the charge falls to a level, and if the battery was charged or changed. A vehicle that does not report its percentage
-has no battery levels. Its battery failsafe is event 7.
+if the charge falls to a level, and if the battery was charged or changed. If a vehicle does not report its charge in
+percent, there are no events of battery levels. Its battery failsafe is still an event with ID 7.
 """
 
 from ucp.events import DEFAULT_LOG, EventKind

@@ -10,10 +10,9 @@ from ucp.loop import Loop, ScheduledCall
 MAX_READ_BYTES = 65536
 
 _REQUESTED = {33: 1.0, 30: 1.0, 1: 2.0, 2: 2.0, 42: 1.0}
-"""Message ID -> requested interval in simulated seconds.
-
-ArduPilot sends HEARTBEAT, STATUSTEXT and MISSION_ITEM_REACHED without a request. If an interval were requested,
-ArduPilot would repeat the last MISSION_ITEM_REACHED.
+"""Message ID -> requested interval in simulated seconds. ArduPilot sends HEARTBEAT, STATUSTEXT and MISSION_ITEM_REACHED
+without a request. After a request for MISSION_ITEM_REACHED, ArduPilot would also repeat the last of these messages at
+intervals.
 """
 _SET_MESSAGE_INTERVAL = 511  # MAV_CMD_SET_MESSAGE_INTERVAL
 
@@ -26,8 +25,8 @@ _FIRST_REQUEST_S, _LAST_REQUEST_S = 1.0, 30.0
 class VehicleConnection:
     """A connection to the vehicle at `host`:`port`. It passes all received bytes to `sink` until `close` is called.
 
-    It tries to connect until the vehicle accepts, requests the messages that `TelemetryEvents` needs, and connects
-    again after a restart of the vehicle.
+    The object tries to connect until the vehicle accepts. It then requests the messages that `TelemetryEvents` needs.
+    It connects again after a restart of the vehicle.
     """
 
     def __init__(self, loop: Loop, host: str, port: int, sink: Callable[[bytes], object]) -> None:

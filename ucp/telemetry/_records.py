@@ -1,4 +1,6 @@
-"""Event IDs of the `mavlink` source, and the layout of their data. A table is in the docstring of the package."""
+"""Event IDs of the `mavlink` source, and the layout of the data of each event. The docstring of the package contains a
+table of them.
+"""
 
 import struct
 from typing import NamedTuple
@@ -78,7 +80,9 @@ class Position(NamedTuple):
 
 
 def position_of(event_id: int, data: bytes) -> Position | None:
-    """Return the position in an event. Return None if it is another event, cannot be read, or is out of range."""
+    """Return the position in an event. Return None if the event is no position event, if its data cannot be parsed, or
+    if the position is out of range.
+    """
     if event_id != POSITION:
         return None
     try:

@@ -32,9 +32,9 @@ class TelemetryEvents:
     def __init__(self, position_interval_s: float, rng: random.Random, log: Iterable[EventKind] = DEFAULT_LOG) -> None:
         """Create the converter. At first, no flight mode and no position are known.
 
-        `position_interval_s` is the mean time between two position events in mission seconds. Each interval is drawn
-        from `rng` between 0.5 and 1.5 times the mean. With equal intervals, all vehicles would complete their blocks at
-        the same moment, unlike real swarms. `log` lists the kinds of events to log.
+        `position_interval_s` is the mean time between two position events in mission seconds. Each interval is a random
+        time from 0.5 to 1.5 times the mean, drawn from `rng`. If all intervals were equal, all vehicles would complete
+        their blocks at the same moment, unlike real swarms. `log` lists the kinds of events to log.
         """
         from pymavlink.dialects.v20 import common  # an agent without a vehicle need not load it
 
@@ -173,8 +173,8 @@ class TelemetryEvents:
         """Add an event: the vehicle reached an item of its mission.
 
         ArduPilot 4.7 reports the last command after the reached waypoint, for example a change of speed. The event
-        therefore has the number of the current item of MISSION_CURRENT if it is lower. Item 0 is home. It is the
-        current item before the mission begins, when no item has been reached.
+        therefore has the number of the current item in MISSION_CURRENT if this number is lower. Item 0 is home. If the
+        current item is 0, the mission has not begun, and the vehicle has reached no item.
         """
         item = reached if self._next_item is None else min(self._next_item, reached)
         self._next_item = None
@@ -231,14 +231,15 @@ class TelemetryEvents:
 
 
 class _HomeError:
-    """The error of a vehicle's height above its home position, computed from its first good position.
+    """The error in the height above home that a vehicle reports. It is computed from the first good position of the
+    vehicle.
 
     A rover of ArduPilot 4.7 sets its home before it knows its altitude, and afterwards reports a height of 584 m above
     home.
     """
 
     def __init__(self, message: Any, on_ground: bool) -> None:
-        """Compute the error. `on_ground` is true if the vehicle is not armed or cannot fly."""
+        """Compute the error from this position. `on_ground` is true if the vehicle is not armed or cannot fly."""
         self._home_mm = message.alt - message.relative_alt
         self._error_mm = message.relative_alt if on_ground and abs(message.relative_alt) > _HOME_ERROR_MM else 0
 
@@ -252,5 +253,7 @@ class _HomeError:
 
 
 def _thousandths(value: float) -> int:
-    """Return the value times 1000 as a signed 16-bit number. Values out of range are limited, and NaN becomes 0."""
+    """Return the value times 1000 as a signed 16-bit number. A value out of range becomes the nearest number in range.
+    NaN becomes 0.
+    """
     return 0 if math.isnan(value) else round(max(-32.768, min(32.767, value)) * 1000)

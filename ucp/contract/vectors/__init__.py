@@ -1,8 +1,9 @@
 """Test vectors of the agent contract: inputs with the correct outputs. `python -m ucp.contract.vectors` writes the
 files.
 
-The vectors cover hashes, messages, dropped datagrams, full blocks, refused missions and requests, secured datagrams
-(they need the extra `secure`), and complete missions in virtual time.
+The vectors cover hashes, messages, dropped datagrams, full blocks, refused missions and requests, secured datagrams,
+and complete missions in virtual time. To write the vectors of secured datagrams, Python needs the packages of the extra
+`secure`.
 """
 
 import base64
@@ -41,7 +42,7 @@ DOCUMENTS: dict[str, Callable[[], Any]] = {
 
 MISSIONS = DIRECTORY / "missions"
 INDEX = MISSIONS / "index.json"
-"""The list of all recorded missions, with name, description and needed features."""
+"""The file that lists all recorded missions, with their descriptions and the features that they need."""
 
 
 def texts() -> dict[Path, str]:

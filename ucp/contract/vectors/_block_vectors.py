@@ -43,7 +43,9 @@ CASES: tuple[tuple[str, Settings, list[LoggableEvent]], ...] = (
 
 
 def vectors() -> list[dict[str, Any]]:
-    """Return the test vectors. Each event has its branch of Algorithm 1, and the block that it completes or null."""
+    """Return the test vectors. For each event, a vector contains the branch that Algorithm 1 takes, and the block that
+    the event completes. If the event completes no block, the vector contains null.
+    """
     return [
         {
             "what": what,

@@ -1,4 +1,6 @@
-"""Record example missions of one agent: a function gives inputs to an agent, and the inputs and outputs are stored."""
+"""Record example missions of one agent. A function gives inputs to the agent, and this module stores the inputs and the
+outputs.
+"""
 
 import base64
 import json
@@ -35,7 +37,8 @@ class RecordedMission:
     """A recorded mission of agent 7. `exchanges` contains each input with its outputs.
 
     Times are mission seconds of the agent, and `now` is the time of the last input. The function that records the
-    mission plays the other agents. All of them share one counter of sequence numbers, which the protocol does not use.
+    mission sends the messages of the other agents. Their datagrams share one counter of sequence numbers, because the
+    protocol does not use these numbers.
     """
 
     initial_data = INITIAL_DATA
@@ -84,8 +87,8 @@ class RecordedMission:
         return {}
 
     def log(self, data_bytes: int = 256, *, after_s: float = 1.0, event_id: int = 5) -> None:
-        """Log an event with `data_bytes` bytes of data. All methods with `after_s` first let this number of mission
-        seconds pass.
+        """Log an event with `data_bytes` bytes of data. Like every method with the argument `after_s`, the method first
+        lets this number of mission seconds pass.
         """
         self.now += after_s
         timestamp_us = self._epoch_us + round(self.now * MICROSECONDS)
@@ -93,7 +96,7 @@ class RecordedMission:
         self._exchange({"event_id": event_id, "data": in_base64(data), "timestamp_us": timestamp_us})
 
     def complete_a_block(self) -> None:
-        """Log three events of the largest size, which together complete a block."""
+        """Log three events of the largest size. Together they complete a block."""
         for _ in range(3):
             self.log()
 

@@ -28,7 +28,7 @@ NOW_US = 1_795_260_078_064_591
 
 
 def session(agent_id: int, keys: KeySet = KEYS) -> Session:
-    """Return the session of an agent in the epoch of the test vectors."""
+    """Create the session of an agent at the time of the test vectors."""
     begun = Session(keys.bundle(agent_id), BOOT)
     begun.set_clock(0.0)
     begun.set_clock(NOW)

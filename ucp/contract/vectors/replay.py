@@ -2,7 +2,7 @@
 COMMAND...`.
 
 The agent is started once, as `COMMAND... --virtual`, and plays all transcripts in turn. The program prints the first
-difference of each transcript with its line. The exit status is 0 without a difference, and 1 otherwise.
+difference of each transcript with its line. The exit status is 0 if there is no difference, and 1 otherwise.
 """
 
 import json

@@ -101,7 +101,7 @@ class Block:
 
 
 class Agent:
-    """The protocol without input and output: handlers, timers, and the datagrams to send."""
+    """The protocol without input and output. The object has the handlers, the timers, and the datagrams to send."""
 
     def __init__(self, agent_id, roster, initial_data, settings):
         self.id, self.roster, self.settings, self.initial = agent_id, roster, settings, initial_data
@@ -148,7 +148,7 @@ class Agent:
             self.run(getattr(self, "expire_" + name.replace(" ", "_")))
 
     def receive(self, data):
-        """Handle a datagram of another address."""
+        """Handle a datagram that arrived from another address."""
         reason = self.drop_reason(data)
         if reason:
             self.dropped[reason] = self.dropped.get(reason, 0) + 1
@@ -374,7 +374,7 @@ class Agent:
 
 
 class Mission:
-    """The mission file, checked."""
+    """The settings from a mission file that was checked."""
 
     def __init__(self, text):
         try:
@@ -519,7 +519,9 @@ class Program:
         return self.agent.now
 
     def wait_ms(self):
-        """Return the wall milliseconds until the next timer or trial, at most 1000."""
+        """Return the milliseconds of wall time until the next timer expires or the next random event is tried, at most
+        1000.
+        """
         if not self.started:
             return 1000
         times = list(self.agent.deadlines.values())
@@ -572,7 +574,7 @@ class Program:
         self.agent.out = []
 
     def log_random(self):
-        """Make the trials of Algorithm 21 that are due."""
+        """Try random events as Algorithm 21 does, once for each second that has passed."""
         while self.logs and self.next_trial is not None and self.next_trial <= self.agent.now:
             self.next_trial += 1000000
             if random.random() < 1 / self.mission.mean_s:

@@ -1,8 +1,8 @@
 """A UCP agent as a ROS 2 node: python ucp_node.py MISSION_FILE (docs/how-to/run-a-ros-node.md).
 
-The node runs the harness's own agent in the main loop of rclpy: ROS timers and a ROS executor drive it. It receives its
-events as ROS messages. The datagrams of UCP stay UDP broadcasts to other vehicles, and ROS messages stay on this
-vehicle.
+The node runs the harness's own agent in the main loop of rclpy. A ROS executor and ROS timers call the agent. It
+receives its events as ROS messages. The datagrams of UCP stay UDP broadcasts to other vehicles, and ROS messages stay
+on this vehicle.
 
     ~/event   in   std_msgs/UInt8MultiArray   an event to log: its ID (1..254), then its data
     ~/status  out  std_msgs/String            the answer of the control socket to `status`, in JSON, every second
