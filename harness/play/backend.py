@@ -1,4 +1,4 @@
-"""Define the interface of a backend, the part of the harness that plays a scenario.
+"""Define the interface of a backend, the part of the harness that runs a scenario.
 
 Code that treats backends differently reads one of the properties defined here, and never compares names of backends. A
 new backend needs a folder here, its name in `harness.backend_names`, and an entry in the table `harness.play.backends`.
@@ -19,7 +19,7 @@ from harness.scenario import Scenario
 
 
 class Backend(ABC):
-    """A backend: a way to play scenarios, for example as processes or in virtual time."""
+    """A backend: a way to run scenarios, for example as processes or in virtual time."""
 
     name: ClassVar[BackendName]
     virtual_time: ClassVar[bool] = False
@@ -36,10 +36,10 @@ class Backend(ABC):
 
     @abstractmethod
     def refuse(self, scenario: Scenario) -> None:
-        """Raise HarnessError if this backend or this machine cannot play the scenario. The message names a solution."""
+        """Raise HarnessError if this backend or this machine cannot run the scenario. The message names a solution."""
 
     def remark(self, scenario: Scenario) -> str | None:
-        """Return a sentence about a part of the scenario that this backend plays differently from other backends.
+        """Return a sentence about a part of the scenario that this backend treats differently from other backends.
         Return None if there is no such part.
         """
         return None

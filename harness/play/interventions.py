@@ -10,9 +10,9 @@ of the run.
 
 A request is an entry of the scenario's timeline without `at_s`, because the run executes it at once. The code that
 checks and applies entries of a scenario also handles requests. The timeline in run.json then contains the entry, and
-the record of its fault has the mark `by_hand`. `replay.yaml` in the run directory plays the whole run again. A lasting
-request ends an earlier temporary change of the same conditions. An impossible request raises ScenarioError and changes
-nothing. Each request gets an answer, at the latest when the run ends.
+the record of its fault has the mark `by_hand`. The scenario `replay.yaml` in the run directory repeats the whole run. A
+lasting request ends an earlier temporary change of the same conditions. An impossible request raises ScenarioError and
+changes nothing. Each request gets an answer, at the latest when the run ends.
 """
 
 import asyncio

@@ -15,7 +15,7 @@ of the agents, and the function of the reference that judges them.
 
 A variant replaces entries in the tables of `ucp.agent`, as if its user had edited `ucp/`. All users of the tables then
 have the variant: every backend, the prover and the conformance test. The alternative was to pass a variant through all
-of these layers. This would change each of them, and a layer that does not pass it on would play the original protocol
+of these layers. This would change each of them, and a layer that does not pass it on would use the original protocol
 without an error.
 
 The file is code of the user. It is loaded only if the user names it, never because a record names it.

@@ -1,7 +1,7 @@
 """Send the recorded inputs of one agent to a different agent program over UDP, and compare its messages with the
 recorded ones.
 
-The agent runs in a lab with one other node, which plays all its peers. This node sends the datagrams that the peers
+The agent runs in a lab with one other node, which simulates all its peers. This node sends the datagrams that the peers
 sent according to the record, at the same times.
 
 The agent contract has no command to log an event, so the agent program cannot log the recorded events. Instead, a peer
@@ -55,8 +55,8 @@ from ucp.trace import DroppedDatagram, HandlerRun, RecordedBytes, in_base64
 from ucp.trigger import LocalTrigger, MessageTrigger, OperatorTrigger
 
 START_DELAY_S = 2.0
-"""Seconds of wall time between the start of the programs and mission second 0. The program that plays the peers needs
-this time to start.
+"""Seconds of wall time between the start of the programs and mission second 0. The program that simulates the peers
+needs this time to start.
 """
 SLACK_S, SLACK_WALL_S = 1.0, 0.15
 """Maximum difference between the time of a message and its recorded time. The first value is in mission seconds, the

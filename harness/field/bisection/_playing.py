@@ -1,4 +1,4 @@
-"""Play a scenario or record with the code of another commit, or with another agent program."""
+"""Run a scenario or replay a record with the code of another commit, or with another agent program."""
 
 import json
 import shlex
@@ -26,7 +26,7 @@ from harness.scenario import Scenario
 SPEEDUP = 20.0
 """Mission seconds per second of wall time when an agent program replays a record."""
 RECORD_CORE = "harness.field.bisection._record_core"
-"""The module that plays records with the tested core. The harness starts it as a process."""
+"""The module that replays records with the tested core. The harness starts it as a process."""
 CODE = "{code}"
 """A placeholder in an agent command. The harness replaces it by the path of the directory with the code of a commit."""
 
@@ -36,12 +36,12 @@ class UntestableError(HarnessError):
 
 
 class SubjectPlayer:
-    """An object that plays one scenario or record with the code of several commits. Each commit gets a separate
-    directory inside `directory`, and at most `limit_s` seconds.
+    """An object that runs one scenario, or replays one record, with the code of several commits. Each commit gets a
+    separate directory inside `directory`, and at most `limit_s` seconds.
 
-    Without `command`, the code of the commit plays a scenario in virtual time, and the agent core of the commit plays
-    records. With `command`, the installed harness starts agent processes with this command. They play the scenario, or
-    the record of one agent.
+    Without `command`, the code of the commit runs a scenario in virtual time, and the agent core of the commit replays
+    records. With `command`, the installed harness starts agent processes with this command. These processes run the
+    scenario, or replay the record of one agent.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class SubjectPlayer:
         return self.subject.scenario is not None and self._command is None
 
     def play(self, code: Path) -> tuple[Outcome, Path]:
-        """Play the scenario or the record with the code in the directory `code`. Return the result and the run
+        """Run the scenario or replay the record with the code in the directory `code`. Return the result and the run
         directory.
 
         Raises UntestableError.
@@ -191,7 +191,7 @@ class SubjectPlayer:
 
 
 class MachineCannotError(HarnessError):
-    """An error: this machine cannot play the scenario or record, regardless of the commit."""
+    """An error: this machine cannot run the scenario or replay the record with any commit."""
 
     exit_status = CANNOT_HERE
 

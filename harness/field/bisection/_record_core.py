@@ -1,4 +1,4 @@
-"""Play records with the agent core of another commit: `python -m harness.field.bisection._record_core PATH [AGENT]`.
+"""Replay records with the agent core of another commit: `python -m harness.field.bisection._record_core PATH [AGENT]`.
 
 The caller puts the `ucp` package of that commit first in the module path. The process prints one JSON document with the
 differences between core and record, by agent and in the order of the record.
@@ -21,7 +21,7 @@ MAX_DIFFERENCES = 10_000
 
 def differences(path: Path, agent: int | None) -> list[dict[str, Any]]:
     """Return the differences between the agent core and the record at `path`. Raises HarnessError if the record cannot
-    be played.
+    be replayed.
     """
     record = open_record(path, agent)
     result, names = RecordPlayer(record, implementation=IN_USE).to_end(), ReplayNames(record)

@@ -1,4 +1,4 @@
-"""Play the peers of one agent: `python -m harness.field.bisection._scripted_peers SCRIPT HEARD EPOCH_US SPEEDUP`.
+"""Simulate the peers of one agent: `python -m harness.field.bisection._scripted_peers SCRIPT HEARD EPOCH_US SPEEDUP`.
 
 Each line of SCRIPT is a datagram to send, `{"t": mission seconds, "datagram": base64}`, in order of time. An agent
 process is some milliseconds later than in the record, and during a reconcile this delay grows. With fixed sending

@@ -1,4 +1,4 @@
-"""Define the subject of a bisection (a scenario or records), the result of playing the subject once, and the
+"""Define the subject of a bisection (a scenario or records), the result of one run or replay of the subject, and the
 differences between two results.
 """
 
@@ -51,7 +51,7 @@ class AgentResult(_OutcomeModel):
 
 
 class Outcome(_OutcomeModel):
-    """The outcome of playing a scenario or record once."""
+    """The outcome of one run of a scenario, or of one replay of records."""
 
     schema_: Literal["ucp-outcome/1"] = "ucp-outcome/1"
     subject: str
@@ -199,7 +199,7 @@ class BisectionSubject:
 
 
 def subject_of(path: Path, seed: int | None, agent: int | None) -> BisectionSubject:
-    """Return the scenario or records at `path`, which the bisection plays.
+    """Return the scenario or records at `path`, which are the subject of the bisection.
 
     A YAML file, the name of an included scenario, and a run directory of virtual time are scenarios. Every other path
     contains records. Raises HarnessError.
@@ -228,7 +228,7 @@ def _is_scenario(path: Path) -> bool:
 
 
 def _played(path: Path) -> tuple[Scenario, int] | None:
-    """Return the scenario and the seed of a run if playing them again gives the same run. Return None otherwise."""
+    """Return the scenario and the seed of a run if they always give the same run. Return None otherwise."""
     record = RunArchive(path).record
     if record.backend != "sim" or record.scenario is None or record.seed is None:
         return None

@@ -1,4 +1,4 @@
-"""Check before a run that this machine can play the scenario in containers."""
+"""Check before a run that this machine can run the scenario in containers."""
 
 import os
 import shutil

@@ -1,7 +1,7 @@
 """Choose names and labels for containers, and remove containers that earlier runs left behind.
 
-A run belongs to the process that plays it, as long as this process exists. Process IDs are reused, so a process is
-identified by boot ID, process ID and start time.
+A run belongs to the process that carries it out, as long as this process exists. Process IDs are reused, so a process
+is identified by boot ID, process ID and start time.
 """
 
 import hashlib

@@ -1,4 +1,4 @@
-"""The workers of a Dask cluster that play the agents of one run.
+"""The workers of a Dask cluster that run the agents of one run.
 
 The run has a secret of its own. Dask hands it to the workers together with the address at which the harness listens.
 Each worker gets one task, which lasts as long as the run. Dask would start the task of a lost worker again. The harness

@@ -76,7 +76,7 @@ def _remove_ended_children() -> None:
 
 
 def _play(inside: int, words: list[str], user_namespace: bool) -> None:
-    """Play one incarnation as the first process of a private network."""
+    """Run one incarnation of an agent as the first process of a private network."""
     os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     far_network.become_first_process(user_namespace=user_namespace)

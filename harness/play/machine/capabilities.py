@@ -1,4 +1,4 @@
-"""Find out which runs this machine can play, and measure how accurately its network applies conditions."""
+"""Find out which runs are possible on this machine, and measure how accurately its network applies conditions."""
 
 import contextlib
 import os

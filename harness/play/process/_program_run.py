@@ -1,8 +1,8 @@
 """Carry out one run with real programs in a private network. The programs are processes or containers.
 
-A run opens the lab, starts the vehicles, the agents and the mission clock, and plays the mission. Meanwhile it watches
-all programs. At the end it exports the chains, stops the programs and closes the lab. A crash, a hang or Ctrl-C ends
-the mission early. The agents that are still alive then export their chains.
+A run opens the lab, starts the vehicles, the agents and the mission clock, and carries out the mission. Meanwhile it
+watches all programs. At the end it exports the chains, stops the programs and closes the lab. A crash, a hang or Ctrl-C
+ends the mission early. The agents that are still alive then export their chains.
 """
 
 import asyncio
@@ -85,7 +85,7 @@ class ProgramRun:
         - `open_lab`: opens a lab of processes or of containers.
         - `keeps_disks`: each agent has a disk with which it can reboot. Otherwise only the agents that the scenario
           reboots with their disk have one.
-        - `hosts`: plays all agents on other computers. By default, the agents run in the lab.
+        - `hosts`: runs all agents on other computers. By default, the agents run in the lab.
         """
         self.scenario = scenario
         self.seed = seed

@@ -1,4 +1,4 @@
-"""Check before a run with processes or containers that this machine can play the scenario."""
+"""Check before a run with processes or containers that this machine can run the scenario."""
 
 import asyncio
 import tempfile
@@ -18,7 +18,7 @@ from netem.tc import may_refuse
 
 
 def refuse_unplayable(scenario: Scenario) -> None:
-    """Raise HarnessError if the scenario needs virtual time, or if this machine cannot play it."""
+    """Raise HarnessError if the scenario needs virtual time, or if this machine cannot run it."""
     refuse_virtual_time_keys(scenario)
     refuse_unsupported_network(scenario)
     choose_vehicles(scenario)

@@ -1,4 +1,4 @@
-"""Play one vehicle of a lab with an agent on another computer.
+"""Connect a vehicle of a lab to an agent that runs on another computer.
 
 The harness starts a *stand-in* in the network of the vehicle, in place of the agent. The stand-in is a program under
 the agent contract. Start, kill, pause, traces, exports, losses, partitions and radio therefore work as for any agent.

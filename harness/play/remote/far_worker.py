@@ -451,7 +451,7 @@ def _other_processes(own: set[int]) -> list[str]:
 
 
 def play(descriptor: int, directory: Path, command: list[str], own_agent: OwnAgent | None = None) -> None:
-    """Play one incarnation of an agent. `descriptor` is the file descriptor of the socket to the process outside the
+    """Run one incarnation of an agent. `descriptor` is the file descriptor of the socket to the process outside the
     private network.
     """
     outside = socket.socket(fileno=descriptor)

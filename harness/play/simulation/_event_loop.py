@@ -1,6 +1,6 @@
 """Run all agents in virtual time: give each agent its inputs in order of time, and deliver the messages of the agents.
 
-Inputs are messages, events to log, and the ends of timers. `simulation.py` plays a mission with this loop.
+Inputs are messages, events to log, and the ends of timers. `simulation.py` carries out a mission with this loop.
 """
 
 import base64
@@ -63,7 +63,7 @@ class EventLoop:
     each receiver decodes the datagram itself, and traces contain the bytes as they were sent.
 
     `interactive`: a user may request injections during the run. `fate_script` creates the object that applies scripted
-    fates. `air` creates the network. `programs` are the programs that play foreign agents.
+    fates. `air` creates the network. `programs` are the programs that run foreign agents.
     """
 
     def __init__(

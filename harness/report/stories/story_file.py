@@ -33,7 +33,7 @@ _ENTRY = re.compile(r"(`?)(timeline|events\.script)\.(\d+)(?:\.|: )")
 INDENT = "    "
 DELAY_S = 0.02
 SPEEDUP = 10.0
-"""Speedup of stories that are played as processes. The speedup is limited, because the sentences of a story may be one
+"""Speedup of stories whose agents run as processes. The speedup is limited, because the sentences of a story may be one
 second apart, and a change of the network takes some milliseconds.
 """
 

@@ -1,7 +1,7 @@
 """Keep a pool of programs that run agents in virtual time.
 
-Starting a program takes longer than playing a short mission, so a pool keeps them for the next mission. Each process
-of the harness has a pool of its own. A forked child starts with an empty pool.
+The start of a program takes longer than a short mission, so a pool keeps programs for the next mission. Each process of
+the harness has a pool of its own. A forked child starts with an empty pool.
 """
 
 import atexit

@@ -47,7 +47,7 @@ class DeterminismCheck:
         """Give an agent's recorded inputs to a program with the same command. Raises NondeterminismError if an answer
         differs from the recorded one.
 
-        The first incarnation of each command gets its inputs twice, so that each process plays more than one
+        The first incarnation of each command gets its inputs twice, so that each process runs more than one
         incarnation.
         """
         used = record.command in self._programs
