@@ -45,19 +45,16 @@ MAX_FAULTS = 500
 
 @dataclass(frozen=True, slots=True)
 class TimelineTable:
-    """The rows of a table. `left_out` is the number of rows that the table omits, because it has at most `MAX_ROWS`
-    rows.
-    """
+    """A table below the timeline."""
 
     rows: list[list[str]]
     left_out: int
+    """Number of rows that the table omits, because it has at most `MAX_ROWS` rows."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """The timeline picture. `messages` is a JSON text, from which the script of the page draws arrows. The text is
-    "null" if the page shows no messages.
-    """
+    """The timeline picture."""
 
     end_s: float
     agents: list[tuple[int, AgentColours]]
@@ -67,6 +64,7 @@ class Timeline:
     charts: list[_timeline_charts.TimelineChart]
     axis: Markup
     messages: str
+    """JSON text from which the script of the page draws arrows. The text is "null" if the page shows no messages."""
     votes: TimelineTable
     reconciles: TimelineTable
 

@@ -62,15 +62,15 @@ class ChainExport:
 
 @dataclass(frozen=True, slots=True)
 class Unusable:
-    """A part of the source file that cannot be used. `why` is a reason that completes a sentence, as in "it has no
-    time". If `of_a_trace` is true, the part may have been a line of a trace, so the trace of agent `agent_id` has a gap
-    at this place. If `agent_id` is None, all traces have a gap at this place.
-    """
+    """A part of the source file that cannot be used."""
 
     why: str
+    """The reason, as a text that completes a sentence, as in "it has no time"."""
     where: int | None = None
     of_a_trace: bool = False
+    """True if the part may have been a line of a trace. The trace then has a gap at this place."""
     agent_id: int | None = None
+    """The agent whose trace has the gap. If it is None, all traces have a gap."""
 
 
 BEGINNING_BYTES = 4096

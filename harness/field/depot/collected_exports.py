@@ -59,15 +59,15 @@ EXPORT_AGAIN = "export it again if you can"
 
 @dataclass(frozen=True)
 class ReadExport:
-    """A chain export and its file. The hashes in `export` are computed from the content of the blocks. `problems` has a
-    sentence for each error. If the file gives a wrong hash for a block, `claims` maps the computed hash to the wrong
-    hash.
-    """
+    """A chain export and its file."""
 
     path: Path
     export: Export
+    """The export. Its hashes are computed from the content of the blocks."""
     problems: list[str]
+    """A sentence for each error in the file."""
     claims: dict[str, str]
+    """The wrong hashes that the file gives for blocks, by the computed hash of the block."""
 
     def blocks(self) -> set[str]:
         """Return the hashes of all blocks in the export."""
@@ -76,15 +76,16 @@ class ReadExport:
 
 @dataclass
 class CollectedExports:
-    """The exports of one mission: the latest export of each agent, and the exports that the same agents made earlier.
-
-    `left_out` has a sentence for each unused file, and `remarks` has further facts about the used files.
-    """
+    """The exports of one mission."""
 
     latest: dict[int, ReadExport]
+    """The latest export of each agent, by agent ID."""
     earlier: list[ReadExport]
+    """The exports that the same agents made earlier."""
     left_out: list[str]
+    """A sentence for each unused file."""
     remarks: list[str]
+    """Sentences with further facts about the used files."""
     roster: set[int] = field(default_factory=set)
     """The IDs of the agents that occur in other files of the mission: mission files, traces, a manifest, or the record
     of the run.

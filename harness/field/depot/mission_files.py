@@ -87,22 +87,24 @@ class MissionFileError(HarnessError):
 
 @dataclass(frozen=True)
 class MissionPlan:
-    """The plan of a mission before it is written. `settings` and `events` override values of the scenario.
-
-    The address of a vehicle is in `addresses`, or is computed from `subnet` and the ID of the vehicle. Without a
-    subnet, it is the same as in a run (`netem.addresses`). The broadcast address follows from the subnet if it is not
-    given. If `secured` is true, the key bundle of each vehicle is in the directory of its mission file.
-    """
+    """The plan of a mission before it is written."""
 
     scenario: Scenario
     initial_data: bytes
     settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings that replace the settings of the scenario."""
     events: Mapping[str, Any] = field(default_factory=dict)
+    """Values that replace the event values of the scenario."""
     subnet: ipaddress.IPv4Network | None = None
+    """The network from which the addresses of vehicles without an entry in `addresses` are computed. If it is None,
+    these vehicles have the same addresses as in a run (`netem.addresses`).
+    """
     addresses: Mapping[int, str] = field(default_factory=dict)
     broadcast: str | None = None
+    """The broadcast address. If it is None, the address is computed from `subnet`, or equals the address in a run."""
     port: int = PORT
     secured: bool = False
+    """True if the directory of each mission file also contains the key bundle of the vehicle."""
 
     def documents(self) -> dict[int, dict[str, Any]]:
         """Return the mission file of each agent. Raises MissionFileError."""

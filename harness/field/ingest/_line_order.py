@@ -16,13 +16,14 @@ MAX_REPEATED = 10_000
 
 @dataclass(frozen=True, slots=True)
 class ReorderedPart:
-    """A part of a trace that was repaired. `first` and `last` are the positions of the part before the repair. `why` is
-    the reason for the repair.
-    """
+    """A part of a trace that was repaired."""
 
     first: int
+    """The position of the first handler run of this part, in the order before the repair."""
     last: int
+    """The position of the last handler run of this part, in the order before the repair."""
     why: str
+    """The reason for the repair."""
 
 
 def in_order(runs: Sequence[HandlerRun]) -> tuple[list[int], list[ReorderedPart]]:

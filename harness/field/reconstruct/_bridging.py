@@ -42,14 +42,13 @@ STEPS_PER_BLOCK = 200
 
 @dataclass(frozen=True)
 class KnownState:
-    """The known state of an idle agent after lost trace lines. `why` is the reason why the lines are missing.
-    `current_block` is the block under construction. It is None if this block is empty, or if its content has no later
-    effect.
-    """
+    """The known state of an idle agent after lost trace lines."""
 
     chain: tuple[Block, ...]
     current_block: bytes | None
+    """The block under construction. The value is None if this block is empty, or if its content has no later effect."""
     why: str
+    """The reason why the trace lines are missing."""
 
 
 class InferredInputPath:

@@ -34,27 +34,26 @@ SEED = 1
 
 @dataclass(frozen=True)
 class AgentOutcome:
-    """The result for one agent: the number of blocks in its simulated chain. `why` is the reason why this chain differs
-    from the recorded chain, or None if both chains are equal.
-    """
+    """The result of the reconstruction for one agent."""
 
     agent_id: int
     blocks: int
+    """The number of blocks in the agent's simulated chain."""
     why: str | None = None
+    """The reason why the simulated chain differs from the recorded chain, or None if both are equal."""
 
 
 @dataclass
 class Reconstruction:
-    """A scenario and the part of the flight that it reproduces.
-
-    `agents` contains the agents with a record. `remarks` contains the assumptions. `difference` is the first step at
-    which the simulation differs from a record that should be simulated completely.
-    """
+    """A scenario and the part of the flight that it reproduces."""
 
     document: Document
     agents: list[AgentOutcome]
+    """The results for the agents that have a record."""
     remarks: list[str]
+    """Sentences about the assumptions."""
     difference: FirstDifference | None
+    """The first step at which the simulation differs from a record that should be simulated completely."""
     simulated: Simulated
     table: InputTimetable = field(repr=False)
     wrong_signatures: list[str] = field(default_factory=list)

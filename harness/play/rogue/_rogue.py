@@ -55,13 +55,14 @@ QUERY_OF_ANSWER = {NAMES[answer]: NAMES[query] for answer, query in REQUEST_OF.i
 
 @dataclass(frozen=True, slots=True)
 class RogueDatagram:
-    """A datagram that the rogue node sends. `injection` is the number of the injection, `what` is the kind of the
-    injection, and `source` is the imitated sender address.
-    """
+    """A datagram that the rogue node sends."""
 
     injection: int
+    """The number of the injection."""
     what: str
+    """The kind of the injection."""
     source: int
+    """The sender address that the rogue node imitates."""
     datagram: bytes
     plain: bytes | None = None
     """The datagram before encryption, or None if the rogue node did not encrypt it."""
@@ -75,25 +76,27 @@ class RogueDatagram:
 
 @dataclass(frozen=True, slots=True)
 class _ReceivedDatagram:
-    """A datagram that the rogue node received. `message` is None for an encrypted datagram. `request` is the
-    identification that an answer to the datagram must contain.
-    """
+    """A datagram that the rogue node received."""
 
     sender: int
     name: str
     message: Message | None
+    """The message in the datagram, or None if the datagram is encrypted."""
     request: "AnsweredRequest | None"
+    """The identification that an answer to the datagram must contain."""
     datagram: bytes
 
 
 @dataclass(slots=True)
 class _ActiveInjection:
-    """An injection of messages that ends at the time `until`. A flood sends its next message at the time `next_at`."""
+    """An injection of messages that has begun and not yet ended."""
 
     number: int
     injection: Injection
     until: float
+    """Mission second at which the injection ends."""
     next_at: float
+    """Mission second at which a flood of messages sends its next message."""
 
 
 class RogueLogic:
