@@ -52,7 +52,7 @@ class LostMessage:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recorded run with its verdict. Its logged events and its lost messages are in order of time."""
+    """A recorded run with its verdict. The logged events and the lost messages are in order of time."""
 
     result: Result
     logged: list[RecordedEvent]

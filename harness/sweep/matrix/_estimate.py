@@ -1,7 +1,7 @@
 """Estimate the means and shares of numeric results over several runs, with 95 % confidence intervals.
 
-The interval of a share of runs is Wilson's, which is also valid near 0 and 100 %. The interval of a mean is Student's.
-A single run has no interval, because it says nothing about the spread.
+A share of runs has the Wilson interval, which is also valid near 0 and 100 %. The interval of a mean comes from
+Student's t distribution. A single run has no interval, because one value does not show the spread.
 """
 
 import math

@@ -1,8 +1,9 @@
 """Fit power laws y = a * x^b by least squares of the logarithms, to describe how one quantity grows with others.
 
-Only values above 0 have a logarithm. Other points are omitted and counted. The confidence interval of an exponent is
-Student's. It assumes that the points scatter around the line independently and equally. If the growth is not a power
-law, this assumption is false. In this case R^2 is low, or parts of the range have different exponents.
+Only values above 0 have a logarithm. Other points are omitted and counted. The confidence interval of an exponent comes
+from Student's t distribution. It assumes that the points scatter around the line independently and equally. If the
+growth is not a power law, this assumption is false. In this case R^2 is low, or parts of the range have different
+exponents.
 """
 
 import math

@@ -101,7 +101,9 @@ class PlayedRun:
     reached: ReachedStates
     found: tuple[FindingIdentity, ...]
     divergence: Divergence | None = None
-    """The differences between the chains of the idle swarm. Only for a run without a final reconcile."""
+    """The differences between the chains of the idle swarm. None if the run has a final reconcile or a bad verdict, or
+    if all chains are equal.
+    """
     timers_ended_s: tuple[float, ...] = ()
     """The times of the timer expiries before the liveness phase, in order. The liveness phase is the end of the run, in
     which the swarm can become idle.

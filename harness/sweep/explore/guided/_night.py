@@ -97,7 +97,9 @@ class NightResult:
     started_at: str
     findings: list[NightFinding] = field(default_factory=list)
     growth: list[tuple[int, int]] = field(default_factory=list)
-    """Pairs of a number of runs, and the number of agent states that were known after these runs."""
+    """The growth of the coverage. Each entry is a pair: a number of runs, and the number of agent states that were
+    known after these runs.
+    """
     interrupted: bool = False
     seconds: float = 0.0
     processor_s: float = 0.0
