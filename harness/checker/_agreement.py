@@ -1,14 +1,14 @@
 """Decide whether agents with different chains had a chance to agree. The checks of characteristics 5 and 6 use this
 decision.
 
-Two idle agents with different chains stay different, because only a vote or a query of another agent's phase 2 starts a
-reconcile. A difference is therefore a violation only if the network was fully connected, and if the agent with the
-different chain then completed a reconcile that began after the last change of any other chain. Otherwise the
-characteristics do not apply.
+Two idle agents with different chains stay different, because a reconcile starts only after a vote, or after a query
+that another agent sends in phase 2 of its own reconcile. A difference is therefore a violation only if the network was
+fully connected, and if the agent with the different chain then completed a reconcile that began after the last change
+of any other chain. Otherwise the characteristics do not apply.
 
 The system consists of the agents that ran until the end. An agent that was switched off earlier neither sends nor
-receives blocks. If all agents were switched off, the system consists of all of them. A reconcile is then a chance only
-if it happened while all of them ran.
+receives blocks. If all agents were switched off, the system consists of all of them. A reconcile then gives a chance to
+agree only if it happened while all agents ran.
 """
 
 import math
@@ -21,10 +21,8 @@ from harness.checker.recurring_cycles import cycle_of
 
 
 def check_endless_cycle(name: str, evidence: Evidence) -> Judgement | None:
-    """Return the verdict `violated` if some agents repeat a cycle forever, although all agents took part and the
-    network connects them. Return None in every other case.
-
-    `harness.checker._liveness` reports the evidence.
+    """Return the verdict `violated` if some agents repeat the same handler runs forever, although all agents took part
+    and the network connects them. Return None in every other case. `harness.checker._liveness` lists the evidence.
     """
     cycle = evidence.cached(cycle_of)
     if cycle is None or evidence.connected_since_s is None or evidence.missing or evidence.paused_at_end:
@@ -33,7 +31,7 @@ def check_endless_cycle(name: str, evidence: Evidence) -> Judgement | None:
 
 
 MAX_REASONS = 3
-"""Maximum number of agents that a reason names."""
+"""Maximum number of agents that the reason of a verdict names."""
 
 
 def explain_unknown(evidence: Evidence) -> str | None:

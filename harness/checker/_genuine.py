@@ -128,8 +128,8 @@ def _explain_unknown_makers(evidence: Evidence, unknown: set[int]) -> str:
 
 
 def _describe_arrival(trace: Trace | None, block_hash: str) -> str:
-    """Return a phrase with the time at which an agent received a block and the handler that handled it, for the end of
-    a sentence.
+    """Return a phrase that states when an agent received a block, and which handler processed it. The phrase ends a
+    sentence.
     """
     came = ("chain+", block_hash)
     for run in trace.runs if trace else ():

@@ -31,16 +31,16 @@ class TraceObservation:
 
     @property
     def where(self) -> str:
-        """The place of the observation as text, such as "trace line 7, t=12.5 s, receive_commit_block"."""
+        """The line, the time and the handler of the observation as text, such as "trace line 7, t=12.5 s,
+        receive_commit_block".
+        """
         return f"trace line {self.line}, t={self.run.t:g} s, {self.run.handler}"
 
 
 @dataclass(slots=True)
 class ReplayedIncarnation:
-    """The replay of an agent between two restarts: the blocks that the agent held at the end, and all observations.
-
-    All three lists contain block hashes. `chain` starts with the oldest block, `deque` with the front block, and
-    `stack` ends with the top block.
+    """The replay of an agent between two restarts: the blocks that the agent held at the end, and all observations. The
+    lists of blocks contain block hashes.
     """
 
     trace: Trace
@@ -48,8 +48,11 @@ class ReplayedIncarnation:
     """Number of the incarnation. The first one has number 0."""
     runs: list[HandlerRun]
     chain: list[str] = field(default_factory=list)
+    """The chain. The oldest block is first."""
     deque: list[str] = field(default_factory=list)
+    """The deque. The front block is first."""
     stack: list[str] = field(default_factory=list)
+    """The reconcile stack. The top block is last."""
     completed: list[str] = field(default_factory=list)
     sent: int = 0
     unknown: bool = False
@@ -134,7 +137,9 @@ class _HeldBlocks:
         self._copies: dict[str, int] = {}
         self._places = {"chain": incarnation.chain, "deque": incarnation.deque, "stack": incarnation.stack}
         self._chain_hashes = [bytes.fromhex(inception)] if inception is not None else None
-        """Chain hash of each block in the chain, from the inception block on. None if they are not known."""
+        """Chain hash of each block in the chain, starting with the inception block. None if the hash of the inception
+        block is unknown.
+        """
         self._completed: set[str] = set()
         self._not_in_chain: dict[str, None] = {}
         self.has_blocks_aside = False

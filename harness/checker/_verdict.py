@@ -37,23 +37,21 @@ FURTHER_CHECKS: dict[str, Callable[[Evidence], Judgement]] = {
     "records": records.check,
     "liveness": _liveness.check,
 }
-"""Key of each check that is not a characteristic of the thesis -> its function. See
-`harness.scenario.verdict_names`.
+"""The checks that are not characteristics of the thesis: the key of each check, and its function.
+`harness.scenario.verdict_names` defines the keys.
 """
 
 
 @dataclass(frozen=True)
 class Result:
-    """The complete verdict on a run.
-
-    `characteristics` holds the judgement of each characteristic by its number, "1" to "6". `beside` holds the
-    judgements of the further checks `steps`, `records` and `liveness`. `figures` holds the numeric results by name, as
-    in run.json. A value of None is unknown.
-    """
+    """The complete verdict on a run."""
 
     characteristics: dict[str, Judgement]
+    """The judgement of each characteristic. The key is its number, "1" to "6"."""
     figures: dict[str, float | int | None]
+    """The numeric results by name, as in run.json. A value of None is unknown."""
     beside: dict[str, Judgement] = field(default_factory=dict)
+    """The judgements of the further checks `steps`, `records` and `liveness`."""
     errors: list[str] = field(default_factory=list)
     """One sentence for each file that could not be read completely."""
     chains: dict[int, tuple[str, ...]] = field(default_factory=dict)

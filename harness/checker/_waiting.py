@@ -15,7 +15,7 @@ from harness.checker.judgement import Finding
 from ucp.trace import HandlerRun
 
 SLACK_WALL_S = 1.0
-"""Seconds of wall time by which a busy machine may delay a timer."""
+"""Tolerance in seconds of wall time for timers that a busy machine delays."""
 
 RECONCILE_STEPS = frozenset(
     (
@@ -31,7 +31,7 @@ RECONCILE_STEPS = frozenset(
     )
 )
 NO_STEP = frozenset(("already in progress", "not in phase 3", "another block"))
-"""Branches in which a handler of a reconcile does not continue the reconcile."""
+"""Branches that do not continue the reconcile, although their handlers belong to a reconcile."""
 
 
 def _continues_reconcile(run: HandlerRun) -> bool:
@@ -47,12 +47,11 @@ ALL_TIMERS = (*VOTE_TIMERS, *RECONCILE_TIMERS)
 
 @dataclass(slots=True)
 class _UnfinishedOperation:
-    """A vote or reconcile in progress. The agent must continue it within `longest` mission seconds after its last
-    step.
-    """
+    """A vote or reconcile in progress."""
 
     what: str
     longest: float
+    """Maximum number of mission seconds between two steps of this vote or reconcile."""
     line: int = 0
     since: float = math.inf
     """Mission second of the last step. Infinity if no vote or reconcile is in progress."""
@@ -111,8 +110,8 @@ def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _Unfini
 
 
 def longest(trace: Trace, timers: tuple[str, ...]) -> float:
-    """Return the duration of the longest of these timers in mission seconds, plus a tolerance. Return infinity if the
-    duration of a timer is unknown.
+    """Return the longest duration of these timers in mission seconds, plus a tolerance. Return infinity if the duration
+    of a timer is unknown.
     """
     settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
     if not all(isinstance(setting, int | float) for setting in settings):

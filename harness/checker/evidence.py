@@ -48,20 +48,20 @@ if TYPE_CHECKING:
 Derived = TypeVar("Derived")
 
 Sending = tuple[tuple[float, SentMessage], ...]
-"""The messages of one agent with a certain type and sequence number, each with its mission second. Each incarnation of
-the agent sends at most one of these messages.
+"""The messages of one agent that have the same type and sequence number. Each message has the mission second at which
+the agent sent it. Each incarnation of the agent sends at most one of these messages.
 """
 Sendings = dict[Any, dict[Any, Sending]]
 """The messages that one agent sent: message type -> sequence number -> messages."""
 
 Watch = Callable[[ReferenceState, HandlerRun | None], None]
 """A function that receives each handler run of an agent, and the agent's state after the run. At the start of an
-incarnation, the function receives None in place of a run.
+incarnation (the time between two restarts), the function receives None in place of a run.
 """
 
 MAX_LINK_CHANGES = 20_000_000
-"""Maximum number of link losses to compute (links times changes of the network). The computation takes about ten
-seconds.
+"""Maximum for the number of links multiplied by the number of network changes. Up to this maximum, the checker computes
+the loss rates of links, which takes at most about ten seconds.
 """
 
 _HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")
@@ -96,7 +96,7 @@ class NetworkLogEntry(BaseModel):
     asked: dict[str, Any] | None = None
     """The conditions that the scenario requested, in the format of `NetworkConditions.to_json`."""
     counters: Counters | None = None
-    """The packet counters of the kernel. Only the last line of the file has them."""
+    """The packet counters of the kernel. Only the last line of the file contains counters."""
 
 
 @dataclass
@@ -132,41 +132,41 @@ class RogueTraffic:
 
 @dataclass
 class Evidence:
-    """All recorded files of one run that the checker uses.
-
-    `record` is the content of `run.json`, or None if there are only exports. `before_final_reconcile` has the exports
-    before the final reconcile. The latter is empty without a final reconcile.
-    """
+    """All recorded files of one run that the checker uses."""
 
     exports: dict[int, Export]
     traces: dict[int, Trace] = field(default_factory=dict)
     record: JudgedRecord | None = None
+    """The content of `run.json`. None if there are only exports."""
     errors: list[str] = field(default_factory=list)
     before_final_reconcile: dict[int, Export] = field(default_factory=dict)
+    """The exports that the agents wrote before the final reconcile. Empty if the run had no final reconcile."""
     injected: RogueTraffic = field(default_factory=RogueTraffic)
     conditions: list[NetworkLogEntry] | None = None
     """The lines of `network.jsonl`. None if the file is missing."""
     captures: Captures | None = None
     lag: MeasuredLag | None = None
-    """The measured delays of machine and agents. None if they were not measured."""
+    """The measured delays of the machine and of agents. None if the run has no such measurement."""
     keys: TrustedKeys | None = None
     """The public keys of a secured mission, which verify the signatures of blocks and exports."""
     verified: "Callable[[UnverifiedSignature], bool] | None" = None
-    """A function that returns true for a valid signature without a computation. It exists only for a swarm that this
-    process simulated.
+    """A function that returns true if the signature is already known to be valid, so that the checker need not compute
+    it. None unless this process simulated the swarm.
     """
     watch: Watch | None = None
     """A function that receives each step that the step judge examines."""
     scenario: Scenario | None = None
-    """The recorded scenario. None without a record. Also None for a run in memory, because its scenario cannot have
-    been edited.
+    """The recorded scenario. None if the run has no record, or if it took place in memory, because such a scenario
+    cannot have been edited.
     """
     link_losses: list[tuple[float, dict[Link, float]]] = field(default_factory=list)
-    """The loss rates (0 to 1) of links over time: mission seconds, each with the links whose loss changes then. The
-    first entry contains all links.
+    """The changes of the loss rates (0 to 1) of links. Each entry contains the mission second of a change and the new
+    loss rates of the changed links. The first entry contains all links.
     """
     delivers_all: bool = False
-    """True if virtual time delivered every message. Otherwise it omitted messages that the released core ignores."""
+    """True if virtual time delivered every message. Otherwise virtual time did not deliver messages that the released
+    core ignores.
+    """
     from_field: bool = False
     """True for files without the run record run.json. Without this record, no counter shows how many lines the traces
     should have, so lines may be missing.
@@ -309,8 +309,8 @@ class Evidence:
         return since is not None and since <= until_s
 
     def was_delayed(self, agent_id: int, due_s: float, until_s: float) -> bool:
-        """Return true if the agent could not run from one mission second until the other: it was paused in between, or
-        the measured lag or a delay of the scenario explains this time.
+        """Return true if the agent could not run between these two mission seconds. The reason is a pause, the measured
+        lag, or a delay that the scenario requested.
         """
         if self.was_paused(agent_id, due_s, until_s):
             return True
@@ -359,7 +359,7 @@ class Evidence:
         return self.record.remote.get(str(agent_id)) if self.record else None
 
     def clock_error_s(self, agent_id: int) -> float:
-        """Return the maximum error of the agent's clock, in seconds of wall time, relative to that of the harness."""
+        """Return the maximum error of the agent's clock, in seconds of wall time, relative to the harness's clock."""
         remote = self.remote(agent_id)
         speedup = self.traces[agent_id].header.clock.get("speedup")
         if remote is None or not isinstance(speedup, int | float) or speedup <= 0:
@@ -407,7 +407,7 @@ class Evidence:
 
     @cached_property
     def requested_conditions(self) -> list[tuple[float, NetworkConditions]] | None:
-        """The network conditions that the scenario requested, each with the mission second from which they applied.
+        """The network conditions that the scenario requested, each with the mission second at which they took effect.
         None if no record contains them.
         """
         if self.conditions is None:
@@ -420,8 +420,8 @@ class Evidence:
 
     @property
     def has_fates(self) -> bool:
-        """True if scripted fates in the scenario decided about the arrival of messages. Otherwise only the network
-        decides.
+        """True if the section `fates` of the scenario decided which messages arrived. Otherwise only the network
+        decided.
         """
         return self.record is not None and any(state.what == NO_MORE_FATES for state in self.record.network)
 

@@ -1,8 +1,8 @@
 """Count how the agents handled injected messages. The sources are the injection log and the traces.
 
 A forged message has a sequence number that no agent uses. Each handler run with this number therefore belongs to the
-rogue node. A replayed copy of a message is equal to its original. If an agent ran its handler for this message several
-times, the last runs therefore count for the copies, but not more runs than copies were sent before.
+rogue node. A replayed copy of a message is equal to its original. If an agent handled this message several times, the
+check therefore assigns the last handler runs to the copies. It assigns at most one run to each copy sent before.
 
 A secured agent handles each datagram only once, and handles no altered datagram. Corrupted messages therefore count as
 not handled. A copy that is sent immediately cannot be distinguished from the original. A delayed copy counts as handled
@@ -152,7 +152,7 @@ def _pair_with_copies(
     copies: Sequence[tuple[float, int]] | None, key: _Key, runs: list[HandlerRun]
 ) -> Iterator[tuple[int, int, HandlerRun]]:
     """Yield each handler run that an injected message triggered, with the number of the injection and the index of the
-    copy. The last runs of a handler are assigned to the last copies.
+    copy. The last handler runs for a message are assigned to its last copies.
     """
     forged = injection_of(key[1])
     if copies is None and forged is not None:

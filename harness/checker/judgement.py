@@ -13,13 +13,14 @@ MAX_EVIDENCE = 50
 
 @dataclass(frozen=True)
 class Finding:
-    """One piece of evidence for a verdict: an agent, an observation, and the block that the observation concerns or
-    None.
-    """
+    """One piece of evidence for a verdict."""
 
     agent_id: int
+    """The agent that the evidence concerns."""
     detail: str
+    """A phrase that describes the observation."""
     block: str | None = None
+    """Short name of the block that the evidence concerns, such as 4.11. None if it concerns no block."""
     block_hash: str | None = None
     handler: str | None = None
     """Name of the handler that the evidence concerns. None if it concerns none of the 20 handlers."""

@@ -5,7 +5,7 @@ impossible, so the judge must know these places. Four kinds of contradiction pro
 
 - The sequence numbers of sent messages jump. The lost line comes after the last message before the jump.
 - The time decreases from one line to the next.
-- A handler run names as its trigger a handler that did not run since the last input.
+- The trigger of a handler run is another handler, but this handler did not run since the last input.
 - The state before a handler run differs from the state at the end of the previous line. The state before the run
   follows from the recorded state after it and from its changes.
 
@@ -44,13 +44,12 @@ def lost_lines(trace: Trace) -> dict[int, str]:
 
 
 class _ContradictionPlaces:
-    """The places in a trace at which one kind of contradiction occurs. `possible` is the number of lines at which it
-    could occur.
-    """
+    """The places in a trace at which one kind of contradiction occurs."""
 
     def __init__(self) -> None:
         self.found: dict[int, str] = {}
         self.places = self.possible = 0
+        """Number of places, and number of trace lines at which the contradiction could occur."""
 
 
 def _jumps(runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _ContradictionPlaces) -> None:

@@ -5,7 +5,8 @@ An incarnation is the time between two restarts. A vehicle that restarted may re
 incarnation. The other parts of its trace then look complete, and the agent seems not to have sent messages and not to
 have completed blocks in that time. Three facts prove that an incarnation is missing:
 
-- The trace begins with a boot, or the agent boots from a disk with completed blocks that are on no earlier line.
+- The trace begins with a boot, or the agent boots from a disk with completed blocks that no earlier trace line
+  contains.
 - Another agent received a message of this agent, and no line of this agent contains the message with this content. The
   sequence number alone proves nothing, because every incarnation numbers its messages from 0.
 - A block of the agent has a timestamp outside all recorded incarnations.

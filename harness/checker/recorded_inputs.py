@@ -54,7 +54,9 @@ def event_of(record: RecordedBytes | None) -> LoggableEvent:
 
 
 def sealed_of(record: RecordedBytes | None) -> bytes | None:
-    """Return the encrypted event data that an agent recorded. Return None if it recorded none, or no valid base64."""
+    """Return the encrypted event data that an agent recorded. Return None if the record contains no encrypted event
+    data or no valid base64.
+    """
     try:
         return None if record is None else base64.b64decode(record.text, validate=True)
     except ValueError:

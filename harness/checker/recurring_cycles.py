@@ -19,22 +19,22 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 SEVERAL = 5
-"""Number of consecutive repetitions that count as a cycle."""
+"""Number of consecutive repetitions from which a sequence of handler runs counts as a cycle."""
 LAST_RUNS = 20_000
-"""Number of an agent's last handler runs in which the checker searches for a cycle."""
+"""Number of handler runs at the end of a trace in which the checker searches for a cycle."""
 COUNTED = {
     "receive_phase_1_response": ("yes", "no"),
     "receive_response_next_in_sequence": ("new candidate", "counted"),
 }
-"""Handler of an answer in a reconcile -> the branches in which the answer counts."""
+"""Handlers that receive answers during a reconcile -> the branches in which the handler counts the answer."""
 ALREADY = "already in progress"
-"""Branch of Algorithm 7 in an agent that is already in a reconcile."""
+"""Branch that Algorithm 7 takes if the agent is already in a reconcile."""
 REFUSED = ("receive_vote_add_block", "no")
 ASKS = ("reconcile_phase_1", "reconcile_phase_2")
 MAX_NAMED = 10
 PERIOD_TOLERANCE_S = 0.01
 SHORTEST_PAUSE_S = 0.05
-"""Mission seconds. The description of a cycle does not mention shorter pauses between handler runs."""
+"""Mission seconds of the shortest pause between two handler runs that the description of a cycle mentions."""
 
 
 def cycle_of(evidence: Evidence) -> Cycle | None:
@@ -68,14 +68,16 @@ def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _CyclePart:
-    """One agent's part of an endless cycle: the handler runs of one period, the start of the cycle, the length of a
-    period, and the number of repetitions.
-    """
+    """One agent's part of an endless cycle."""
 
     runs: list[HandlerRun]
+    """The handler runs of one period."""
     since_s: float
+    """Mission second at which the cycle began."""
     period_s: float
+    """Length of one period in mission seconds."""
     times: int
+    """Number of recorded repetitions."""
 
 
 def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | None:

@@ -26,12 +26,11 @@ MAX_U64 = 2**64 - 1
 
 @dataclass(frozen=True)
 class TrustedKeys:
-    """The public keys of a mission. `anchor` names the source that confirms the keys. `anchor` is None without such a
-    source.
-    """
+    """The public keys of a mission."""
 
     public: "PublicKeys"
     anchor: str | None
+    """Name of the source that confirms the keys. None if no source confirms them."""
 
 
 def unanchored(exports: Iterable[Export], keys: TrustedKeys | None) -> str | None:

@@ -14,12 +14,12 @@ TOLERATED = 0.05
 
 @dataclass(frozen=True)
 class TimerLag:
-    """The lateness of vote timers. One in twenty of these timers, whose duration is `asked_s` mission seconds, was more
-    than `late_s` mission seconds late.
-    """
+    """The lateness of vote timers."""
 
     late_s: float
+    """Lateness in mission seconds that one vote timer in twenty exceeded."""
     asked_s: float
+    """Requested duration of a vote timer in mission seconds."""
 
     @property
     def tolerable(self) -> bool:

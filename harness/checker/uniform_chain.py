@@ -53,7 +53,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def common_prefix(chains: list[tuple[str, ...]]) -> int:
-    """Return the length of the longest common beginning of all chains, in blocks."""
+    """Return the number of blocks with which all chains begin."""
     length = 0
     for level in zip(*chains, strict=False):
         if len(set(level)) > 1:

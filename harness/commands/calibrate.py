@@ -1,4 +1,4 @@
-"""Implement `ucp-harness calibrate`, which fits the radio of a scenario to a real flight."""
+"""Implement `ucp-harness calibrate`, which fits the radio parameters of a scenario to the record of a real flight."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Implement `ucp-harness chain`, which prints the chains of a run, or writes their positions as a map."""
+"""Implement `ucp-harness chain`, which prints the chains of a run, or writes the positions in them as a map."""
 
 import json
 from pathlib import Path

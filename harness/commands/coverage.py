@@ -1,4 +1,4 @@
-"""Implement `ucp-harness coverage` and `validate`, which compare runs with all states and with the TLA+
+"""Implement `ucp-harness coverage` and `validate`, which compare runs with all possible states and with the TLA+
 specification.
 """
 
@@ -21,8 +21,8 @@ from harness.scenario import load_scenario
 from ucp.settings import Settings
 
 BLOCK_SIZE_SETTINGS = {*EVENT_FILLS_BLOCK, "max_event_bytes"}
-"""Settings that affect only the size of blocks. These settings have no effect on `prove`, because its blocks have no
-size.
+"""Settings that affect only the size of blocks. These settings have no effect on `prove`, because blocks have no size
+in `prove`.
 """
 
 

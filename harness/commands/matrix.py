@@ -1,4 +1,4 @@
-"""Implement `ucp-harness matrix`, which plays a scenario with many combinations of values and seeds."""
+"""Implement `ucp-harness matrix`, which runs a scenario with many combinations of values and seeds."""
 
 from pathlib import Path
 from typing import Annotated, NoReturn

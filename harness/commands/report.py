@@ -1,4 +1,4 @@
-"""Implement `ucp-harness check`, `report` and `watch`, which judge a run again, write its report, or replay it as a
+"""Implement `ucp-harness check`, `report` and `watch`, which judge a run again, write its report, or show the run as a
 film.
 """
 

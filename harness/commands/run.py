@@ -1,4 +1,4 @@
-"""Implement `ucp-harness run`, which plays a scenario and judges it."""
+"""Implement `ucp-harness run`, which runs a scenario and judges the run."""
 
 import secrets
 from contextlib import nullcontext

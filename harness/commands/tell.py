@@ -25,8 +25,8 @@ _TIME_COMMANDS: list[tuple[re.Pattern[str], str, str | None]] = [
     (re.compile("step"), "step", None),
     (re.compile(r"step (\d{1,9}(?:\.\d{1,9})?)(?: s)?"), "step", "seconds"),
 ]
-"""Patterns of sentences about virtual time. Each pattern has a command for the run, and the name of the number in the
-sentence.
+"""Patterns of a user's sentences about virtual time. Each pattern has the command that the run receives, and the name
+of the number in the sentence.
 """
 _COMMAND_EXAMPLES = (
     "`partition 1 2 | 3`, `heal`, `1 does not reach 2 3`, `1 reaches 2 3 again`, "

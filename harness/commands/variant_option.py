@@ -1,4 +1,4 @@
-"""Define the option --variant, which each command that plays or judges agents has."""
+"""Define the option --variant of all commands that run scenarios or judge runs."""
 
 from pathlib import Path
 from typing import Annotated, Any

@@ -17,9 +17,7 @@ from ucp.mission import SCHEMA
 
 
 class AgentUnderTest(ABC):
-    """An agent under test from one start to its end, together with the reference implementation that gets the same
-    inputs.
-    """
+    """An agent under test from its start to its end, and the reference implementation that gets the same inputs."""
 
     def __init__(self, variant: SettingsVariant) -> None:
         self.model = ReferenceModel(variant.settings)
@@ -60,8 +58,8 @@ class AgentUnderTest(ABC):
 
 
 Start = Callable[[SettingsVariant, bool], Awaitable[AgentUnderTest]]
-"""A function that starts an agent with a variant of the settings. Its second argument is true for a replay, for which
-few agents run in parallel. Raises NoAgentError, UnsupportedError, AgentEndedError.
+"""A function that starts an agent with a variant of the settings. If the second argument is true, the agent repeats a
+test, and few agents run in parallel. Raises NoAgentError, UnsupportedError, AgentEndedError.
 """
 
 

@@ -35,7 +35,7 @@ from ucp.messages import (
 )
 
 UNKNOWN = bytes.fromhex("de" * 32)
-"""The hash of no block and no chain."""
+"""A value that is the hash of no block and of no chain."""
 
 Tally = Literal["voting", "phase one", "phase two", "timer"]
 
@@ -47,14 +47,16 @@ class AgentInput:
     name: str
     make: Callable[[ReferenceModel], Action | None]
     tally: Tally | None = None
-    """The activity whose counted answers determine the effect of the input. "timer" stands for the activity of the
-    running timer.
+    """The activity in which the effect of the input depends on the answers that the agent has counted. "timer" stands
+    for the activity that ends with the running timer. None if counted answers never affect the input.
     """
     counted_twin: str | None = None
-    """Name of a similar answer that the agent must count. Only for an answer that the agent must ignore."""
+    """Name of a similar answer that the agent must count. None unless the input is an answer that the agent must
+    ignore.
+    """
     preceding: str | None = None
-    """Name of an ignored answer that precedes a timer expiry. The expiry reveals whether the agent counted this answer.
-    Only timer expiries have this attribute.
+    """Name of an answer that arrives before a timer expiry and that the agent must ignore. The expiry reveals whether
+    the agent counted this answer. Only timer expiries have this attribute.
     """
 
 

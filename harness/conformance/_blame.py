@@ -1,8 +1,8 @@
 """Find the handler that most likely caused a failure, using only observations from outside the agent.
 
 One input can trigger several handlers, one after another, and the wrong handler may even have run before this input.
-The evidence is: missing and unexpected messages, wrong values in the status, and the branches that passed or failed in
-other vectors.
+The evidence consists of missing and unexpected messages, of wrong values in the status, and of the branches that passed
+or failed in other vectors.
 """
 
 from collections import Counter
@@ -23,8 +23,8 @@ BLOCK_KEYS = {"chain", "deque", "stack", "completed", "top_chain_hash"}
 """Keys of the status that describe the blocks of the agent."""
 
 Branch = tuple[str, str, bool]
-"""A branch of a handler: handler, branch, and whether the run changes blocks. The last element is needed because one
-branch of Algorithm 20 changes blocks only in some runs.
+"""A branch of a handler: the name of the handler, the name of the branch, and true if the handler run changes blocks.
+The last element is needed because one branch of Algorithm 20 changes blocks only in some runs.
 """
 
 STARTED_BY = {timer: handler.name for handler in HANDLERS.values() for timer in handler.starts}
@@ -35,18 +35,19 @@ BEGINNING_OF_COUNT = {
     "reconcile_phase_2_timer_expiration": "reconcile_phase_2",
     "reconcile_phase_3_timer_expiration": "reconcile_phase_3",
 }
-"""Handler of a timer expiry -> the handler that began to count the answers on which this expiry depends."""
+"""Handler of a timer expiry -> the handler that began to count the answers. This expiry evaluates the counted answers.
+"""
 
 _EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 _LEADING_EVENTS = {"Reconcile Begin", "Reconcile Phase 1"}
 """Local events whose handlers only trigger another handler."""
 STARTING_BRANCHES = {"proposed", "asked", "recommitted, more to come"}
-"""Branches in which a handler starts its timer."""
+"""Branches in which a handler starts a timer."""
 
 
 @dataclass(frozen=True)
 class BlamedBranch:
-    """The branch that most likely caused a failure, with its handler. It is the branch that the reference took."""
+    """The branch that most likely caused a failure, and its handler. The reference took this branch."""
 
     handler: str
     branch: str
@@ -102,15 +103,17 @@ class BlameEvidence:
         return BlamedBranch(run.handler, run.branch)
 
     def _fails_without_preceding_input(self, failure: ConfirmedFailure) -> bool:
-        """Return true if the test of the timer expiry without an ignored answer before it has not passed."""
+        """Return true if no test of the same timer expiry without a preceding ignored answer has passed. Return false
+        if the failed test had no such answer.
+        """
         key = failure.observation.key
         if INPUTS[key.input].preceding is None:
             return False
         return (failure.variant, VectorKey(*failure.observation.before, TIMER)) not in self._pairs
 
     def _counts_wrongly_from_start(self, failure: ConfirmedFailure) -> bool:
-        """Return true if the agent probably began its count wrongly. In this case it decides correctly after other
-        counts.
+        """Return true if the agent probably began to count answers with a wrong number. An agent with this fault
+        decides correctly after other counts.
         """
         observation, first = failure.observation, failure.observation.outcome.runs[0]
         if first.handler not in BEGINNING_OF_COUNT:
@@ -138,8 +141,8 @@ class BlameEvidence:
 
     @staticmethod
     def _starter_of_timer(failure: ConfirmedFailure) -> BlamedBranch:
-        """Return the handler that starts the timer with the wrong duration. If this handler ran in the step, also
-        return its branch.
+        """Return the handler that starts the timer with the wrong duration. If this handler ran in the tested step,
+        also return its branch.
         """
         for run in failure.observation.outcome.runs:
             if HANDLERS[run.handler].starts and run.branch in STARTING_BRANCHES:
@@ -147,8 +150,8 @@ class BlameEvidence:
         return BlamedBranch(STARTED_BY[str(failure.observation.wrong_timer)], "")
 
     def _most_suspicious(self, runs: Sequence[ExpectedRun], failure: ConfirmedFailure) -> ExpectedRun:
-        """Return the handler run that most likely failed. The choice depends on its messages, its successor, and the
-        passed tests.
+        """Return the handler run that most likely failed. The choice depends on the messages of each handler run, on
+        the handler run after it, and on the passed tests.
         """
         observation = failure.observation
         if len(runs) == 1:

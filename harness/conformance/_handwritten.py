@@ -1,5 +1,5 @@
-"""Run the handwritten test cases, each with its own agents. Some cases run in parallel. Failed cases run a second time,
-each of them alone.
+"""Run the handwritten test cases, and start new agents for each case. Some cases run in parallel. Each failed case runs
+a second time, without other cases at the same time.
 """
 
 import asyncio

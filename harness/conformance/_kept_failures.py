@@ -5,7 +5,7 @@ vector.jsonl      the inputs and the expected answers, as `COMMAND --virtual` re
 scenario.yaml     the same inputs as a scenario, for `ucp-harness run --backend sim`
 air.pcapng        the datagrams, for Wireshark and `ucp-harness packets`
 
-The scenario can be played in virtual time. Such a run has a report and a trace, and the checker judges each step. If a
+The scenario runs in virtual time. Such a run has a report and a trace, and the checker judges each step. If a
 timer expired late in the test, the inputs may be impossible in virtual time. In that case failure.txt reports this, and
 there are no vector and no scenario.
 """

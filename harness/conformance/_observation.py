@@ -1,4 +1,4 @@
-"""Compare one step of the agent under test with the reference, and describe it in words."""
+"""Compare one step of the agent under test with the same step of the reference. Describe the result in words."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -81,13 +81,16 @@ class RecordedDatagram:
 
 @dataclass(frozen=True)
 class TestedStep:
-    """One step of the agent under test: the input, the expected answer, and the actual answer."""
+    """One step of the agent under test."""
 
     key: VectorKey
     outcome: ExpectedOutcome
     given: str
+    """Description of the input."""
     expected: tuple[str, ...]
+    """Descriptions of the messages that the reference sent."""
     received: tuple[str, ...]
+    """Descriptions of the messages that the agent sent."""
     wrong: tuple[str, ...]
     """A sentence for each deviation. Empty if the agent behaved like the reference."""
     before: AgentState
@@ -99,14 +102,14 @@ class TestedStep:
     wrong_status_keys: tuple[str, ...] = ()
     """Keys of the status with wrong values."""
     wrong_timer: str | None = None
-    """Name of the timer that expired or will expire at a wrong time. None without such a timer."""
+    """Name of the timer that expired or will expire at a wrong time. None if no timer does."""
     running_timer: str | None = None
-    """Name of the next timer to expire, if its expiry time is correct. Only in virtual time."""
+    """Name of the next timer to expire, if its expiry time is correct. None over UDP."""
     ended: str | None = None
     """A phrase about the end or the hanging of the agent. None if the agent still runs."""
     hidden_run: ExpectedRun | None = None
-    """A handler run that may be the true cause of the failure. This run handled an answer that must not count, or
-    should have stopped a timer.
+    """A handler run that may be the true cause of the failure. This run handled an answer that the agent must ignore,
+    or it should have stopped a timer.
     """
 
 

@@ -63,12 +63,13 @@ Action = PeerDatagram | LoggedEvent | TimerExpiry | ControlCommand
 
 @dataclass(frozen=True)
 class ExpectedRun:
-    """A handler run of the reference: its branch and its messages."""
+    """A handler run of the reference implementation."""
 
     algorithm: int
     handler: str
     branch: str
     sent: tuple[Message, ...]
+    """The messages that the handler sends."""
     changes: bool = False
     """True if the handler run changes chain, deque, stack or completed blocks."""
 
@@ -92,7 +93,7 @@ class ExpectedOutcome:
 
 
 class ReferenceModel:
-    """The reference agent, with all blocks of the test so far and the number of handler runs."""
+    """The reference agent in a test, with all blocks that occurred in the test and the number of handler runs."""
 
     def __init__(self, settings: Settings) -> None:
         self.agent = ReferenceAgent(AGENT, ROSTER, INITIAL_DATA, ReferenceSettings.of(settings))
@@ -195,8 +196,8 @@ class ModelSnapshot:
 
 
 def _sorted(part: dict[str, Any]) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """Divide the attributes of an object into two groups: immutable attributes, and copies of the attributes that are
-    containers.
+    """Divide the attributes of an object into two groups, and return both. The first group contains the immutable
+    attributes, and the second one contains copies of the other attributes, which are containers.
     """
     containers = [(name, _copied(value)) for name, value in part.items() if type(value) in CONTAINERS]
     return {name: value for name, value in part.items() if type(value) not in CONTAINERS}, containers

@@ -62,10 +62,12 @@ class AgentState(NamedTuple):
     """The state of an agent, reduced to the values that handlers can distinguish."""
 
     activity: str
-    """Name of the running timer of a reconcile, "voting", "idle", or "stuck" (a reconcile without a running timer)."""
+    """Name of the running timer if the agent reconciles. Otherwise "voting" or "idle". "stuck" means a reconcile
+    without a running timer.
+    """
     holdings: tuple[str | int, ...]
-    """The blocks of the agent: length of the chain, owner of its top block, waiting blocks, and length of the stack.
-    Lengths are limited.
+    """The blocks of the agent: the length of the chain, the owner of its top block, the waiting blocks, and the length
+    of the stack. Lengths above a limit count as equal.
     """
     counted: tuple[object, ...]
     """Answers that the agent has counted in its current activity."""
@@ -110,7 +112,9 @@ def state_of(model: ReferenceModel) -> AgentState:
 
 
 def _candidates(model: ReferenceModel) -> tuple[object, ...]:
-    """Return the kind, the age and the number of answers of each candidate of reconcile phase 2."""
+    """Return three values for each candidate of reconcile phase 2: the kind of its block, the age of its block, and the
+    number of answers that named it.
+    """
     state = model.state
     stack = [block.block_hash for block in reversed(state.reconcile_stack)]
     candidates = []
@@ -127,8 +131,8 @@ def _candidates(model: ReferenceModel) -> tuple[object, ...]:
 
 
 class VectorKey(NamedTuple):
-    """The identity of a generated test: an input in a state. `counted` is empty if the effect of the input does not
-    depend on the counted answers.
+    """The identity of a generated test. A test is one input in one state. `counted` is empty if the effect of the input
+    does not depend on the counted answers.
     """
 
     activity: str
@@ -236,7 +240,7 @@ _CHANGING_BRANCHES = {
     "receive_response_next_in_sequence": ("new candidate", "counted"),
     "receive_response_block_for_hash": ("committed",),
 }
-"""Handler -> the branches that change the agent. None if no branch does."""
+"""Handler -> the branches that change the agent. None if no branch of the handler changes the agent."""
 
 
 def changes_nothing(outcome: ExpectedOutcome) -> bool:
@@ -248,16 +252,16 @@ def changes_nothing(outcome: ExpectedOutcome) -> bool:
 
 
 COUNTING_HANDLERS = {"receive_vote_add_block", "receive_phase_1_response", "receive_response_next_in_sequence"}
-"""Handlers that only count an answer. A wrong count becomes visible only at the expiry of the timer."""
+"""Handlers that only count an answer. A wrong count becomes visible only when the timer expires."""
 COUNTING_STATES = {
     ("voting", (2, "another's block", "one block waits", 0)),
     ("voting", (2, "another's block", "blocks wait", 0)),
     ("phase one", (2, "another's block", "", 0)),
     ("phase two", (2, "another's block", "", 0)),
 }
-"""Activity and holdings of the states in which the exploration tries more than one answer, and tests ignored answers.
-In all other states an agent counts and decides in the same way. These states have a long chain and an empty stack, so
-one agent can reach them repeatedly.
+"""Pairs of activity and holdings. In states with such a pair, the exploration tries more than one answer, and tests
+answers that the agent must ignore. An agent counts and decides in the same way in all other states. The listed states
+have a long chain and an empty stack, so one agent can reach them repeatedly.
 """
 
 
@@ -278,8 +282,8 @@ def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, g
 
 
 def _outcome_of_timer(snapshot: ModelSnapshot, now: float, name: str, *, counts: bool) -> ExpectedOutcome | None:
-    """Return the handler runs after this input and the next expiry of the timer. `counts` is true for an input that the
-    agent must count, and false for an input that it must ignore.
+    """Return the handler runs of the timer expiry that follows this input. `counts` is true for an input that the agent
+    must count, and false for an input that it must ignore.
 
     Return None if the input is impossible in the saved state, or if `counts` is wrong for this input.
     """
@@ -296,7 +300,9 @@ def _outcome_of_timer(snapshot: ModelSnapshot, now: float, name: str, *, counts:
 
 
 def handlers_and_messages(outcome: ExpectedOutcome) -> tuple[object, ...]:
-    """Return the handlers, branches and message names of these handler runs. They do not depend on block hashes."""
+    """Return the names of the handlers, branches and messages of these handler runs. The names do not depend on block
+    hashes.
+    """
     return tuple((run.handler, run.branch, tuple(message.NAME for message in run.sent)) for run in outcome.runs)
 
 

@@ -1,4 +1,4 @@
-"""Play all generated tests with many agents in parallel. Then repeat the suspected failures with few agents at a time.
+"""Run all generated tests with many agents in parallel. Then repeat the suspected failures with a few agents at a time.
 
 Parallel agents compete for the processor, so a wrong answer may be caused by a slow machine. A suspected failure counts
 only if it occurs in each of several replays.
@@ -33,7 +33,9 @@ from harness.errors import UnsupportedError
 MAX_WORKERS = 24
 """Maximum number of agents in parallel."""
 WORKERS_PER_PASS = 0.01
-"""Increase of the number of agents for each vector that passes, after the number was reduced."""
+"""Increase of the maximum number of parallel agents for each passed vector. It applies after the suite has reduced this
+maximum.
+"""
 MIN_WORKERS = 6
 """Minimum number of agents in parallel on a machine that is often late."""
 STARTS_AT_ONCE = 4
@@ -45,20 +47,22 @@ RETRY_WORKERS = 3
 each other.
 """
 MAX_FAILURES_OF_A_KIND = 3
-"""Number of suspected failures with the same branches. After this number, further vectors with these branches are not
-tested.
+"""Maximum number of suspected failures in which the reference took the same branches. When this number is reached, the
+suite omits the remaining vectors with these branches.
 """
 MAX_RETRIES_OF_A_KIND = 2
 MAX_SUSPICIONS = 24
 """Maximum number of suspected failures that are replayed. When this number is reached, the suite stops its tours."""
 MAX_HIDDEN = 16
-"""Maximum number of ignored answers that are tried as the cause of a failure."""
+"""Maximum number of ignored answers that the suite tests, one after another, as the cause of a failure."""
 MAX_PATH = 80
-"""Maximum number of inputs in a replay that consists of the end of a tour."""
+"""Maximum number of inputs in a replay that repeats only the end of a tour."""
 REPETITIONS = 2
 """Number of replays in which a suspected failure must occur again."""
 MAX_ATTEMPTS = 4
-"""Maximum number of replays, if the machine is late in some of them."""
+"""Maximum number of replays of one suspected failure. The suite needs more than REPETITIONS replays if the machine is
+late in some of them.
+"""
 MAX_FAILED_STARTS = 3
 """Number of consecutive failed starts after which the suite gives up."""
 
@@ -76,7 +80,9 @@ class ConfirmedFailure:
     needs_earlier_round: bool = False
     """True if the agent fails only after an earlier vote or reconcile, and not with the shortest sequence of inputs."""
     unexplained_end: str | None = None
-    """A phrase about the end of the agent, if no short sequence of inputs explains this end. None otherwise."""
+    """A phrase that describes the end of the agent. None if the agent did not end, or if a short sequence of inputs
+    explains its end.
+    """
 
 
 @dataclass
@@ -104,7 +110,7 @@ ReplayOutcome = ConfirmedFailure | ReplayVerdict
 
 
 class VectorSuite:
-    """All generated tests, and the methods that play them. `show_progress` receives the number of passed tests after
+    """All generated tests, and the methods that run them. `show_progress` receives the number of passed tests after
     each change.
     """
 
@@ -129,7 +135,9 @@ class VectorSuite:
         ]
         self._working: Counter[int] = Counter()
         self._on_tour: Counter[int] = Counter()
-        """Variant -> number of its active tours. All other workers of the variant wait for the end of these tours."""
+        """Index of the settings -> number of active tours. While a tour is active, the suite does not abandon tests
+        that no tour can reach, because the active tour may make them reachable.
+        """
         self._kinds: Counter[object] = Counter()
         self._failed_starts = 0
         self._max_suspicions = max_suspicions
@@ -138,10 +146,10 @@ class VectorSuite:
         self._unexplained_ends: set[str] = set()
 
     async def run(self, until: float) -> None:
-        """Play all tests. Then repeat the tests for which the machine was too late, and at the end the suspected
+        """Run all tests. Then repeat the tests for which the machine was too late. At the end, repeat the suspected
         failures.
 
-        No vector begins after the second `until` of the monotonic clock. Raises NoAgentError if the agent never starts.
+        No test begins after `until`, in seconds of the monotonic clock. Raises NoAgentError if the agent never starts.
         """
         workers = min(self._all_workers, 1 + sum(vector_map.left for vector_map in self._maps) // 10)
         await _run_all([self._work(place, until) for place in range(workers)])
@@ -204,7 +212,7 @@ class VectorSuite:
             self._on_tour[number] -= 1
 
     async def _run_tour(self, variant_result: VariantResult, vector_map: VectorMap, until: float) -> None:
-        """Start an agent, and let it play tests in sequence until it fails or no test remains."""
+        """Start an agent, and test it with one vector after another until it fails or no test remains."""
         try:
             async with self._starting:
                 agent = await self._start(variant_result.vectors.variant, False)
@@ -261,7 +269,7 @@ class VectorSuite:
     # Replays with few agents at a time
 
     async def _retry_late(self, late_keys: Iterator[tuple[VariantResult, VectorKey]], until: float) -> None:
-        """Play the tests that were abandoned because the machine was too late at each attempt."""
+        """Repeat the tests that were abandoned because the machine was too late at each attempt."""
         for variant_result, key in late_keys:
             if time.monotonic() >= until:
                 return
@@ -299,8 +307,8 @@ class VectorSuite:
     async def _retry_variants(
         self, variant_result: VariantResult, suspicion: SuspectedFailure
     ) -> AsyncIterator[ReplayOutcome]:
-        """Test a suspected failure with several sequences of inputs, until the agent fails in one. Yield the result of
-        each sequence.
+        """Test a suspected failure with several sequences of inputs, until the agent fails in one. Yield the results. A
+        sequence with an additional answer gives a result only if the agent fails.
 
         The first sequence is the shortest sequence that leads to the state. The next sequences contain an additional
         answer that the agent must ignore. The last sequences are the ends of the original sequence.
@@ -331,8 +339,9 @@ class VectorSuite:
     async def _find_miscounted(
         self, variant: SettingsVariant, path: Sequence[str], failure: ConfirmedFailure, *, needs_earlier_round: bool
     ) -> ConfirmedFailure:
-        """Find out whether the failure disappears without the answers that a certain handler must ignore. Return the
-        failure. If it disappears, the returned failure names this cause.
+        """Find out whether the failure disappears if a certain handler gets no answers that it must ignore. If the
+        failure disappears, return it with this handler as its cause. Otherwise return it with the given value of
+        `needs_earlier_round`.
         """
         counted = _ignored_answers(variant, path)
         for handler in dict.fromkeys(run.handler for run in counted.values()):
@@ -345,8 +354,8 @@ class VectorSuite:
         return replace(failure, needs_earlier_round=needs_earlier_round)
 
     async def _play_repeatedly(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Play these inputs several times. If the agent is right at least once, return RIGHT. Otherwise return the
-        failure of the agent. Return TOO_LATE if the machine was late in too many replays.
+        """Give these inputs to new agents, several times. If an agent is right at least once, return RIGHT. Otherwise
+        return the failure. Return TOO_LATE if the machine was late in too many replays.
         """
         failures = 0
         for _ in range(MAX_ATTEMPTS):
@@ -360,8 +369,8 @@ class VectorSuite:
         return TOO_LATE
 
     async def play(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Give these inputs to a new agent. Return the first failure of the agent. Return RIGHT without a failure, or
-        TOO_LATE if the machine was late.
+        """Give these inputs to a new agent. Return the first failure of the agent. Return RIGHT if the agent made no
+        error, or TOO_LATE if the machine was late.
         """
         try:
             agent = await self._start(variant, True)
@@ -399,7 +408,9 @@ def _single_run(variant: SettingsVariant, path: tuple[str, ...], name: str) -> E
 
 
 def _ignored_answers(variant: SettingsVariant, path: Sequence[str]) -> dict[int, ExpectedRun]:
-    """Return position -> handler run, for each of these inputs that is an answer the agent must ignore."""
+    """Return those of these inputs that are answers which the agent must ignore. The key is the index of the input. The
+    value is the handler run that must ignore the answer.
+    """
     model, now = ReferenceModel(variant.settings), 0.0
     uncounted = {}
     for place, name in enumerate(path[:-1]):

@@ -1,9 +1,9 @@
-"""Let one agent play many generated tests in sequence, along the shortest paths between their states.
+"""Test one agent with many generated tests in sequence, along the shortest paths between their states.
 
-In each state the tour first plays the vectors that do not change the agent, and then one that changes it. If no vectors
-remain in a state, the tour goes to the nearest state with remaining vectors. Many tours run in parallel, and share the
-set of remaining vectors. A deviation of the agent ends its tour with a suspected failure. Another agent continues with
-the other vectors, and the suite later replays the suspected failure.
+A tour is such a sequence. In each state it first runs the vectors that do not change the agent. It then runs one vector
+that changes the agent. If no vectors remain in a state, the tour continues in the nearest state with remaining vectors.
+Many tours run in parallel, and share the set of remaining vectors. A deviation of the agent ends its tour with a
+suspected failure. Another agent continues with the other vectors, and the suite later replays the suspected failure.
 """
 
 import heapq
@@ -22,8 +22,8 @@ TIMER_COSTS = 10.0
 """Cost of a timer expiry on a path. The unit of a cost is about one mission second."""
 INPUT_COSTS = 0.3
 START_COSTS = 100.0
-"""Cost of starting a new agent. A start takes less time than this cost, but it uses processor time that other agents
-need.
+"""Cost of starting a new agent. The cost is higher than the duration of a start, because a start uses processor time
+that other agents need.
 """
 GROWTH_COSTS = 60.0
 """Cost of adding a block to the chain. A chain never becomes shorter, and some vectors need a short chain."""
@@ -46,20 +46,20 @@ class SuspectedFailure:
 
 
 class VectorMap:
-    """The remaining tests for one combination of settings, and a map of the transitions that lead to them."""
+    """The remaining tests for one combination of settings, and a graph of the transitions that lead to these tests."""
 
     def __init__(self, variant: SettingsVariant, transitions: list[AgentTransition], wanted: set[VectorKey]) -> None:
         self.variant = variant
         self.start = state_of(ReferenceModel(variant.settings))
         self._unseen: dict[tuple[str, tuple[str | int, ...]], set[VectorKey]] = defaultdict(set)
-        """Activity and holdings -> the vectors that remain there."""
+        """Activity and holdings -> the vectors that remain in states with these values."""
         self.left = len(wanted)
         for key in wanted:
             self._unseen[key.activity, key.holdings].add(key)
         self._edges: dict[tuple[str, tuple[str | int, ...], tuple[object, ...]], list[tuple[str, AgentState, float]]]
         self._edges = defaultdict(list)
-        """Activity, holdings and relevant counts of a state -> the transitions from this state: input, next state, and
-        cost.
+        """Activity, holdings and relevant counts of a state -> the transitions from this state. Each transition
+        consists of the input, the next state, and the cost.
         """
         self._quiet: set[VectorKey] = set()
         self._growing: set[VectorKey] = set()
@@ -67,7 +67,7 @@ class VectorMap:
         self.given_up: list[VectorKey] = []
         """Vectors for which the machine was late MAX_TRIES times."""
         self.claimed: set[VectorKey] = set()
-        """Vectors that a tour is about to play."""
+        """Vectors that a tour has reserved and will run soon."""
         for transition in transitions:
             if transition.after == transition.before:
                 self._quiet.add(transition.key)
@@ -79,7 +79,7 @@ class VectorMap:
                 self._edges[transition.key[:3]].append((transition.key.input, transition.after, costs))
 
     def unseen_in(self, state: AgentState, ruled_out: Container[VectorKey] = ()) -> VectorKey | None:
-        """Return the next test to play in this state, except those in `ruled_out`. Return None if no test remains.
+        """Return the next test to run in this state, except those in `ruled_out`. Return None if no test remains.
         Inputs that leave the agent unchanged come first, then other inputs, then timers, and last the inputs that make
         the chain longer.
         """
@@ -126,7 +126,7 @@ class VectorMap:
         return True
 
     def give_up(self) -> None:
-        """Remove all tests that have not been played."""
+        """Remove all tests that have not been run."""
         self._unseen.clear()
         self.left = 0
 
@@ -142,7 +142,7 @@ class VectorMap:
         reached.
 
         An empty path means that it is cheaper to start a new agent. `ruled_out` contains tests that were impossible, or
-        that led to a state other than the one in the map.
+        that led to another state than the graph predicts.
         """
         queue: list[tuple[float, int, AgentState | VectorKey, tuple[str, ...]]] = [(0.0, 0, state, ())]
         if state != self.start:
@@ -169,8 +169,8 @@ class VectorMap:
         return None
 
     def leads_to(self, state: AgentState, name: str) -> AgentState | None:
-        """Return the state to which the input leads according to the map. Return None if the map does not contain the
-        input.
+        """Return the state to which the input leads according to the graph. Return None if the graph does not contain
+        the input.
         """
         return next((after for each, after, _ in self._edges_from(state) if each == name), None)
 
@@ -181,7 +181,7 @@ class VectorMap:
 
 
 class AgentTour:
-    """A sequence of tests played by one agent. `passed` is called for each test that passes."""
+    """A sequence of tests of one agent. The tour calls `passed` for each test that passes."""
 
     def __init__(self, vector_map: VectorMap, agent: AgentUnderTest, passed: Callable[[VectorKey], None]) -> None:
         self._map = vector_map
@@ -193,7 +193,8 @@ class AgentTour:
         self._passed = passed
 
     async def run(self, until: float) -> SuspectedFailure | None:
-        """Play tests until the agent deviates, no test remains, or the monotonic clock reaches the second `until`.
+        """Run tests until the agent deviates, no test remains, or the time `until` is reached, in seconds of the
+        monotonic clock.
 
         Return the deviation, or None if the agent did not deviate.
         """

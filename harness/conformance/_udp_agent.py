@@ -64,15 +64,17 @@ class UdpTiming:
     margin_s: float
     """Minimum time between an input and the next timer expiry."""
     early_s: float
-    """Time by which a timer may expire early without a failure."""
+    """Number of seconds by which a timer may expire early without a failure."""
     patience_s: float
-    """Time limit for an expected message."""
+    """Maximum time to wait for an expected message."""
     calm_s: float
-    """Time without a change after which an input counts as handled, if the agent does not report it as handled."""
+    """Time for which the status must have the expected values before an input counts as handled. This time applies to
+    an agent that does not count its handler runs as expected.
+    """
     linger_s: float
     """Additional time to wait for unexpected messages."""
     ask_again_s: float
-    """Time without an expected message after which the harness requests the agent's status."""
+    """Time to wait for an expected message before the harness requests the agent's status."""
 
 
 TIMING_IN_PARALLEL = UdpTiming(
@@ -86,7 +88,7 @@ late machine.
 
 
 class UdpAgent(AgentUnderTest):
-    """An agent that is a process and is tested over UDP."""
+    """An agent under test that runs as a process and exchanges datagrams over UDP."""
 
     def __init__(
         self,
@@ -270,8 +272,8 @@ class UdpAgent(AgentUnderTest):
         return deadline is not None and self._wall_s(deadline) - time.time() < self._timing.early_s
 
     async def _wait_for_timer(self, until: float, name: str) -> str | None:
-        """Wait until the timer expires or a message arrives. If the message is too early, return a sentence. Otherwise
-        return None.
+        """Wait until the timer expires or a message arrives. If a message arrives too early, return a sentence about
+        it. Otherwise return None.
         """
         while time.time() < until and not self.peer_socket.received:
             await self.peer_socket.arrival(until)
@@ -308,8 +310,8 @@ class UdpAgent(AgentUnderTest):
         `since` is the wall time of the input. `deadline` is the mission second of the next timer expiry. If the agent
         counts handler runs differently, its status must have the expected values for some time.
 
-        Return the status, the number of answers, and whether it was too late. Only answers before the deadline count,
-        because they prove that the agent was running and could have handled the input.
+        Return the status, the number of the agent's answers, and true if the time limit was exceeded. Only answers
+        before the deadline count, because they prove that the agent was running and could have handled the input.
         """
         timing = self._timing
         give_up, calm_since = since + timing.patience_s, math.inf

@@ -35,9 +35,9 @@ AGENTS_VEHICLE, PEERS_VEHICLE = 1, 2
 FIRST_PORT = 14600
 MAX_READ_BYTES = 65536
 MAX_REPEATED_REQUESTS, REPEATED_REQUEST_LIMIT_S = 10, 1.0
-"""Number and time limit of additional requests to an agent that did not answer a request within ANSWER_LIMIT_S. An
-agent that answers none of the additional requests counts as hung. If the harness itself pauses, only one of these
-requests is wasted.
+"""Maximum number of additional requests to an agent that did not answer a request within ANSWER_LIMIT_S, and the time
+limit of each additional request in seconds. An agent that answers none of the additional requests counts as hung. If
+the harness itself pauses, only one of these requests is wasted.
 """
 _SO_TIMESTAMPNS = 35
 """A socket option of Linux that has no name in Python."""
@@ -77,7 +77,7 @@ class UdpLab:
         self.remote = remote
         """The agents on another computer. None if the agents under test run here."""
         self.small = small
-        """The profile for small machines applies."""
+        """True if the profile for small machines applies."""
         self._ports = [FIRST_PORT + number for number in range(count)]
         self._lab: Lab | None = None
         self._sockets: dict[int, socket.socket] = {}
@@ -155,7 +155,9 @@ class UdpLab:
     def mission(
         self, variant: SettingsVariant, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS
     ) -> dict[str, Any]:
-        """Return the mission file of an agent on this port. `keys` replace or extend its keys."""
+        """Return the mission file of an agent on this port. `keys` contains keys that replace or extend those of the
+        file.
+        """
         address = self.lab.addresses[AGENTS_VEHICLE]
         return mission(variant, address=address, broadcast=self.lab.broadcast, port=port, speedup=speedup, keys=keys)
 
@@ -190,7 +192,9 @@ class PeerSocket:
         self._arrived = asyncio.Event()
         self.received: list[tuple[float, bytes]] = []
         self.record: list[tuple[float, bool, bytes]] = []
-        """All datagrams that were sent or received: wall time in seconds, true if the agent sent it, and content."""
+        """All datagrams that were sent or received. Each entry contains the wall time in seconds, true if the agent
+        under test sent the datagram, and the content.
+        """
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         with suppress(BlockingIOError):
             while True:
@@ -239,7 +243,7 @@ class ProcessUnderTest:
         self.program = program
         self._incarnation = incarnation
         self.signalled = False
-        """True if the harness has sent a signal. The agent may not answer after it."""
+        """True if the harness has sent a signal to the agent. The agent may no longer answer after a signal."""
 
     @classmethod
     async def start(
@@ -266,7 +270,7 @@ class ProcessUnderTest:
 
     @property
     def last_line(self) -> str:
-        """The last line of the agent's output, or a sentence that there is none."""
+        """The last line of the agent's output, or a sentence that the agent wrote no output."""
         return self.program.last_line or SILENT
 
     async def ready(self) -> None:

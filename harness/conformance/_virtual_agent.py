@@ -1,7 +1,7 @@
 """Test an agent in virtual time: `COMMAND --virtual` reads inputs and writes answers as lines of text.
 
 A test in virtual time does not wait for timers. It also compares the time at which the next timer expires. One process
-plays many incarnations of the agent, one after another.
+runs many incarnations of the agent, one after another.
 """
 
 import asyncio
@@ -89,8 +89,8 @@ class VirtualProgram:
 
 
 class VirtualTimeAgent(AgentUnderTest):
-    """An agent in virtual time, from one start to its end. At its end, its process can be added to the list `idle` for
-    reuse.
+    """An agent in virtual time, from its start to its end. When it ends, its process can be added to the list `idle`
+    for reuse.
     """
 
     def __init__(self, variant: SettingsVariant, program: VirtualProgram, idle: list[VirtualProgram] | None) -> None:
@@ -100,7 +100,7 @@ class VirtualTimeAgent(AgentUnderTest):
         self._now = 0.0
         self._record: list[RecordedDatagram] = []
         self._stopped_timers: dict[float, ExpectedRun] = {}
-        """Former deadline of a stopped timer -> the handler run that stopped it."""
+        """The time at which a stopped timer would have expired -> the handler run that stopped the timer."""
 
     @classmethod
     async def start(
@@ -196,7 +196,7 @@ async def case_of_end(programs: Sequence[VirtualProgram]) -> CaseResult:
 
 def starter(command: Sequence[str], errors: Path) -> tuple[Start, list[VirtualProgram]]:
     """Return a function that starts agents in virtual time, and a list of idle processes. The caller must close these
-    at the end.
+    processes at the end.
     """
     idle: list[VirtualProgram] = []
 

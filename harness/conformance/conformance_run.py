@@ -1,4 +1,4 @@
-"""Test one agent for conformance: play all generated and handwritten tests, and write files about each failure."""
+"""Test one agent for conformance: run all generated and handwritten tests, and write files about each failure."""
 
 import asyncio
 import time
@@ -29,10 +29,10 @@ from harness.errors import MachineError
 from harness.play.remote.agent_pool import PLACES, AgentPool
 
 VIRTUAL_WORKERS = 2
-"""Number of processes of the agent in a test in virtual time."""
+"""Number of agent processes in a test in virtual time."""
 LIMIT_S = 600.0
-"""Time limit of the tours in seconds of wall time. Vectors that remain then are not played. An idle machine needs 100
-s.
+"""Time limit of all tours in seconds of wall time. Vectors that remain after this time are not run. An idle machine
+needs about 100 s for all vectors.
 """
 
 
@@ -48,11 +48,12 @@ class ConformanceRequest:
     virtual: bool = False
     """True to test in virtual time."""
     handwritten: bool = True
-    """True to play the handwritten cases as well, over UDP."""
+    """True to run the handwritten cases as well. They run over UDP."""
     max_suspicions: int = MAX_SUSPICIONS
     limit_s: float = LIMIT_S
     remote: AgentPool | None = None
-    """The agents on another computer, over UDP. `command` is then empty."""
+    """The agents on another computer, which communicate over UDP. `command` is then empty. None if the agents run here.
+    """
     small: bool = False
     """True to apply the profile for small machines."""
 
@@ -70,8 +71,8 @@ def conform(
 ) -> ConformanceResults:
     """Test an agent, and return the results. Raises MachineError, NoAgentError.
 
-    `show_progress` receives the number of passed vectors and the number of all vectors. If `vector_sets` is given, it
-    replaces the vectors that the request selects.
+    `show_progress` is called with the number of passed vectors and the number of all vectors. If `vector_sets` is
+    given, it replaces the vectors that the request selects.
     """
     results = ConformanceResults(request.command, 0.0, datetime.now(UTC).isoformat(timespec="seconds"))
     began = time.monotonic()

@@ -16,7 +16,7 @@ SCHEMA = "ucp-conformance/1"
 CaseVerdict = Literal["passed", "failed", "not applicable", "not tried"]
 TITLES = {handler.algorithm: handler.title for handler in HANDLERS.values()}
 FURTHER_CHECKS = 0
-"""The number that stands in place of an Algorithm number in cases about the program, its datagrams and its files."""
+"""The value that replaces an Algorithm number in cases about the program, its datagrams and its files."""
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ Agents with different settings have different vectors. The vectors for other set
 those for the default settings.
 
 The first line of the file describes the file. Each further line is one step: an input and the expected output. `after`
-is the number of the preceding step. By following these numbers back, a reader finds all steps of a mission. `in` and
-`out` are lines of virtual time (ucp/contract/CONTRACT.md): times are mission seconds, datagrams are in base64, and
-`timer` is the time at which the next timer expires, or null if no timer runs. `says` and `sends` contain the same as
-text.
+is the number of the step before this one. A program that follows these numbers backwards finds all steps of a mission.
+`in` and `out` are lines of virtual time (ucp/contract/CONTRACT.md): times are mission seconds, datagrams are in base64,
+and `timer` is the time at which the next timer expires, or null if no timer runs. `says` and `sends` contain the same
+as text.
 
 Over UDP the agent's own blocks have different timestamps, and therefore different hashes. A reader must replace the
 hashes of the blocks 1.1, 1.2 and so on by those in the agent's export.
@@ -39,7 +39,7 @@ class VectorSet:
     steps: Sequence[AgentTransition]
     """All transitions of the state space."""
     wanted: Mapping[VectorKey, AgentTransition]
-    """The transitions that are vectors. All other transitions only lead to vectors."""
+    """The transitions that are vectors. All other transitions are only steps on the way to a vector."""
 
     @cached_property
     def by_key(self) -> dict[VectorKey, AgentTransition]:
@@ -61,7 +61,7 @@ def generate(only: str | None = None) -> list[VectorSet]:
 
 @cache
 def _all_sets() -> tuple[VectorSet, ...]:
-    """Return all generated tests. They take seconds to compute, so all agents share the result."""
+    """Return all generated tests. Their computation takes seconds, so it happens only once for all tested agents."""
     default_results: dict[VectorKey, tuple[object, ...]] = {}
     generated = []
     for variant in VARIANTS.values():

@@ -46,7 +46,7 @@ def swarm_for(node: pytest.Item) -> Iterator[Swarm]:
 
 
 def scenario_for(node: pytest.Item) -> Iterator[Findings]:
-    """Play the scenario that the marker names. Yield its verdicts and numeric results."""
+    """Run the scenario that the marker names. Yield its verdicts and numeric results."""
     with one_sentence():
         options = SessionOptions.of(node.config)
         path, keys = _marked(node)
@@ -71,7 +71,7 @@ def play(
     *,
     delivers_all: bool = False,
 ) -> Run:
-    """Play and judge a scenario. Raises HarnessError, and KeyboardInterrupt if the run was interrupted."""
+    """Run and judge a scenario. Raises HarnessError, and KeyboardInterrupt if the run was interrupted."""
     with in_force(variant):
         finished = run(scenario, seed, directory, SilentProgress(), backend, delivers_all=delivers_all)
     if finished.played.outcome == "interrupted":
@@ -92,7 +92,7 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
 
 
 def _variant(marked: Any, node: pytest.Item, options: SessionOptions) -> Path | None:
-    """Return the file of the protocol variant. An option of the command line takes precedence over the marker. Raises
+    """Return the file of the protocol variant. A command-line option takes precedence over the marker. Raises
     ScenarioError.
     """
     if marked is not None and not isinstance(marked, str | Path):
@@ -101,9 +101,7 @@ def _variant(marked: Any, node: pytest.Item, options: SessionOptions) -> Path | 
 
 
 def _backend_and_seed(backend: Any, seed: Any, options: SessionOptions) -> tuple[BackendName, int]:
-    """Return the backend and the seed. Options of the command line take precedence over the marker. Raises
-    ScenarioError.
-    """
+    """Return the backend and the seed. Command-line options take precedence over the marker. Raises ScenarioError."""
     if backend not in BACKEND_NAMES:
         *names, last = map(repr, BACKEND_NAMES)
         raise ScenarioError(f"`backend` is {backend!r}: use {', '.join(names)} or {last}")

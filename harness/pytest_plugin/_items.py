@@ -1,4 +1,4 @@
-"""Convert scenarios and stories to tests, one for each backend and seed."""
+"""Create tests from scenarios and stories: one test for each backend and seed."""
 
 from collections.abc import Iterator
 from difflib import unified_diff
@@ -39,7 +39,7 @@ class ScenarioFile(pytest.File):
 
 
 class ScenarioItem(pytest.Item):
-    """The test of one run of a scenario. `pytest_runtest_call` judges the run."""
+    """The pytest item for one run of a scenario. `pytest_runtest_call` judges the run."""
 
     def __init__(self, *, scenario: Scenario, backend: BackendName, seed: int, **node: Any) -> None:
         super().__init__(**node)
@@ -131,7 +131,7 @@ class StoryItem(pytest.Item):
             pytest.fail(f"{self.path} cannot be written: {error.strerror}", pytrace=False)
 
     def _played_text(self, archive: RunArchive) -> str:
-        """Return the text of a story file with the same inputs, but with the reactions of the agents in this run."""
+        """Return the text of a story with the inputs of the story file and the reactions of the agents in this run."""
         narrator = StoryWriter(archive.traces, self._story.scenario.roster)
         answers = [narrator.answer(section, first=number == 0) for number, section in enumerate(self._story.sections)]
         return self._story.with_answers(answers)

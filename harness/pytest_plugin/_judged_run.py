@@ -1,4 +1,4 @@
-"""Judge the run of a test, and compare it with the scenario's expectations."""
+"""Judge the run of a test, and compare its results with the expectations in the scenario."""
 
 import re
 import shlex
@@ -22,10 +22,10 @@ from harness.scenario.expect import Expect
 
 
 class RunOfOneTest:
-    """The run of a test. The function `finish` ends the run and judges it. With the argument true, it first waits until
-    the agents are idle.
+    """The run of one test. The function `finish` ends the run and judges it. If its argument is true, it first waits
+    until the agents are idle.
 
-    `variant` is the file of the protocol variant of the run, or None.
+    `variant` is the file of the protocol variant of the run. It is None if the run uses the original protocol.
     """
 
     def __init__(self, scenario: Scenario, finish: Callable[[bool], Run], variant: Path | None) -> None:
@@ -36,7 +36,7 @@ class RunOfOneTest:
         self.passed = False
 
     def end_of_test(self) -> None:
-        """Raise pytest's exception Failed if the run differs from its expectations."""
+        """Raise pytest's exception Failed if the results of the run differ from the expectations."""
         try:
             finished = self._finish(True)
         except HarnessError as error:
@@ -48,7 +48,7 @@ class RunOfOneTest:
         self.passed = True
 
     def end_of_failed_test(self) -> str:
-        """Return the findings about the run as text. They are printed together with the failure of the test."""
+        """Return the findings about the run as text. pytest prints this text together with the failure of the test."""
         try:
             finished = self._finish(False)
         except HarnessError as error:
@@ -76,7 +76,7 @@ class RunOfOneTest:
         return [*lines, *([f"deliberate mistakes: {wrong}"] if wrong else []), *([ran] if ran else [])]
 
     def _report_lines(self, finished: Run) -> list[str]:
-        """Return lines with the path of the report, and the command that plays the run again."""
+        """Return lines with the path of the report, and the command that repeats the run."""
         variant = [] if self._variant is None else ["--variant", str(self._variant)]
         command = ["ucp-harness", "run", str(finished.directory), "--backend", str(finished.record.backend), *variant]
         return [f"report: {finished.report}", f"again, with seed {finished.record.seed}: {shlex.join(command)}"]
@@ -84,8 +84,8 @@ class RunOfOneTest:
 
 @contextmanager
 def one_sentence() -> Iterator[None]:
-    """Convert an error inside the context to one sentence. Skip the test if the machine cannot play it, and let the
-    test fail for any other error.
+    """Report an exception inside the context as one sentence. Skip the test if this machine cannot run it. Let the test
+    fail after any other exception.
     """
     try:
         yield

@@ -1,8 +1,8 @@
-"""Play a mission that a test controls. Each action of the test is added to the timeline during the run.
+"""Run a mission that a test controls. Each action of the test is added to the timeline during the run.
 
 The test and the mission run in different threads. Real processes therefore continue, and vehicles fly, while the test
 computes or stops in a debugger. Each action that changes the swarm or the network becomes an entry of the scenario's
-timeline. The entry is validated like any other entry, and the recorded scenario can be played again.
+timeline. The entry is validated like any other entry, and the recorded scenario can be run again.
 """
 
 import asyncio
@@ -24,9 +24,9 @@ from harness.scenario.timeline import TimelineEntry
 from ucp.agent import HANDLERS
 
 HOLDABLE = ("message", "sender", "receiver", "block", "count")
-"""Keys of a fate that select messages."""
+"""Keys of an entry in `fates` that select messages."""
 LOOK_EVERY_S = 5.0
-"""Keys of a fate that select the messages to hold back."""
+"""Keys of an entry in `fates` that select the messages to hold back."""
 
 HANDLER_BRANCHES = {name: handler.branches for name, handler in HANDLERS.items()}
 
@@ -34,9 +34,9 @@ Action = Callable[[mission.Swarm], Awaitable[Any]]
 
 
 class LiveTimeline(GrowingTimeline):
-    """The player of a mission that also performs the actions of the test.
+    """The object that runs a mission and performs the actions of the test.
 
-    `play` runs in the thread of the loop, and `started` is set when the mission begins. `queue_action` queues an
+    `play` runs in the thread of the event loop. `started` is set when the mission begins. `queue_action` queues an
     action.
     """
 
@@ -45,9 +45,9 @@ class LiveTimeline(GrowingTimeline):
         self.started: Future[Any] = Future()
         self._actions: asyncio.Queue[tuple[Action, Future[Any]] | None] = asyncio.Queue()
         self._holds: dict[int, dict[str, Any]] = {}
-        """Number of an active hold -> the keys of its fate."""
+        """Number of an active hold (a rule that holds messages back) -> the keys that select its messages."""
         self._completed: dict[int, int] = {}
-        """Agent ID -> number of its completed blocks at the last action."""
+        """Agent ID -> number of blocks that the agent had completed at the last action."""
 
     async def play(self, swarm: mission.Swarm, scenario: Scenario) -> None:
         first, *_ = timeline_of(scenario)
@@ -65,8 +65,8 @@ class LiveTimeline(GrowingTimeline):
         await self.release(swarm)
 
     def queue_action(self, action: Action, answer: Future[Any]) -> None:
-        """Queue an action. `answer` receives its result or its error, unless the run ends before the action is
-        performed.
+        """Queue an action. `answer` receives the result or the error of the action, unless the run ends before the
+        action.
         """
         self._actions.put_nowait((action, answer))
 
@@ -110,7 +110,9 @@ class LiveTimeline(GrowingTimeline):
         self._completed = await swarm.completed()
 
     async def hold(self, swarm: mission.Swarm, **which: Any) -> int:
-        """Hold back matching messages from now on. Return the number of this rule. Raises ScenarioError."""
+        """Hold back matching messages from now on. Return the number of the new rule, which `let_go` needs. Raises
+        ScenarioError.
+        """
         if unknown := next((key for key in which if key not in HOLDABLE), None):
             raise ScenarioError(f"`{unknown}` is unknown: use one of {', '.join(HOLDABLE)}")
         if which in self._holds.values():
@@ -129,9 +131,8 @@ class LiveTimeline(GrowingTimeline):
         return number
 
     async def release(self, swarm: mission.Swarm, **which: Any) -> None:
-        """Deliver the messages held back by one rule, or by all rules if no keys are given.
-
-        Raises ScenarioError if there is no such hold.
+        """Deliver the messages that the rule with these keys holds back. If no keys are given, deliver the messages of
+        all rules. Raises ScenarioError if no rule has these keys.
         """
         if which and which not in self._holds.values():
             held = ", ".join(map(_in_words, self._holds.values())) or "nothing"
@@ -140,7 +141,7 @@ class LiveTimeline(GrowingTimeline):
             await self.let_go(swarm, number)
 
     async def let_go(self, swarm: mission.Swarm, number: int) -> None:
-        """Deliver the messages that this rule holds back, if it is still active."""
+        """Deliver the messages that the hold with this number holds back, if it is still active."""
         if self._holds.pop(number, None) is None:
             return
         document = self.scenario.model_dump()
@@ -250,7 +251,7 @@ class LiveTimeline(GrowingTimeline):
 
 
 def _next_instant(mission_s: float) -> float:
-    """Return a slightly later mission second, by which all earlier messages have been sent."""
+    """Return a slightly later mission second. All messages that agents sent until now have left by then."""
     return round(mission_s + INSTANT_S, 3)
 
 
@@ -259,7 +260,7 @@ def _until(mission_s: float) -> dict[str, float]:
 
 
 def _in_words(which: dict[str, Any]) -> str:
-    """Return the keys in the notation of a test."""
+    """Return the keys as text in the notation that a test uses."""
     return ", ".join(f"{key}={value!r}" for key, value in which.items()) or "every message"
 
 

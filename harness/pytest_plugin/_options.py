@@ -22,14 +22,14 @@ class SessionOptions:
     keep: Path | None
     """Absolute path of the directory in which run directories are kept. None to remove them."""
     in_uml: bool
-    """True if processes are played in User Mode Linux."""
+    """True to run processes in User Mode Linux."""
     image_from_host: bool
-    """True if containers use this machine's files."""
+    """True to let containers use the files of this machine."""
     programs: Programs
     variant: Path | None
     """Absolute path of the file with a protocol variant."""
     rewrite: bool
-    """True if stories are rewritten instead of compared."""
+    """True to rewrite stories. False to compare them with the runs."""
 
     @classmethod
     def of(cls, config: pytest.Config) -> "SessionOptions":

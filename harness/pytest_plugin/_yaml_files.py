@@ -46,7 +46,7 @@ def is_expectation_scenario(path: Path) -> bool:
 
     The section must contain one of the known keys. If the section is empty, all top-level keys of the file must be keys
     of a scenario. If the keys of the section are misspelt, the file must have more keys than `name` and `expect`,
-    because tests of other tools have these two keys.
+    because test files of other tools have these two keys.
     """
     try:
         if not path.is_file() or path.stat().st_size > MAX_BYTES:

@@ -31,12 +31,12 @@ _VERBS = [*(kind.what for kind in TIMELINE_FAULTS), *INJECTIONS]
 
 
 class RunEndedError(Exception):
-    """An error: the run ended before the test, because an agent, a vehicle or the machine failed."""
+    """An error: the run ended before the end of the test, because an agent, a vehicle or the machine failed."""
 
 
 class _ActionContext(AbstractContextManager[None]):
-    """A context manager that holds the result of an action. The end of the `with` block undoes the action, unless the
-    block raised an exception.
+    """A context manager that undoes an action at the end of the `with` block. If the block raises an exception, the
+    action is not undone.
     """
 
     def __init__(self, undo: Callable[[], object]) -> None:
@@ -49,11 +49,11 @@ class _ActionContext(AbstractContextManager[None]):
 
 
 class Swarm:
-    """The value of the fixture `swarm`: agents on any backend, controlled by a test.
+    """The value of the fixture `swarm`: a swarm on any backend that the test controls.
 
-    Times are mission seconds, and agents are named by their IDs. Between two calls, virtual time does not advance. Real
-    processes continue to run, and faults that become due between two calls happen at the next call. Between two
-    actions, all queries of the test describe the same moment. An impossible action raises ScenarioError and changes
+    Times are mission seconds, and agents are named by their IDs. Virtual time does not advance between two calls. Real
+    processes continue to run between two calls. Faults that become due between two calls take effect at the next call.
+    All queries between two actions describe the same moment. An impossible action raises ScenarioError and changes
     nothing. Raises HarnessError if the run cannot start.
     """
 
@@ -93,7 +93,7 @@ class Swarm:
     def partition(self, *groups: list[int], for_s: float | None = None) -> AbstractContextManager[None]:
         """Separate the groups of agents from each other. Agents that are in no group form an additional group.
 
-        `with swarm.partition([1, 2]):` heals at the end of its block.
+        With `with swarm.partition([1, 2]):`, the partition ends at the end of the block.
         """
         __tracebackhide__ = True
         self._change(partition=[list(group) for group in groups], for_s=for_s)
@@ -112,8 +112,8 @@ class Swarm:
     def loss(self, probability: float, for_s: float | None = None) -> AbstractContextManager[None]:
         """Let every receiver lose each message with this probability, from 0 to 1.
 
-        This condition and the following ones last for `for_s` mission seconds, until the end of a `with` block (`with
-        swarm.loss(0.5):`), or for the rest of the run.
+        The condition lasts for `for_s` mission seconds, until the end of a `with` block (`with swarm.loss(0.5):`), or
+        for the rest of the run.
         """
         __tracebackhide__ = True
         return self._for_a_block(loss=probability, for_s=for_s)
@@ -248,7 +248,9 @@ class Swarm:
     # Queries
 
     def characteristic(self, number: int) -> JudgementInTest:
-        """Return the current verdict on a characteristic, 1 to 6: `holds`, `verdict`, `reason` and `evidence`."""
+        """Return the current verdict on a characteristic with the number 1 to 6. The result has the attributes `holds`,
+        `verdict`, `reason` and `evidence`.
+        """
         __tracebackhide__ = True
         return self._findings().characteristic(number)
 
@@ -279,7 +281,9 @@ class Swarm:
         return self.directory / "report.html"
 
     def _findings(self) -> Findings:
-        """Return the verdicts and numeric results. They are computed when the test first reads them after an action."""
+        """Return the verdicts and numeric results. The checker computes them when the test first reads them after an
+        action.
+        """
         __tracebackhide__ = True
         if self._seen is None:
             self._seen = self._judge_by_now(self._run_action(_snapshot))

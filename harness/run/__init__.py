@@ -1,1 +1,1 @@
-"""Play and judge a scenario: one run in a directory or in memory, or many runs on all processor cores."""
+"""Run and judge a scenario. A run takes place in a directory or in memory, and many runs use all processor cores."""

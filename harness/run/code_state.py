@@ -18,16 +18,17 @@ from typing import Literal
 from harness.errors import HarnessError, InterruptedRunError, MachineError
 
 ROOT = Path(__file__).parents[2]
-"""The directory of the running harness."""
+"""The directory that contains the code of the running harness."""
 GRACE_S = 30.0
-"""Seconds that a run may take to stop after SIGTERM, because it first removes its lab."""
+"""Maximum number of seconds until a run stops after SIGTERM. The run first removes its network."""
 
 
 @dataclass(frozen=True)
 class ProcessResult:
-    """The result of a process. `status` is None if it exceeded its time limit and was stopped."""
+    """The result of a process."""
 
     status: int | None
+    """The exit status. None if the process exceeded its time limit and was stopped."""
     stdout: str
     stderr: str
 
@@ -57,10 +58,11 @@ class ProcessResult:
 def run_python(
     arguments: Sequence[str], *, first: Sequence[Path], cwd: Path, limit_s: float | None, stdin: str | None = None
 ) -> ProcessResult:
-    """Run a Python program with this interpreter. The directories `first` come first on its module search path.
+    """Run a Python program with this interpreter. The directories in `first` are at the beginning of its module search
+    path.
 
-    The process has its own session. If the caller is interrupted, the process receives SIGTERM, and SIGKILL after
-    GRACE_S.
+    The process has its own session. If the caller is interrupted, the process receives SIGTERM. If it has not ended
+    after GRACE_S seconds, it receives SIGKILL.
     """
     environment = {
         **os.environ,
@@ -133,9 +135,7 @@ _GIT_LOCATION_VARIABLES = (
     "GIT_COMMON_DIR",
     "GIT_PREFIX",
 )
-"""Environment variables that a hook or `git bisect run` may have set. With these variables, git would use a different
-repository.
-"""
+"""Environment variables that make git use a different repository. A hook or `git bisect run` may have set them."""
 
 
 class RepositoryError(HarnessError):
@@ -144,13 +144,14 @@ class RepositoryError(HarnessError):
 
 @dataclass(frozen=True)
 class GitCommit:
-    """A commit. `files` contains the paths of the changed files."""
+    """A git commit."""
 
     hash: str
     date: str
     author: str
     subject: str
     files: tuple[str, ...] = ()
+    """Paths of the changed files."""
 
     @property
     def sentence(self) -> str:
@@ -159,11 +160,10 @@ class GitCommit:
 
 @dataclass(frozen=True)
 class SuspectCommits:
-    """The result of a search for the first bad commit: one commit, or several candidates if some commits could not be
-    tested.
-    """
+    """The result of a search for the first bad commit."""
 
     first: tuple[str, ...]
+    """Hash of the first bad commit. Several candidates if some commits could not be tested."""
 
 
 class GitBisection:
@@ -207,9 +207,8 @@ class GitBisection:
         return self._next(self._git(self.tree, "bisect", "start", bad, good, accept=(0, 2)))
 
     def mark(self, mark: Mark) -> "str | SuspectCommits":
-        """Record the verdict on the commit that is checked out, and check out the next commit to test.
-
-        Returns the hash of the next commit, or the result of the search.
+        """Record the verdict on the commit that is checked out, and check out the next commit to test. Return the hash
+        of the next commit, or the result of the search.
         """
         return self._next(self._git(self.tree, "bisect", mark, accept=(0, 2)))
 

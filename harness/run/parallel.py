@@ -35,7 +35,9 @@ R = TypeVar("R")
 REDRAW_EVERY_S = 0.1
 LINE_EVERY_S = 10.0
 WAKE_EVERY_S = 1.0
-"""Maximum number of seconds until the parent process handles a signal that arrives just before the process waits."""
+"""Maximum delay in seconds until the parent process handles a signal that arrives just before the process begins to
+wait.
+"""
 
 _FORK = multiprocessing.get_context("fork")
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -80,8 +82,8 @@ def sweep(
 
 
 def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError:
-    """Call `work` with one task in a worker process, and return the result or the error. The parent process passes it
-    to `raise_error`.
+    """Call `work` with one task in a worker process, and return the result or the error. The parent process passes this
+    value to `raise_error`.
     """
     try:
         return work(task)
@@ -219,8 +221,8 @@ def sigterm_as_ctrl_c() -> Iterator[None]:
 def progress_bar(what: str | None, total: int | None) -> Iterator[Callable[[Any], Any]]:
     """Show a progress bar. Yield a function that counts the results passed to it.
 
-    On a terminal it is a bar, and otherwise a line every few seconds. The function draws without a thread, because
-    forking a process with threads is unsafe.
+    On a terminal, the function draws a bar. Elsewhere it prints a line every few seconds. The function uses no thread,
+    because forking a process with threads is unsafe.
     """
     if what is None:
         yield lambda outcome: outcome

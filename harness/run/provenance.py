@@ -1,4 +1,4 @@
-"""Record the versions of the software that played and judged a run. Result files contain them under the key
+"""Record the versions of the software that ran and judged a scenario. Result files contain them under the key
 `versions`.
 """
 
@@ -25,7 +25,8 @@ GIT_LIMIT_S = 5.0
 def versions() -> dict[str, str]:
     """Return the versions of agent core, reference, variant, packages, Python, kernel and platform.
 
-    `commit` is there if the harness runs from a clone. "-dirty" at its end means that files were modified.
+    The key `commit` exists if the harness runs from a git clone. A commit that ends in "-dirty" means that files of the
+    clone were modified.
     """
     commit = _commit()
     return {

@@ -1,4 +1,4 @@
-"""Play one run completely: play the scenario, check it, and write the record, the report and the replay file."""
+"""Perform a complete run: run the scenario, check the result, and write record, report and replay file."""
 
 import asyncio
 import signal
@@ -49,8 +49,8 @@ REPLAY_FILE = "replay.yaml"
 
 
 def replay_of(record: RunRecord, by_hand_s: Collection[float]) -> str:
-    """Return the text of a scenario file that repeats the run. `by_hand_s` contains the times of timeline entries that
-    a user added.
+    """Return the text of a scenario file that repeats the run. `by_hand_s` contains the mission seconds of the timeline
+    entries that a user added during the run.
     """
     assert record.scenario is not None
     document = record.scenario.model_dump(mode="json", exclude_defaults=True)
@@ -69,23 +69,26 @@ def replay_of(record: RunRecord, by_hand_s: Collection[float]) -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its directory, result, record and verdict, and the exit status for the command line.
-
-    `result` is the verdict, `record` the content of run.json, `report` the path of report.html, and `wall_s` the wall
-    time in seconds. `timer_lag` is the lateness of the agents' timers; it is None in virtual time, or if too few are
-    on record.
-    """
+    """A finished run."""
 
     directory: Path
+    """The run directory."""
     played: RunOutcome
+    """The results of the mission."""
     record: RunRecord
+    """The content of run.json."""
     result: checker.Result
+    """The verdict."""
     survival: Survival
     rogue: list[RogueInjection]
     exit_status: int
+    """The exit status for the command line."""
     wall_s: float
+    """The wall time in seconds."""
     report: Path
+    """The path of report.html."""
     timer_lag: TimerLag | None
+    """The lateness of the agents' timers. None in virtual time, and if the traces contain too few timers."""
 
 
 def run(
@@ -99,21 +102,21 @@ def run(
     interventions: Interventions | None = None,
     scheduler: str | None = None,
 ) -> Run:
-    """Play a scenario, check it, and write the run directory. Return the finished run.
+    """Run a scenario, check the run, and write the run directory. Return the finished run.
 
-    - `seed`: 0 or more. It fixes events, faults and everything else that the harness draws.
+    - `seed`: 0 or more. The seed determines events, faults and all other random choices of the harness.
     - `out`: the run directory, new or empty. Without it, a new directory under `runs/`.
-    - `progress`: where the state of the swarm is shown during the run. Without it, nothing is shown.
-    - `backend`: `process` plays in network namespaces, `docker` in containers, `sim` in virtual time.
-    - `delivers_all`: in virtual time, traces also record messages that have no effect, as traces of processes do.
-    - `interventions`: faults that the user requests during the run. They belong to this scenario.
-    - `scheduler`: address of a Dask scheduler, whose workers play the agents. It needs the backend `process`.
+    - `progress`: the display that shows the state of the swarm during the run. None shows nothing.
+    - `backend`: `process` runs the agents in network namespaces, `docker` in containers, and `sim` in virtual time.
+    - `delivers_all`: true to record messages without effect in traces, even in virtual time. Traces of processes always
+      contain them.
+    - `interventions`: faults that the user requests during the run. They must belong to this scenario.
+    - `scheduler`: address of a Dask scheduler, whose workers run the agents. It needs the backend `process`.
 
-    Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end the mission early. The run is then exported and checked as far as it went.
-    Ctrl-C during the check raises InterruptedRunError. The function also works inside a running event loop, for example
-    in a notebook.
-    Raises HarnessError if the run cannot start: the scenario does not suit the backend, the machine lacks something, or
-    `out` is not empty.
+    Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end the mission early. The agents are then exported, and the run is checked up
+    to this moment. Ctrl-C during the check raises InterruptedRunError. The function also works inside a running event
+    loop, for example in a notebook. Raises HarnessError if the run cannot start: the scenario does not suit the
+    backend, the machine lacks something, or `out` is not empty.
     """
     progress = progress or SilentProgress()
     out = out or default_path(scenario.name)
@@ -174,12 +177,12 @@ class RunRecording:
         self._update(outcome="failed", outcome_detail=str(error))
 
     def update_scenario(self, scenario: Scenario) -> None:
-        """Record the played scenario, including the events that the user has requested so far."""
+        """Record the scenario of the run, including the events that the user has requested so far."""
         self._scenario = scenario
         self._update(scenario=scenario)
 
     def record_requests(self, interventions: Interventions) -> None:
-        """Record the actions that the user has requested so far. Also write a scenario that repeats them."""
+        """Record the actions that the user has requested so far. Also write a scenario file that repeats them."""
         self.update_scenario(interventions.scenario)
         by_hand_s = [entry.at_s for entry in interventions.by_hand]
         replay = replay_of(self._record, by_hand_s)
@@ -255,7 +258,7 @@ def _updated(record: RunRecord, **keys: Any) -> RunRecord:
 async def _play_with_requests(
     interventions: Interventions, directory: RunDirectory, swarm: mission.Swarm, scenario: Scenario
 ) -> None:
-    """Play a mission during which a user or another process can request events."""
+    """Run a mission during which a user or another process can request events."""
     async with serve_requests(interventions, directory.path):
         await interventions.story(swarm, scenario)
 

@@ -1,4 +1,4 @@
-"""Play and judge scenarios in virtual time in memory, without a run directory.
+"""Run and judge scenarios in virtual time. All data stay in memory, without a run directory.
 
 The checker is the same as for other runs. The checker reads the evidence directly from the agents instead of from
 files.
@@ -42,9 +42,10 @@ Returned = TypeVar("Returned")
 
 @dataclass(frozen=True)
 class Simulated:
-    """A run in memory: its result (`played`), its evidence, and its verdict (`result`)."""
+    """A run in memory."""
 
     played: RunOutcome
+    """The results of the mission."""
     evidence: Evidence
     result: checker.Result
 
@@ -52,7 +53,7 @@ class Simulated:
 def simulate(
     scenario: Scenario, seed: int, *, tracing: bool = False, deliver_all: bool = False, again: bool = False
 ) -> Simulated:
-    """Play a scenario in virtual time and check it in memory, without a run directory. Return the run.
+    """Run a scenario in virtual time and check the run in memory, without a run directory. Return the run.
 
     - `seed`: 0 or more. The same scenario and seed give the same run.
     - `tracing`: record handler runs. Without handler runs, characteristic 1 cannot be judged, and characteristics 2 and
@@ -74,7 +75,7 @@ def simulate(
 def simulate_in_memory(
     memory: "MemoryRecorder", scenario: Scenario, seed: int, *, again: bool = False, **options: Any
 ) -> Simulated:
-    """Play and check a scenario as `simulate` does, and store the records of the run in `memory`. `options` are the
+    """Run and check a scenario as `simulate` does, and store the records of the run in `memory`. `options` are the
     options of the simulation.
     """
     SimulationBackend().refuse(scenario)
@@ -209,7 +210,7 @@ class MemoryRecorder:
 EVIDENCE_SHOWN = 5
 
 Judge = Callable[[Scenario, int], Result]
-"""A function that plays a scenario with a seed, and checks the run."""
+"""A function that runs a scenario with a seed, and returns the verdict on the run."""
 
 
 @gc_paused()
@@ -219,7 +220,7 @@ def simulated(scenario: Scenario, seed: int) -> Result:
 
 
 def _judge_failures(failures: Sequence[AgentFailedError]) -> Judgement:
-    """Return the verdict on agents that crashed or hung, and whose end is no deviation of a handler."""
+    """Return the verdict on agents that crashed or hung, if their end is not already a deviation of a handler."""
     reason = "; ".join(f"agent {error.agent_id} {error.outcome}" for error in failures)
     findings = [Finding(error.agent_id, f"{error.outcome}: it {error.detail}") for error in failures]
     return Judgement(RUN_CHECKS[ENDED], "violated", reason, findings)

@@ -14,8 +14,8 @@ from harness.play.variant import Variant, core_in_force, load_variant, replaced
 
 @contextmanager
 def in_force(variant: Variant | Path | None) -> Iterator[Variant | None]:
-    """Inside the context, the agents and the checker use a protocol variant, or the variant in a file. If `variant` is
-    None, they use the original protocol. // Processes that are forked inside the context use the variant, too. Raises
+    """Let the agents and the checker use a protocol variant, or the variant in a file, inside the context. If `variant`
+    is None, they use the original protocol. Processes that are forked inside the context use the variant, too. Raises
     VariantError.
     """
     if variant is None:

@@ -1,7 +1,8 @@
 """Compare different records of the same facts. A contradiction between two records is a finding.
 
-Each comparison is a file in this folder: a function from `Evidence` to the `Contradiction`s that it finds. An unaltered
-run has no contradiction. The records contain each kill, restart, reboot, pause, rogue node and full disk.
+Each file in this folder contains a function that compares records in an `Evidence` and yields each `Contradiction`. An
+unaltered run has no contradiction, because its records also list each kill, restart, reboot, pause, rogue node and full
+disk.
 """
 
 from collections.abc import Callable, Iterator
@@ -63,7 +64,7 @@ class RecordComparisons:
     short: dict[int, str]
     """Agent with an incomplete trace -> the reason why the trace is incomplete."""
     unsent: dict[int, int]
-    """Agent -> number of messages that the agent could not send, as the agent counted them."""
+    """Agent -> number of messages that the agent could not send, according to the agent's own count."""
 
     def touching(self, number: str) -> list[Finding]:
         """Return the contradictions that affect the characteristic with this number."""

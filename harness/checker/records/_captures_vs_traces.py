@@ -16,10 +16,12 @@ from harness.checker.records.contradiction import Contradiction, of_agent, slack
 from ucp.trigger import MessageTrigger
 
 COUNTS_DATAGRAMS = "nftables"
-"""The engine that counts each broadcast once. All other engines also count duplicated packets."""
+"""Name of the network engine that counts each broadcast once. All other engines also count the packets that the network
+duplicated.
+"""
 
 Datagrams = Counter[tuple[object, object]]
-"""A count of datagrams by (sender, sequence number)."""
+"""Number of datagrams for each pair of sender and sequence number."""
 
 
 def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:

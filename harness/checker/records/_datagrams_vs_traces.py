@@ -1,13 +1,13 @@
 """Compare the number of datagrams that the kernel delivered to an agent with the datagrams in traces.
 
 A trace has a line for each datagram that its agent handled or dropped. The agent also reads its own broadcasts, which
-it ignores. If it read more datagrams, they are missing in its trace. A datagram that was read at the end of an
-incarnation may be missing, because the agent ended before it handled the datagram. An agent may also use other sockets,
-for example between its processes, so only broadcasts count.
+it ignores. If the agent read more datagrams than these, its trace is incomplete. A datagram that was read at the end of
+an incarnation may be missing, because the agent ended before it handled the datagram. An agent may also use other
+sockets, for example between its processes, so only broadcasts count.
 
 An agent that stops reading its socket also has a trace that looks complete. The module therefore uses the kernel's
-count of broadcasts that arrived at each vehicle. If neither the agent read a broadcast nor the kernel discarded it, it
-is still in the socket.
+count of broadcasts that arrived at each vehicle. If neither the agent read a broadcast nor the kernel discarded it, the
+broadcast is still in the socket.
 """
 
 from bisect import bisect_left, bisect_right
@@ -20,12 +20,12 @@ from harness.checker.records.contradiction import Contradiction, of_agent
 from ucp.trigger import MessageTrigger
 
 UNDER_WAY_WALL_S = 0.25
-"""Seconds of wall time before the end of an incarnation. The agent may not have handled a datagram that it read in this
-time.
+"""Length of the interval before an agent stops, in seconds of wall time. The agent may not have handled a datagram that
+it read in this interval.
 """
 UNREAD_WALL_S = 1.0
-"""Seconds of wall time before the end of an incarnation. The agent may not have read a datagram that was delivered in
-this time.
+"""Length of the interval before an agent stops, in seconds of wall time. The agent may not have read a datagram that
+the kernel delivered in this interval.
 """
 
 

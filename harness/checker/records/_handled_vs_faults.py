@@ -114,7 +114,7 @@ class _CutIntervals:
     def __init__(self, link_losses: list[tuple[float, dict[Link, float]]], slack_s: float) -> None:
         self.slack_s = slack_s
         self._times: dict[Link, list[float]] = defaultdict(list)
-        """Link -> the mission seconds at which the link was cut, restored, cut again, and so on."""
+        """Link -> the mission seconds at which the link was alternately cut and restored. The first one is a cut."""
         for at_s, losses in link_losses:
             for link, loss in losses.items():
                 times = self._times[link]

@@ -55,14 +55,16 @@ MAX_CHANCE = 1e-12
 
 @dataclass
 class _ExpectedDeliveries:
-    """The messages that one receiver should get: their number, and the sums of their smallest and largest loss
-    probabilities.
-    """
+    """The messages that one receiver should get."""
 
     messages: int = 0
+    """Number of messages that the receiver should get."""
     least: float = 0.0
+    """Sum of the smallest loss probability that is possible for each message."""
     most: float = 0.0
+    """Sum of the largest loss probability that is possible for each message."""
     handled: int = 0
+    """Number of messages that the receiver handled."""
     dropped: int = 0
     """Recorded datagrams that arrived at the receiver, but that the receiver did not handle. Some of these datagrams
     may be among `messages`.
@@ -83,7 +85,7 @@ class _ExpectedDeliveries:
 
 
 class _LossHistory:
-    """The probability over time that no copy of a message passes a link."""
+    """The probability that no copy of a message passes a link, at each time of the run."""
 
     def __init__(
         self,
@@ -105,7 +107,9 @@ class _LossHistory:
         self._most = [max(shares) for shares in single]
 
     def range_at(self, link: Link, sent_s: float) -> tuple[float, float]:
-        """Return the minimum and maximum probability that the link loses all copies around this time."""
+        """Return the minimum and maximum probability that the link loses all copies at this time. The clock slack
+        before and after this time is included.
+        """
         losses = self._around(self._times[link], self._losses[link], sent_s)
         fewest = min(self._around(self._changed_at, self._fewest, sent_s))
         most = max(self._around(self._changed_at, self._most, sent_s))
@@ -114,7 +118,9 @@ class _LossHistory:
         return min(losses) * fewest, highest if highest == 1.0 else highest * most
 
     def _around(self, times: list[float], values: list[float], sent_s: float) -> list[float]:
-        """Return the values that apply around this time. Each value applies from its time on."""
+        """Return the values in effect at this time, and during the clock slack before and after it. A value takes
+        effect at the time with the same index in `times`.
+        """
         if len(values) == 1:
             return values
         first = max(0, bisect_right(times, sent_s - self._slack_s) - 1)
@@ -275,10 +281,9 @@ def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterato
 
 
 def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer: bool) -> bool:
-    """Return true if `count` is practically impossible as the number of successes in `number` random draws.
-
-    `means` contains the minimum and maximum of the mean of the draws. If `fewer` is true, the function tests whether
-    the count is too low, and otherwise whether it is too high.
+    """Return true if `count` is practically impossible as the number of successes in `number` random draws. `means`
+    contains the minimum and the maximum probability of a success, averaged over the draws. If `fewer` is true, the
+    function tests whether the count is too low. Otherwise it tests whether the count is too high.
     """
     share = min(1.0, count / number)
     mean = min(1.0, max(0.0, means[0] if fewer else means[1]))

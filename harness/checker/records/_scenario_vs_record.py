@@ -55,7 +55,9 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 def _compare_changes(
     evidence: Evidence, scenario: Scenario, record: JudgedRecord, mission_s: float
 ) -> Iterator[Contradiction]:
-    """Yield each planned change that the record lacks at its time, and each recorded change that was not planned."""
+    """Yield each change of the scenario that is not recorded at its planned time, and each recorded change that the
+    scenario does not contain.
+    """
     first = min(record.roster, default=0)
     latest = max((slack_s(evidence, trace) for trace in evidence.traces.values()), default=ROUNDED_S)
     late_s = 0.0 if any(map(in_virtual_time, evidence.traces.values())) else LATE_WALL_S * scenario.speedup

@@ -11,14 +11,13 @@ from ucp.clock import MICROSECONDS
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """A contradiction between two records. `touches` is the number of the characteristic that depends on the two
-    records, or None without such a characteristic. `short` is true if the contradiction shows that the agent's trace
-    lacks lines.
-    """
+    """A contradiction between two records."""
 
     finding: Finding
     touches: str | None = None
+    """Number of the characteristic that depends on the two records. None if no characteristic depends on them."""
     short: bool = False
+    """True if the contradiction shows that lines are missing in the trace of the agent."""
 
 
 def of_agent(agent_id: int, detail: str, touches: str | None = None, *, short: bool = False) -> Contradiction:

@@ -143,11 +143,11 @@ def receive_vote_add_block(state: ReferenceState, sender: int, message: BlockAdd
 def vote_timer_expiration(state: ReferenceState) -> str:
     """Algorithm 5, Vote Timer Expiration (Section 3.6.2): commit the proposed block, vote again or reconcile.
 
-    By reading 4, the agent votes again if its chain changed during an approved vote. By reading 5, the agent tests the
-    result of the vote before the change of the chain, and a tied vote is not approved. By reading 10, the handler does
-    nothing during a reconcile. The block leaves the deque before it is committed, because the agent contract requires
-    this order of recorded changes. The thesis removes the block last. The setting `asks_after_commit` extends the
-    thesis.
+    According to reading 4, the agent votes again if its chain changed during an approved vote. According to reading 5,
+    the agent tests the result of the vote before the change of the chain, and a tied vote is not approved. According to
+    reading 10, the handler does nothing during a reconcile. The block leaves the deque before it is committed, because
+    the agent contract requires this order of recorded changes. The thesis removes the block last. The setting
+    `asks_after_commit` extends the thesis.
     """
     if state.reconcile_in_progress:
         return "reconcile in progress"
@@ -341,8 +341,8 @@ def reconcile_phase_2_timer_expiration(state: ReferenceState) -> str:
 def reconcile_phase_3(state: ReferenceState) -> str:
     """Algorithm 16, Reconcile Phase 3 (Section 3.6.3): get the chosen block.
 
-    By reading 11, the agent continues with phase 2 after it takes a block from its own stack. Because of characteristic
-    3, it gives up a block that it holds elsewhere.
+    According to reading 11, the agent continues with phase 2 after it takes a block from its own stack. Because of
+    characteristic 3, the agent gives up a chosen block that it already holds elsewhere.
     """
     block_hash = state.majority_response_block_hash
     assert block_hash is not None, "Algorithm 15 chooses a block before it triggers phase 3"
@@ -404,8 +404,8 @@ def reconcile_phase_3_timer_expiration(state: ReferenceState) -> str:
 def reconcile_finalize(state: ReferenceState) -> str:
     """Algorithm 20, Reconcile Finalize (Section 3.6.3): commit the remaining blocks of the reconcile stack again.
 
-    By reading 14, the agent pauses between two commits, and the flag `reconcile_in_progress` stays set during the
-    pause. The setting `asks_after_commit` is an extension of the thesis.
+    According to reading 14, the agent pauses between two commits, and the flag `reconcile_in_progress` stays set during
+    the pause. The setting `asks_after_commit` is an extension of the thesis.
     """
     if state.settings.asks_after_commit and not state.reconcile_in_progress:
         state.send(ChainHashSuccessorQuery(state.chain.top_chain_hash))

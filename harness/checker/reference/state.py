@@ -129,16 +129,17 @@ class Chain:
 
 @dataclass(frozen=True, eq=False)
 class Handler:
-    """An event handler of the protocol, with its Algorithm number.
-
-    `algorithm` is the number of the handler in the thesis. `run` is the function of the algorithm. `tally` names the
-    attribute of the state that contains the handler's vote counts, or the block that it chooses.
-    """
+    """An event handler of the protocol."""
 
     name: str
     algorithm: int
+    """The Algorithm number of the handler in the thesis."""
     run: Callable[..., str]
+    """The function that performs the Algorithm."""
     tally: str | None = None
+    """Name of the attribute of the state in which the handler counts votes or answers, or stores the chosen block. None
+    if the handler does neither.
+    """
 
 
 class ReferenceState:

@@ -2,8 +2,8 @@
 
 The judge gives the recorded inputs of each agent, step by step, to the independent reference
 (`harness.checker.reference`). It compares branch, changes, messages, timers, vote counts and state. It needs only the
-record, so it judges agents in any language, and an edit of `ucp` does not change it. After a difference the judge
-continues from the agent's own state, so one mistake gives one finding.
+recorded files of a run, so it judges agents in any language, and an edit of `ucp` does not change it. After a
+difference the judge continues from the agent's own state, so one mistake gives one finding.
 """
 
 from collections import Counter

@@ -19,9 +19,9 @@ from harness.checker.steps.follower import RecordedTimerExpiry
 from harness.checker.steps.trace_header import ROUNDING_S
 
 SINGLE_WALL_S = 0.03
-"""Seconds of wall time by which a single timer may be late without an explanation."""
+"""Maximum lateness of a single timer, in seconds of wall time, that needs no explanation."""
 MEAN_WALL_S = 0.01
-"""Seconds of wall time by which all expiries of one timer may be late on average without an explanation."""
+"""Maximum mean lateness of one timer's expiries, in seconds of wall time, that needs no explanation."""
 ENOUGH = 8
 """Minimum number of expiries for which a mean is computed."""
 

@@ -1,11 +1,12 @@
-"""Check the code that the judge shares with the agents, if it was edited.
+"""Check the code that the judge shares with the agents, if a user has edited this code.
 
-The reference has its own algorithms, state and settings. It shares only the language in which agents speak: hashes, the
-codec of messages and events, and the format of traces. An edit there could change the agents and the judge alike, so
-that no step differs. The test vectors of the agent contract show such an edit, because they contain the correct bytes.
-The vectors also contain the settings, whose defaults an edit could change for all agents.
+The reference has its own algorithms, state and settings. The reference and the agents share only the formats of their
+data: hashes, the codec of messages and events, and the format of traces. An edit of this shared code could change the
+agents and the judge alike, so that no step differs. The test vectors of the agent contract show such an edit, because
+they contain the correct bytes. The vectors also contain the settings, whose defaults an edit could change for all
+agents.
 
-An installation without an edit needs no check, because its tests have played the vectors.
+An installation without an edit needs no check, because the tests of the project compare the code with the vectors.
 """
 
 import base64
@@ -46,8 +47,8 @@ def edited() -> tuple[str, ...]:
 
 @cache
 def defect() -> str | None:
-    """Return a sentence about the first test vector that the edited shared code contradicts. Return None without
-    one.
+    """Return a sentence about the first test vector that the edited shared code contradicts. Return None if the code
+    agrees with all vectors.
     """
     if not edited():
         return None
@@ -154,7 +155,7 @@ def _missions() -> Iterator[str]:
 
 
 def _is_read(run: HandlerRun, recorded: dict[str, Any]) -> bool:
-    """Return true if a handler run has the values of its trace line."""
+    """Return true if a handler run, read from a trace line, has the values in this line."""
     trigger: dict[str, Any] = recorded["trigger"]
     kind = next(iter(trigger))
     if (run.trigger.kind, run.trigger.subject) != (kind, trigger[kind]):

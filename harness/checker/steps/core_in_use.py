@@ -1,8 +1,8 @@
 """Make the installed agent core `ucp.agent` comparable with the records of an agent.
 
-The verdict on agents comes from the reference. The installed core follows a record in two cases in which its own
-behaviour matters: for a debugger, which stops in the handlers of `ucp`, and for `bisect`, which compares the cores of
-commits.
+The verdict on agents comes from the reference. The installed core repeats the recorded steps in two cases in which its
+own behaviour matters: for a debugger, which stops in the handlers of `ucp`, and for `bisect`, which compares the cores
+of commits.
 """
 
 from dataclasses import asdict
@@ -38,7 +38,7 @@ class _CoreInUse(AdoptingCore, Core):  # type: ignore[misc]  # a core has the at
 
 
 def settings_in_use(header: CheckedHeader) -> Settings:
-    """Return the settings of a trace as settings of the installed core."""
+    """Convert the settings in a trace to the settings class of the installed core."""
     return Settings(**asdict(header.settings))
 
 

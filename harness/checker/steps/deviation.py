@@ -21,22 +21,21 @@ description gives only their number.
 
 @dataclass(frozen=True, slots=True)
 class StepDeviation:
-    """A difference between a step of an agent and the same step of the reference implementation.
-
-    `run` and `expected` are the recorded and the expected handler run. If no handler runs can be compared, `what`
-    describes the difference.
-    """
+    """A difference between a step of an agent and the same step of the reference implementation."""
 
     agent_id: int
     line: int
     t: float
     handler: str | None
     what: str = ""
+    """Description of the difference if there are no two handler runs to compare."""
     run: HandlerRun | None = None
+    """The recorded handler run."""
     expected: HandlerRun | None = None
+    """The handler run of the reference implementation."""
 
     def sentence(self, name: NameOf) -> str:
-        """Return a sentence with the place, the handler, and the actual and expected behaviour."""
+        """Return a sentence with the trace line, the time, the handler, and the actual and expected behaviour."""
         known = HANDLERS.get(self.handler or "")
         handler = f"Algorithm {known.algorithm}, {known.name}: " if known else ""
         return f"trace line {self.line}, t={self.t:g} s: {handler}{self.difference(name)}"

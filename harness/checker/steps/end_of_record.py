@@ -26,10 +26,10 @@ _OF_MESSAGE = {message.NAME: handler for message, handler in ON_MESSAGE.items()}
 
 
 class MessageArrival(NamedTuple):
-    """A message to the agent: mission second, type, sender and sequence number.
+    """A message to the agent, with its type, sender and sequence number.
 
-    If `arrived` is true, a capture shows that the message reached the agent's vehicle at this time. Otherwise the
-    sender sent it at this time, and it may have been lost.
+    If `arrived` is true, a capture shows that the message reached the agent's vehicle at mission second `t`. Otherwise
+    the sender sent the message at mission second `t`, and it may have been lost.
     """
 
     t: float

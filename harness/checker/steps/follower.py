@@ -62,8 +62,8 @@ class NotHandledError(Exception):
 
 
 class RecordedTimerExpiry(NamedTuple):
-    """The expiry of a timer. Its handler ran at mission second `t`, `late_s` mission seconds after the expiry
-    was due.
+    """The expiry of a timer. The handler of the timer ran at mission second `t`. The expiry was due `late_s` mission
+    seconds earlier.
     """
 
     line: int
@@ -74,8 +74,8 @@ class RecordedTimerExpiry(NamedTuple):
 
 
 class OptionalTraceFields(NamedTuple):
-    """The optional fields that this trace contains: the handlers with recorded tallies, and whether the trace records
-    timers.
+    """The optional fields that this trace contains. `tallying` names the handlers whose runs record a tally. `timers`
+    is true if the trace records timers.
     """
 
     tallying: frozenset[str]
@@ -111,11 +111,11 @@ class StepComparer:
         self.deviations: list[StepDeviation] = []
         """The differences found so far, in order."""
         self.expiries: list[RecordedTimerExpiry] = []
-        """Each expiry of a timer of the reference that the agent handled, in order."""
+        """The timer expiries that occurred in the reference and that the agent handled, in order."""
         self.lost: str | None = None
-        """The reason, with a trace line, why the comparison cannot continue. None while the comparison can continue."""
+        """The reason why the comparison cannot continue, with its trace line. None while it can continue."""
         self.stops_before_handler = False
-        """Stop in the debugger before each handler."""
+        """True to stop in the debugger before each handler."""
         self._header = header
         self._parts = parts
         self._blocks = blocks
@@ -125,7 +125,7 @@ class StepComparer:
         self._core = implementation.core(header)
         self._timers = {timer.name: timer for timer in self._core.timers}
         self._ran: dict[str, tuple[int, float]] = {}
-        """Handler -> trace line and mission second of its run since the last input."""
+        """Handler -> number of the trace line, and mission second, of its run since the last input."""
         self._adopted = False
         """True if a difference was found since the last input. The handlers that were triggered since then are not
         compared.
@@ -134,7 +134,7 @@ class StepComparer:
         self._none_ends_before = math.inf
         """Time of the next timer expiry of the reference, on the agent's clock."""
         self._paused = 0, -math.inf
-        """The last pause of the phase 3 timer: trace line, and time on the agent's clock."""
+        """The last pause of the phase 3 timer: the number of the trace line, and the time on the agent's clock."""
         self._top, self._top_hex = b"", ""
         self._state: StateSummary | None = None
         """The last recorded state, as long as the reference is still in this state."""
@@ -291,8 +291,8 @@ class StepComparer:
         return twin
 
     def foresee(self, line: int, run: HandlerRun) -> list[StepDeviation]:
-        """Return the missing or additional triggered handlers that the next handler run reveals. The method runs no
-        handler.
+        """Find the triggered handlers that are missing or additional before the next handler run, and return them as
+        deviations. The method runs no handler.
         """
         foreseeing = self.copy()
         if foreseeing.lost is None:
@@ -300,7 +300,7 @@ class StepComparer:
         return foreseeing.deviations
 
     def end(self, at_s: float | None) -> None:
-        """Report the handlers that the agent had to run before the run ended at `at_s`, but did not run."""
+        """Report the handlers that should have run before the mission ended at `at_s`, but did not run."""
         if self.lost is not None:
             return
         self._not_run()

@@ -14,7 +14,9 @@ class ReferenceCore(AdoptingCore, ReferenceState):
 
 
 class CoreImplementation(NamedTuple):
-    """An agent core and its handlers, indexed by message type, by timer, by local event and by name."""
+    """An agent core and its handlers. The tables of handlers are indexed by message type, by timer, by local event and
+    by handler name.
+    """
 
     core: Callable[[CheckedHeader], AdoptingCore]
     on_message: Mapping[Any, Any]
@@ -29,4 +31,4 @@ def _reference_core(header: CheckedHeader) -> AdoptingCore:
 
 
 REFERENCE = CoreImplementation(_reference_core, ON_MESSAGE, ON_TIMER, ON_LOCAL_EVENT, HANDLERS, tally_of)
-"""The reference implementation, with which agents are judged."""
+"""The reference implementation. The checker judges agents by it."""

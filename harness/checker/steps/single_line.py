@@ -5,9 +5,9 @@ prove a mistake of the agent. The module tries four kinds of damage:
 
 - One character of the line is wrong.
 - The line and the next line are in the wrong order.
-- The line before it is missing. The missing handler run changed no block, so no recorded state reveals it.
-- Several lines before it are missing. They contained answers to one question, which often arrive together, and perhaps
-  the expiry of the timer of this question.
+- The line before this line is missing. The missing handler run changed no block, so no recorded state reveals it.
+- Several lines before this line are missing. They contained answers to one question, which often arrive together. One
+  of them may have contained the expiry of the timer of this question.
 
 An explanation counts only if the reference, after this correction, agrees with the lines that follow.
 """
@@ -67,7 +67,7 @@ COUNTS = frozenset(ON_MESSAGE[kind].name for kind in (BlockAddResponse, ChainCon
 _MESSAGES = {handler.name: kind.NAME for kind, handler in ON_MESSAGE.items()}
 """Name of a handler of messages -> the type of its messages."""
 MAX_LOCAL = 4
-"""Maximum number of handlers that the handler of one lost line may trigger in turn."""
+"""Maximum number of handlers that one lost handler run may have triggered, one after another."""
 
 
 def damage_that_explains(
@@ -101,7 +101,9 @@ def damage_that_explains(
 
 
 def _agrees(follower: StepComparer, lines: Sequence[Line]) -> bool:
-    """Return true if the reference agrees with the lines, up to the first block that has events without a line."""
+    """Return true if the reference agrees with the lines. Lines after the first block with different events do not
+    count.
+    """
     for number, run in lines:
         if number > lines[0][0] and _damage_to_events(follower, run) is not None:
             return True
@@ -232,7 +234,9 @@ def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
 
 
 def _completes_unknown_block(before: StepComparer, deviation: StepDeviation, run: HandlerRun) -> bool:
-    """Return true if a block is full earlier than with the logged events, and no record has the block."""
+    """Return true if the agent completed a block that its recorded events do not fill, and if no record contains this
+    block.
+    """
     expected = deviation.expected
     if deviation.run is not run or expected is None or run.handler != LOGS or expected.changes or not run.changes:
         return False
@@ -263,7 +267,7 @@ def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecord
 
 
 def _with_local_events_more(before: StepComparer, run: HandlerRun) -> Iterator[StepComparer]:
-    """Yield copies of the reference after its next local events."""
+    """Yield copies of the reference. Each copy has run the handlers of some of the next local events."""
     trial = before.copy()
     for _ in range(MAX_LOCAL):
         if not trial.play_lost_local_event(run.t):

@@ -30,9 +30,7 @@ class UnknownSettingError(ImpossibleHeaderError):
 
 @dataclass(frozen=True)
 class CheckedHeader:
-    """The mission that a trace header describes. A timer may expire up to `early_s` mission seconds early and `late_s`
-    mission seconds late.
-    """
+    """The mission that a trace header describes."""
 
     agent_id: int
     roster: frozenset[int]
@@ -41,7 +39,9 @@ class CheckedHeader:
     offset_s: float
     rate: float
     early_s: float
+    """Maximum number of mission seconds by which a timer may expire early."""
     late_s: float
+    """Maximum number of mission seconds by which a timer may expire late."""
     secured: bool = False
     seal: Callable[[bytes, int], bytes] | None = field(default=None, repr=False, compare=False)
     """A function that returns the encrypted event data, if the agent recorded them. None if the mission does not

@@ -1,4 +1,4 @@
-"""Provide the tools for a handwritten test case: start agents, play the other agents, and check messages."""
+"""Provide the tools for a handwritten test case: start agents, simulate their peers, and check messages."""
 
 import asyncio
 import base64
@@ -50,7 +50,7 @@ class HandwrittenCase:
     section: str
     """Section of the thesis or of the agent contract that the case tests."""
     play: Callable[["CaseBench"], Awaitable[None]]
-    """The function that plays the case. It raises WrongBehaviourError if the case fails."""
+    """The function that runs the case. The function raises WrongBehaviourError if the case fails."""
 
 
 ALL_CASES: list[HandwrittenCase] = []
@@ -74,7 +74,7 @@ def require(true: bool, expected: str, received: object) -> None:
 
 
 class BenchAgent:
-    """An agent in a handwritten test case, together with the other agents that the harness plays."""
+    """An agent in a handwritten test case, and the other agents, which the harness simulates."""
 
     def __init__(self, process: ProcessUnderTest, peer_socket: PeerSocket) -> None:
         self.process = process
@@ -82,7 +82,7 @@ class BenchAgent:
         self.agent_id = process.agent_id
         self.epoch_s = 0.0
         self.epoch_us = 0
-        """The start of the mission in the time of the agent's computer."""
+        """Start of the mission in microseconds, on the clock of the agent's computer."""
         self._sequence = 0
 
     async def begin(self, ahead_s: float = 0.0) -> None:
@@ -127,10 +127,8 @@ class BenchAgent:
         require(not received, f"nothing {why}", _names(received))
 
     async def require_single_answer(self, top: bytes, after: str) -> None:
-        """Send the agent a query whether it has this chain. Raises WrongBehaviourError unless its next message is the
-        answer yes.
-
-        This also detects an answer to an earlier message.
+        """Ask the agent whether its chain contains this chain hash. Raises WrongBehaviourError unless the next message
+        of the agent is the answer yes. A late answer to an earlier message therefore also raises this error.
         """
         self.send(2 if self.agent_id != 2 else 3, ChainContainQuery(top))
         (received,) = await self.receive(1, f"an answer to a Chain Contain Query after {after}")
@@ -155,12 +153,16 @@ class CaseBench:
         self.lab = lab
 
     def require_own_machine(self, what: str) -> None:
-        """Raise CannotJudgeError if the agent runs on another computer. `what` names the things not visible here."""
+        """Raise CannotJudgeError if the agent runs on another computer. `what` names the data that are visible only on
+        that computer.
+        """
         if self.lab.remote is not None:
             raise CannotJudgeError(f"{what} of an agent on another computer cannot be seen from here")
 
     def require_large_machine(self, what: str) -> None:
-        """Raise CannotJudgeError if the profile for small machines applies. `what` may be missing in this profile."""
+        """Raise CannotJudgeError if the profile for small machines applies. `what` names the feature that an agent with
+        this profile may lack.
+        """
         if self.lab.small:
             raise CannotJudgeError(f"an agent on a small machine may leave out {what}")
 
@@ -176,7 +178,7 @@ class CaseBench:
     ) -> AsyncIterator[BenchAgent]:
         """Start an agent and wait until it is ready. If `started` is true, also start its mission.
 
-        `keys` replace keys of the mission file. The other arguments are those of `program`.
+        `keys` contains keys that replace those of the mission file. The other arguments are those of `program`.
         """
         async with self.program(keys, prepare=prepare, directory=directory, port=port) as alone:
             await alone.process.ready()

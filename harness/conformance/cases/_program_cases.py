@@ -38,10 +38,10 @@ NO_EXPIRY = {**VARIANTS["default"].settings.to_json(), "vote_timeout_s": 10_000.
 """Settings with which no vote ends during a test case."""
 INPUTS = 50
 SIGNAL_GAP_S = 0.05
-"""Seconds of wall time between two signals. A pending signal would absorb an equal one."""
+"""Seconds of wall time between two signals. The kernel discards a signal if an equal signal is still pending."""
 SECONDS_WITHOUT_EVENT = 20.0
-"""Mission seconds of a test without an event. An agent that draws an event each second logs at least one event in this
-time with a probability of almost 1.
+"""Duration in mission seconds of a test in which the agent must log no event. An agent that draws an event each second
+would log at least one event in this time with a probability of almost 1.
 """
 
 

@@ -67,7 +67,7 @@ class _CaseRecords:
 
 
 async def _play_recorded_mission(bench: CaseBench) -> _CaseRecords:
-    """Play a mission with handler runs of every kind, kill the agent, and return its records."""
+    """Run a mission with handler runs of every kind. Then kill the agent, and return its records."""
     async with bench.agent({"settings": SETTINGS, "roster": [*ROSTER, *PEERS]}) as agent:
         first, second, *_ = PEERS
         block = Block(first, 1, b"block")

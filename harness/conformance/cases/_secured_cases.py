@@ -54,7 +54,7 @@ class SecuredPeers:
         self._sequence = 0
 
     def sealed(self, sender: int, message: Message) -> bytes:
-        """Return the next datagram of an agent that the harness plays, encrypted and signed with this agent's keys."""
+        """Return the next datagram of a simulated agent. It is encrypted and signed with this agent's keys."""
         self._sequence += 1
         return self.sessions[sender].seal(self._sequence, message, None, None, 0)
 
@@ -71,7 +71,7 @@ class SecuredPeers:
             return None
 
     async def receive(self, count: int, what: str) -> "list[OpenedDatagram]":
-        """Return the next datagrams of the tested agent, decrypted with the keys of an agent that the harness plays.
+        """Return the next datagrams of the tested agent. A simulated agent decrypts them with its keys.
 
         Raises WrongBehaviourError if fewer arrive, or if one is not authentic.
         """
@@ -97,8 +97,8 @@ class SecuredPeers:
         return len(received)
 
     async def require_single_answer(self, after: str) -> bytes:
-        """Send the agent a query whether it has the inception block. Raise WrongBehaviourError if its next datagram is
-        not the answer to this query.
+        """Ask the agent whether its chain contains the inception block. Raise WrongBehaviourError if its next datagram
+        is not the answer to this query.
 
         Return the datagram of the request.
         """

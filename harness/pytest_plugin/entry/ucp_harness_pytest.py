@@ -1,9 +1,9 @@
-"""The entry point that pytest loads. It loads the plugin unless other packages have the names of the harness's
-packages.
+"""The module that pytest loads first. It loads the plugin, unless Python would import other packages with the names of
+the harness's packages.
 
 A project may have a folder with the name of one of the harness's packages, and a process can import only one of the
-two. In this case the plugin is not loaded, and the project's tests run as without it. A test that uses a fixture of the
-harness then fails with this reason.
+two. In this case the plugin is not loaded, and the project's tests run as if it were not installed. A test that uses a
+fixture of the harness then fails with this reason.
 """
 
 from __future__ import annotations
