@@ -36,7 +36,7 @@ _FORMS = {f"{key}_s": ".2f" for key in ("docker_up", "process_up", "docker_down"
 
 
 async def once(agents: int, open_lab: OpenLab, directory: Path) -> tuple[float, float]:
-    """Return the seconds in which `agents` agents start, and the seconds in which they stop."""
+    """Return the seconds that `agents` agents take to start, and the seconds that they take to stop."""
     scenario = parse(
         {"name": "up and down", "agents": agents, "vehicles": {"kind": "none"}, "docker": {"image_from_host": True}}
     )

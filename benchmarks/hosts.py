@@ -1,9 +1,10 @@
 """Measure how fast a swarm on several workers starts: `python -m benchmarks.hosts [--workers W] [--json] [N ...]`.
 
 The workers of the Dask cluster are processes of this machine, so they share its processors. A real cluster has more
-processors. Each round plays the start and the end of a mission of N agents, first on the workers and then in one lab
-without Dask (`here`). Up is the time from the beginning until the mission begins, without the import of Dask. Down is
-the time from the end of the mission until all agents have ended. Needs root, or a /dev/net/tun that this user may open.
+processors. Each round plays the start and the end of a mission of N agents. The rows `workers` are measured on the
+workers, and the rows `here` in one lab without Dask. Up is the time from the beginning until the mission begins,
+without the import of Dask. Down is the time from the end of the mission until all agents have ended. Needs root, or a
+/dev/net/tun that this user may open.
 """
 
 from __future__ import annotations

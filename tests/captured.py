@@ -13,7 +13,7 @@ from scapy.utils import RawPcapNgReader
 
 SECTION, STATISTICS = 0x0A0D0D0A, 5
 COMMENT, RECEIVED, DROPPED = 1, 4, 5
-PAYLOAD_AT = 42  # Ethernet, IPv4, UDP
+PAYLOAD_AT = 42  # bytes of the Ethernet, IPv4 and UDP headers
 
 
 class CapturedFrame(NamedTuple):

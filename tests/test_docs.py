@@ -47,7 +47,7 @@ def test_site_has_every_page_and_every_link_target(site: Path) -> None:
     for page in site.rglob("*.html"):
         for target in re.findall(r'(?:href|src)="(?!https?:)([^"#:]+)', page.read_text()):
             if not target.startswith(("/", "data")) and page.name != "404.html":
-                assert (page.parent / target).is_file(), (page, target)  # a folder is no page without a server
+                assert (page.parent / target).is_file(), (page, target)  # without a server, a folder is not a page
 
 
 @pytest.mark.parametrize("page", sorted({*PAGES, *REPOSITORY.glob("*.md")}), ids=lambda page: page.stem)

@@ -119,7 +119,7 @@ class _FastExit:
 
 def _serve(channel: socket.socket) -> None:
     fast_exit = _FastExit()
-    atexit.register(fast_exit)  # before all others, so it is called after them
+    atexit.register(fast_exit)  # registered before all others, so it is called last
     from harness.cli import COMMANDS
     from harness.errors import MachineError
 

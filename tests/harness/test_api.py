@@ -18,7 +18,7 @@ NAMES = [(module, name) for module in PUBLIC for name in importlib.import_module
 @pytest.mark.parametrize(("module", "name"), NAMES, ids=[f"{module}.{name}" for module, name in NAMES])
 def test_public_name_has_a_docstring_of_its_own(module: str, name: str) -> None:
     value = getattr(importlib.import_module(module), name)
-    written = value.__doc__  # inspect.getdoc would take that of a base
+    written = value.__doc__  # inspect.getdoc would return the docstring of a base class
     assert written is not None
     assert not written.startswith(f"{name}("), "a dataclass makes such a docstring itself"
 

@@ -1,6 +1,6 @@
 """Open a virtual network, start programs in it that ignore signals, and wait.
 
-bare.py FOLDER [ENGINE] prints each step on standard output
+`bare.py FOLDER [ENGINE]` prints each step on standard output.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ WITNESS = (
 CONSTANT_S = 0.3
 CONSTANT = LinkConditions(delay=Delay(CONSTANT_S))
 DATA_BYTES = 1000
-EARLY_S = 0.001  # how far the clocks that stamp a packet's way may be apart
+EARLY_S = 0.001  # maximum difference between the clocks that timestamp a packet
 SEEDS = range(1, 6)
 
 
@@ -172,7 +172,7 @@ def test_independent_draws_agree(netem: str, tmp_path: Path) -> None:
         4: LinkConditions(corrupt=0.2),
         5: LinkConditions(delay=Delay(0.3), reorder=0.25),
         6: LinkConditions(0.2, Delay(0.3, 0.1, "normal"), duplicate=0.5, reorder=0.2, corrupt=0.2),
-        7: LinkConditions(delay=Delay(0.1, 0.1, "normal")),  # a sixth of it would be below 0
+        7: LinkConditions(delay=Delay(0.1, 0.1, "normal")),  # a sixth of the delays would be below 0
     }
     links |= {8 + i: LinkConditions(delay=Delay(0.5, 0.2, shape)) for i, shape in enumerate(get_args(Distribution))}
     conditions = NetworkConditions(receivers=links)
@@ -193,7 +193,7 @@ def test_bursts_and_directions_of_a_pair_agree(netem: str, tmp_path: Path) -> No
     links = {
         WITNESS: CONSTANT,
         3: LinkConditions(GilbertElliott(0.05, 0.25)),
-        4: LinkConditions(GilbertElliott(1, 1, loss_bad=0.9, loss_good=0.2)),  # good and bad by turns
+        4: LinkConditions(GilbertElliott(1, 1, loss_bad=0.9, loss_good=0.2)),  # good and bad states alternate
     }
     pairs = {(1, 5): LinkConditions(0.6), (5, 1): LinkConditions(0.2)}
     conditions = NetworkConditions(receivers=links, links=pairs)

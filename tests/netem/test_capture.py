@@ -131,7 +131,7 @@ def test_frames_are_complete_with_checksums_and_vlan_tags(tmp_path: Path) -> Non
 
 
 def test_slow_capture_reports_the_number_of_missing_frames(tmp_path: Path) -> None:
-    count = 15_000  # of the largest datagrams: more than a ring has room for
+    count = 15_000  # number of largest datagrams: more than a ring can hold
 
     async def story(air: Air, capture: LiveCapture) -> None:
         await capture._process.send_signal(signal.SIGSTOP)

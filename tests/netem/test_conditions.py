@@ -87,7 +87,7 @@ def test_delay_of_zero_is_none() -> None:
 def test_the_mean_of_bursts_is_the_loss_in_the_long_run() -> None:
     assert GilbertElliott(0.1, 0.3).mean == pytest.approx(0.25)
     assert GilbertElliott(0.1, 0.3, 0.8, 0.04).mean == pytest.approx(0.23)
-    assert GilbertElliott(0, 0, loss_good=0.2).mean == 0.2  # begins in the good state, and stays
+    assert GilbertElliott(0, 0, loss_good=0.2).mean == 0.2  # begins in the good state and stays in it
     assert GilbertElliott(0.1, 0).mean == 1
 
 
@@ -98,7 +98,8 @@ def test_lossless_link_never_loses_a_packet() -> None:
     assert LinkConditions(GilbertElliott(0, 0.5)).lossless
     assert LinkConditions(GilbertElliott(0.5, 0.5, loss_bad=0)).lossless
     assert not LinkConditions(GilbertElliott(0.5, 0.5)).lossless
-    assert not LinkConditions(GilbertElliott(0.5, 0, 0, loss_good=0.1)).lossless  # mean 0, but not at first
+    # A mean of 0, but a different value at first.
+    assert not LinkConditions(GilbertElliott(0.5, 0, 0, loss_good=0.1)).lossless
     assert not LinkConditions(0.1).lossless
     assert LinkConditions(rate=1e6).lossless
     assert not LinkConditions(rate=1e6, limit=1000).lossless

@@ -114,7 +114,7 @@ def test_nothing_crosses_a_partition_and_healing_restores_everything(engine: str
         assert await crossings(air, [1, 2, 3, 4]) == all_of([(1, 2), (3, 4)])
         before = await lab.read()
         assert all(figures.cut > 0 and figures.lost == 0 for figures in before.receivers.values())
-        # Other groups, with one vehicle that stays where it was and one alone.
+        # Other groups. One vehicle stays in its group, and one is alone.
         await lab.apply(NetworkConditions().with_partition([[1, 3, 4], [2]]))
         assert await crossings(air, [1, 2, 3, 4]) == all_of([(1, 3), (1, 4), (3, 4)])
         applied = await lab.apply(NetworkConditions())
@@ -149,7 +149,7 @@ def test_a_partition_cuts_every_protocol_in_both_directions_at_once(engine: str,
             times = heard[receiver - 1][addresses.mac(sender)]
             assert times.keys() == ETHERTYPES.keys()
             for index, (asked_ns, cut_ns, heal_ns, healed_ns) in enumerate(rounds):
-                # a busy machine may stop a sender between the time that it writes down and its sending: one frame's
+                # a busy machine may stop a sender between its timestamp and the sending
                 held = [
                     at_ns for kind in times.values() for at_ns, came_ns in kind if cut_ns < at_ns < heal_ns <= came_ns
                 ]
@@ -164,7 +164,7 @@ def test_a_partition_cuts_every_protocol_in_both_directions_at_once(engine: str,
                     took_ns.append((index, max(before, default=0) - asked_ns))
 
     in_lab([1, 2], engine, tmp_path, story)
-    # The machine may be busy with something else at the moment of a command, but not at each of them.
+    # The machine may be busy during one command, but not during every command.
     slowest = {index: max(took for other, took in took_ns if other == index) for index, _ in took_ns}
     assert min(slowest.values()) <= 50_000_000, f"packets crossed until {min(slowest.values()) / 1e6} ms later"
 

@@ -189,7 +189,7 @@ def test_end_of_a_program_is_reported_correctly(tmp_path: Path) -> None:
         assert endless.returncode is None
         await endless.send_signal(signal.SIGUSR1)
         assert await endless.wait() == -signal.SIGUSR1
-        await endless.send_signal(signal.SIGKILL)  # too late, and no harm
+        await endless.send_signal(signal.SIGKILL)  # too late, which does no harm
 
     in_lab(tmp_path, story)
 
@@ -262,7 +262,7 @@ def test_a_connection_is_made_inside_the_vehicle(tmp_path: Path) -> None:
 
 def test_connection_without_listener_times_out_and_delays_no_other(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
-        # Loss of everything: not even the ARP answer comes, so connecting hangs.
+        # All packets are lost, even the answer to ARP. Therefore a connection attempt does not end.
         await lab.apply(NetworkConditions().with_partition([[1]]))
         hanging = asyncio.create_task(lab.connect(1, PORT, host=lab.addresses[2], timeout_s=0.5))
         assert "alive" in await output(lab, tmp_path, 1, "/bin/echo", "alive")

@@ -75,7 +75,7 @@ def test_a_killed_orchestrator_leaves_nothing(tmp_path: Path, after_s: float) ->
     with orchestrator_in(tmp_path) as orchestrator:
         assert orchestrator.stdout is not None
         assert orchestrator.stdout.readline() == b"opening\n"
-        time.sleep(after_s)  # the moment is the input of this test, nothing is waited for
+        time.sleep(after_s)  # the time of the kill is the input of this test; the test waits for nothing
         marked = processes_of(tmp_path)
         inhabited = namespaces_of(marked)
         during = interfaces()

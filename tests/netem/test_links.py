@@ -64,11 +64,11 @@ def test_delays_have_the_requested_mean_deviation_and_shape(netem: str, tmp_path
         applied = await air.lab.apply(to_each({vehicle: LinkConditions(delay=it) for vehicle, it in shapes.items()}))
         assert {vehicle: applied.receivers[vehicle].link.delay for vehicle in shapes} == shapes
         found = await heard(air, 1, shapes, PACKETS)
-        late_s = statistics.median(found[2]["delays_s"]) - shapes[2].mean_s  # for this machine does other things, too
+        late_s = statistics.median(found[2]["delays_s"]) - shapes[2].mean_s  # because this machine also does other work
         for vehicle, delay in shapes.items():
             delays_s = found[vehicle]["delays_s"]
             assert sorted(found[vehicle]["numbers"]) == list(range(PACKETS))
-            # Five standard errors of a normal distribution's median, and the clocks' grain.
+            # Five standard errors of the median of a normal distribution, plus the resolution of the clocks.
             early_s = 5 * 1.2533 * delay.jitter_s / math.sqrt(PACKETS) + 0.001
             assert -early_s < statistics.median(delays_s) - median(delay) < late_s + LATE_S, delay
             if delay.distribution in ("uniform", "normal"):
@@ -77,7 +77,7 @@ def test_delays_have_the_requested_mean_deviation_and_shape(netem: str, tmp_path
                 width = delay.jitter_s * (1 if delay.distribution == "uniform" else 1.349)
                 assert three_quarters - quarter == pytest.approx(width, rel=0.15, abs=0.005)
                 assert min(delays_s) > delay.mean_s - delay.jitter_s * (1 if delay.distribution == "uniform" else 5)
-            else:  # few very late ones
+            else:  # few very long delays
                 assert skewness(delays_s) > 1
 
     in_lab(range(1, 7), netem, tmp_path, story)
@@ -105,7 +105,7 @@ def test_bursts_are_as_requested_and_independent_between_links(netem: str, tmp_p
         found = await heard(air, 1, {2: bursts, 3: bursts, 4: soft}, PACKETS)
         got = {vehicle: set(result["numbers"]) for vehicle, result in found.items()}
         for vehicle in (2, 3):
-            # Losses show the state, so count its changes from packet to packet.
+            # Losses show the state. Therefore count the changes of the state from packet to packet.
             pairs = Counter((number in got[vehicle], number + 1 in got[vehicle]) for number in range(PACKETS - 1))
             assert_binomial(pairs[True, False], pairs[True, False] + pairs[True, True], bursts.p)
             assert_binomial(pairs[False, True], pairs[False, True] + pairs[False, False], bursts.r)
@@ -133,7 +133,7 @@ def test_shares_of_duplicates_reorders_and_corruptions_are_as_requested(netem: s
         assert len(found[3]["numbers"]) == PACKETS
         assert_binomial(sum(delay_s < 0.1 for delay_s in found[3]["delays_s"]), PACKETS, 0.25)
         assert found[3]["numbers"] != sorted(found[3]["numbers"])
-        # Of the Ethernet frame 12 bytes of addresses have no checksum.
+        # The 12 bytes of addresses in an Ethernet frame have no checksum.
         assert set(found[4]["numbers"]) <= set(range(PACKETS))
         lost = PACKETS - len(found[4]["numbers"])
         assert_binomial(lost, PACKETS, 0.2 * (1 - 12 / (size + HEADERS)))
@@ -229,7 +229,7 @@ def test_kernel_applies_any_conditions_of_any_pair(netem: str, tmp_path: Path) -
 
 def test_refused_change_leaves_the_previous_conditions_in_force(netem: str, tmp_path: Path) -> None:
     good = NetworkConditions(LinkConditions(0.1), links={(1, 2): LinkConditions(0.2, Delay(0.1))}).with_partition([[3]])
-    # A jitter has 31 bits of nanoseconds in the kernel, which takes more and holds less.
+    # The kernel stores a jitter with 31 bits of nanoseconds. It accepts a larger value, but stores a smaller one.
     far = NetworkConditions(LinkConditions(0.5), {2: LinkConditions(delay=Delay(10, 5))})
 
     async def story(air: Air) -> None:

@@ -100,7 +100,7 @@ def test_delay_excludes_the_lateness_of_the_machine() -> None:
     jittered = [(number, sent_s[number] + (0.09, 0.11)[number % 2]) for number in range(100)]
     deviation = estimates.delay_deviation(received(jittered, sent_s, MachineLateness([0.0] * 100, [0.0, 0.004])))
     assert (deviation.measured, deviation.high) == pytest.approx((0.01, 0.01))
-    assert deviation.low == pytest.approx(math.sqrt(0.01**2 - 0.002**2))  # timers may have added theirs
+    assert deviation.low == pytest.approx(math.sqrt(0.01**2 - 0.002**2))  # timers may have added their delay
 
 
 def test_rate_is_measured_in_the_longest_queue() -> None:
@@ -117,12 +117,12 @@ def test_rate_is_measured_in_the_longest_queue() -> None:
 def test_limit_is_the_number_waiting_at_a_loss() -> None:
     sent_s = [number * 0.01 for number in range(100)]
     received_packets: list[tuple[int, float]] = []
-    for number, now in enumerate(sent_s):  # each waits 95 ms; three may
+    for number, now in enumerate(sent_s):  # each waits 95 ms, and three packets may wait
         if sum(at > now for _, at in received_packets) < 3:
             received_packets.append((number, now + 0.095))
     found = estimates.waiting_when_lost(received(received_packets, sent_s), delay_s=0.095)
     assert (found.low, found.measured, found.high) == (3, 3, 3)
-    late = [(number, at + 0.01) for number, at in received_packets]  # a fourth seems to wait still, now and then
+    late = [(number, at + 0.01) for number, at in received_packets]  # sometimes a fourth packet seems to wait
     found = estimates.waiting_when_lost(received(late, sent_s), delay_s=0.095)
     assert found.low <= 3 <= found.high
     rarely = [(number, at + 0.01 * (number < 9)) for number, at in received_packets]
@@ -211,12 +211,12 @@ def test_wrong_conditions_are_found(condition: str) -> None:
 
 @pytest.mark.lab
 def test_answers_with_real_packets_are_ok(engine: EngineName) -> None:
-    for _ in range(2):  # a machine that was busy for a while is not an engine that is wrong
+    for _ in range(2):  # a machine that was busy for some time does not mean that the engine is wrong
         measured = measure(engine, studies(engine), in_lab(engine))
         if measured.ok:
             break
     assert [row.to_json() for row in measured.rows if not row.ok] == []
-    # A busy machine is sent packets so slowly that few wait for a rate.
+    # On a busy machine, packets are sent so slowly that few of them wait for the rate.
     assert all(row.answer.packets >= 5000 for row in measured.rows if row.question.quantity != "rate")
 
 

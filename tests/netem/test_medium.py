@@ -188,7 +188,7 @@ def test_partition_drops_packets_before_the_queue() -> None:
 
 
 def test_bursts_restart_at_new_conditions_but_not_at_a_partition() -> None:
-    bursts = NetworkConditions(LinkConditions(GilbertElliott(1, 0)))  # good for one packet, then bad for good
+    bursts = NetworkConditions(LinkConditions(GilbertElliott(1, 0)))  # good for one packet, and then bad forever
     air = medium(conditions=bursts)
     heard = [bool(draw(air, 0).copies_to(1)) for _ in range(2)]
     air.apply(bursts.with_partition([[3]]))

@@ -55,5 +55,5 @@ def test_undo_of_a_partial_change_sets_all_losses_again() -> None:
     engine.change(NetworkConditions())
     whole = sum(engine.sent)
     engine.sent.clear()
-    engine.change(NetworkConditions())  # nothing differs any more: the partition's rules only
+    engine.change(NetworkConditions())  # the conditions are already equal, so only the rules of the partition
     assert sum(engine.sent) < whole

@@ -37,13 +37,13 @@ class Resource:
     content: bytes
     status: int = 200
     headers: dict[str, str] = field(default_factory=dict)
-    ranges: bool = True  # heeds Range and If-Range
+    ranges: bool = True  # the server supports Range and If-Range
     heeds_if_range: bool = True
-    range_from: int | None = None  # where a partial answer begins, if not where it was asked to
-    cut_after: int | None = None  # bytes; the connection is closed then
-    silent_after: int | None = None  # bytes; nothing more comes then, and the connection stays
-    announced: int | None = None  # Content-Length, if not the true one
-    sized: bool = True  # Content-Length at all
+    range_from: int | None = None  # first byte of a partial answer, if it is not the requested one
+    cut_after: int | None = None  # number of bytes after which the server closes the connection
+    silent_after: int | None = None  # number of bytes after which the server sends nothing more
+    announced: int | None = None  # the value of Content-Length, if it is wrong
+    sized: bool = True  # whether the answer has a Content-Length
     chunked: bool = False
     etag: bool = True
 

@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from sitl.vehicle import Home, VehicleType
 
 HOME = Home(-35.363262, 149.165237, 584.0, 270.0)
-DEADLINE_S = 20.0  # generous for a busy machine; tests do not wait that long
+DEADLINE_S = 20.0  # long enough for a busy machine; tests do not wait for this time
 
 
 T = TypeVar("T")

@@ -121,7 +121,7 @@ def test_copter_in_guided_mode_flies_to_places_and_stays() -> None:
     assert math.dist(cockpit.place, here) > 20
     cockpit.fly(100.0)
     assert cockpit.place == pytest.approx(there, abs=0.02)
-    cockpit.tell(position_target(LocalPlace(0, 0, 25), mask=0x0DFF))  # a velocity or nothing, but no place
+    cockpit.tell(position_target(LocalPlace(0, 0, 25), mask=0x0DFF))  # a velocity or nothing, but no position
     assert cockpit.tell(reposition(LocalPlace(0, 0, 25)))[0].result == ACCEPTED
     cockpit.fly(200.0)
     assert cockpit.place == pytest.approx((0, 0, 25), abs=0.02)

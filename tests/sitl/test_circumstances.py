@@ -187,7 +187,7 @@ def test_silent_vehicle_is_not_reported_as_unsupported(
     async def ask() -> None:
         async with on_strings(tmp_path) as (pilot, puppet):
             puppet.tamper = lambda frame: b""
-            await asyncio.sleep(0.1)  # messages under way arrive in this time
+            await asyncio.sleep(0.1)  # messages in transit arrive in this time
             if leaves:
                 puppet.leave()
             with pytest.raises(
@@ -313,7 +313,7 @@ def test_pilot_asks_for_no_telemetry_that_arrives_after_a_battery_failsafe(tmp_p
             listening = asyncio.create_task(pilot.stay_in_touch())
             while not puppet.vehicle.failsafes.acting:
                 await asyncio.sleep(0.01)
-            puppet.vehicle.simulate("SIM_GPS1_ENABLE", 0.0)  # its checks before arming now fail for good
+            puppet.vehicle.simulate("SIM_GPS1_ENABLE", 0.0)  # its checks before arming fail from now on
             while pilot.state.ready_to_arm:
                 await asyncio.sleep(0.01)
             asked: list[int] = []

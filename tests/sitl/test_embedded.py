@@ -99,7 +99,7 @@ def test_vehicle_climbs_hovers_lands_and_disarms() -> None:
         until(lambda: altitude(client) == pytest.approx(20.0), "at 20 m")
         places = {(place.lat, place.lon) for place in (client.wait_for("GLOBAL_POSITION_INT") for _ in range(10))}
         assert places == {(round(HOME.lat_deg * 1e7), round(HOME.lon_deg * 1e7))}
-        assert client.command(ARM, 0) == FAILED  # not up there
+        assert client.command(ARM, 0) == FAILED  # not in the air
         assert client.command(SET_MODE, 1, LAND) == ACCEPTED
         until(lambda: not client.wait_for("HEARTBEAT").base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED, "disarmed")
         assert altitude(client) == 0.0
@@ -174,7 +174,7 @@ def test_slow_client_delays_neither_vehicle_nor_other_clients() -> None:
         client = Client(vehicle.pilot_port)
         slow.connect(("127.0.0.1", vehicle.agent_port))
         ask = mavlink.MAVLink_command_long_message(3, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, 30, *[0.0] * 6)
-        frames = ask.pack(client.mav) * 100_000  # answers of some 7 MB, to one who reads none
+        frames = ask.pack(client.mav) * 100_000  # answers of about 7 MB to a client that reads none
         slow.settimeout(DEADLINE_S)
         slow.sendall(frames)
         take_off(client)
@@ -200,7 +200,8 @@ def test_vanished_clients_are_forgotten() -> None:
     with embedded() as vehicle:
         for _ in range(10):
             sock = connect(vehicle.agent_port)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # a reset, no farewell
+            # The connection is reset, and not closed.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
             sock.close()
         Client(vehicle.agent_port).wait_for("HEARTBEAT")
 
@@ -210,7 +211,7 @@ def test_simulated_time_stops_with_the_process() -> None:
         client = Client(vehicle.pilot_port)
         before_ms = client.wait_for("SYSTEM_TIME").time_boot_ms
         vehicle.process.send_signal(signal.SIGSTOP)
-        time.sleep(1.0)  # not for luck: this is how long it stands
+        time.sleep(1.0)  # not a wait for luck: the vehicle is suspended for this time
         vehicle.process.send_signal(signal.SIGCONT)
         after = until(lambda: (m := client.wait_for("SYSTEM_TIME")).time_boot_ms > before_ms + 3_000 and m, "going on")
         assert after.time_boot_ms - before_ms < 15_000

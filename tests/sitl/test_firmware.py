@@ -122,7 +122,7 @@ def test_second_install_downloads_nothing(server: FirmwareServer, environ: dict[
     install_copter(server, environ)
     server.asked.clear()
     assert install_copter(server, environ).already
-    assert [path for path, _ in server.asked] == [f"{RELEASE}git-version.txt"]  # has stable moved on?
+    assert [path for path, _ in server.asked] == [f"{RELEASE}git-version.txt"]  # whether the stable version has changed
 
 
 @pytest.mark.parametrize("version", ["4.6.3", "stable-4.6.3"])
@@ -146,7 +146,7 @@ def test_new_stable_release_is_current_and_the_old_one_is_kept(server: FirmwareS
     assert [one.directory.name for one in all_installed("copter", environ)] == ["4.6.3", "4.7.0"]
     assert current("copter", environ) == new
     assert old.damage is None
-    assert install_copter(server, environ, "4.6.3").already  # and back
+    assert install_copter(server, environ, "4.6.3").already  # and back to the first version
     assert the_binary(environ) == BINARY
 
 
@@ -166,7 +166,7 @@ def test_plane_parameters_are_found_in_the_old_place(server: FirmwareServer, env
     assert (installed.directory / "plane.parm").read_bytes() == b"ARSPD_FBW_MAX 30\n"
 
 
-# What breaks off goes on, if it is the same file.
+# An interrupted download continues, if the file is still the same.
 
 
 def test_interrupted_download_is_resumed(server: FirmwareServer, environ: dict[str, str]) -> None:
@@ -421,7 +421,7 @@ def test_impossible_cache_names_the_solution(server: FirmwareServer, tmp_path: P
 def test_read_only_cache_names_the_solution(
     server: FirmwareServer, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def read_only(path: Path, *_: object, **__: object) -> None:  # root may write anywhere, so it is played
+    def read_only(path: Path, *_: object, **__: object) -> None:  # root may write anywhere, so the error is simulated
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
 
     monkeypatch.setattr(Path, "mkdir", read_only)
@@ -437,7 +437,7 @@ def test_full_disk_is_reported(server: FirmwareServer, environ: dict[str, str]) 
         install_copter(server, environ)
     (part / "copter.parm").unlink()
     install_copter(server, environ)
-    assert server.ranges_of("arducopter") == [None]  # the binary was there
+    assert server.ranges_of("arducopter") == [None]  # the binary was installed before
 
 
 def test_missing_home_gives_no_cache() -> None:

@@ -43,7 +43,7 @@ def test_items_are_requested_in_order_and_acknowledged() -> None:
     cockpit = Cockpit()
     assert answer(cockpit, count(2)) == ("MISSION_REQUEST_INT", 0)
     assert answer(cockpit, item(0)) == ("MISSION_REQUEST_INT", 1)
-    assert cockpit.vehicle.mission == ()  # not before it is whole
+    assert cockpit.vehicle.mission == ()  # not before the mission is complete
     assert answer(cockpit, item(1)) == ("MISSION_ACK", mavlink.MAV_MISSION_ACCEPTED)
     assert [one.seq for one in cockpit.vehicle.mission] == [0, 1]
 

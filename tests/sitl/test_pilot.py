@@ -139,7 +139,7 @@ def test_garbage_is_counted_and_not_logged(tmp_path: Path) -> None:
         channel.send_due()
         frames = channel.take()
         pilot.link.data_received(b"garbage" + frames + b"\x00" * 300)
-        for byte in frames:  # the same, in crumbs
+        for byte in frames:  # the same bytes, one by one
             pilot.link.data_received(bytes([byte]))
         assert pilot.state.garbage == 2
         assert pilot.state.messages == 12

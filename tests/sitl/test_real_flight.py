@@ -16,8 +16,9 @@ from tests.sitl.flying import HOME
 from tests.sitl.real_flight import PLANS, track_of
 
 WAYS: list[By] = ["mission", "guided"]
-LATE_S, APART_M = 5.0, 6.0  # copters and rovers: so late, and then so near
-PLANE_APART_M, PLANE_BESIDE_M = 80.0, 40.0  # planes: at the same second, and from their path over the ground
+LATE_S, APART_M = 5.0, 6.0  # copters and rovers: maximum delay in seconds, and maximum distance at this time in metres
+# Planes: maximum distance at the same second, and from the path over the ground, in metres.
+PLANE_APART_M, PLANE_BESIDE_M = 80.0, 40.0
 
 
 @pytest.mark.ardupilot

@@ -16,7 +16,7 @@ from tests.sitl.recorded import Name, frames, messages
 from ucp.telemetry import EVENT_KINDS, POSITION, STATUS_TEXT, WAYPOINT, Position, TelemetryEvents, describe
 
 HOME = Home(-35.363262, 149.165237, 584.0)
-FIELD_M = 200.0  # vehicles stood at most so far from HOME
+FIELD_M = 200.0  # maximum distance of the standing vehicles from HOME in metres
 GOOD_S: dict[Name, float] = {"copter-mission": 22.9, "plane-mission": 21.9, "plane-guided": 21.9, "rover-mission": 42.1}
 
 

@@ -191,7 +191,7 @@ def recorded() -> Iterator[set[Branch]]:
 
     with pytest.MonkeyPatch.context() as patch:
         run = property(recording, lambda handler, run: vars(handler).update(run=run))
-        patch.setattr(EventHandler, "run", run, raising=False)  # goes before the instance's `run`
+        patch.setattr(EventHandler, "run", run, raising=False)  # replaces the `run` of the instance
         yield taken
 
 

@@ -48,7 +48,7 @@ def test_hostile_datagram_is_counted_and_changes_no_state(datagrams: list[bytes]
     for datagram in datagrams:
         try:
             sender, _, _ = decode(datagram)
-            acceptable += sender == 2  # a cut that cut nothing off
+            acceptable += sender == 2  # a cut that removed nothing
         except ValueError:
             pass
         if acceptable:

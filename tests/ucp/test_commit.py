@@ -29,7 +29,7 @@ def test_a_block_is_full_when_the_largest_event_might_not_fit_any_more() -> None
     air.log(1, bytes(256))  # 3 * 267 + 267 >= 1024
     (block,) = agent.state.blocks_to_be_committed
     assert [len(event.data) for event in decode_events(block.event_data)] == [256] * 3
-    assert block.timestamp_us == 3_500_000  # the newest event's
+    assert block.timestamp_us == 3_500_000  # the time of the newest event
     assert agent.state.current_block == b""
 
 
@@ -61,7 +61,7 @@ def test_a_full_block_is_proposed_to_go_on_top_of_the_own_chain() -> None:
         agent.add_event(LoggableEvent(0, 7, bytes(256)), air.now)
     proposal = BlockAddRequest(agent.state.completed[0], agent.state.chain.top_chain_hash)
     assert agent.messages_to_send() == [(1, proposal)]  # 0 was its approval of 2's
-    assert agent.state.vote_count == {"yes": 1, "no": 0}  # its own
+    assert agent.state.vote_count == {"yes": 1, "no": 0}  # its own vote
     assert agent.next_timer() == air.now + 10.0
 
 

@@ -133,7 +133,7 @@ def test_each_algorithm_has_one_handler_in_one_table() -> None:
         ("Reconcile Phase 1", {7, 11}),  # Figure 3.11
         ("Reconcile Phase 2", {11, 16, 18}),  # Figure 3.15, and step 4 of Reconcile Phase 3 (Section 3.5.3)
         ("Reconcile Phase 3", {15}),  # Figure 3.19
-        ("Reconcile Finalize", {11, 15, 16, 19}),  # Figure 3.23; 16 where the block is held already
+        ("Reconcile Finalize", {11, 15, 16, 19}),  # Figure 3.23; 16 if the agent already holds the block
     ],
 )
 def test_handlers_trigger_the_local_events_of_the_thesis(event: LocalEvent, by: set[int]) -> None:

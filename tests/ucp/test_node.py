@@ -397,7 +397,7 @@ def test_a_killed_agent_leaves_no_half_export(directory: Path) -> None:
             sock.connect(f"/proc/self/fd/{descriptor}/7.control")
             os.close(descriptor)
             sock.sendall(b'{"command": "export"}\n' * 200)
-            time.sleep(rng.random() * 0.05)  # the moment is what is random here
+            time.sleep(rng.random() * 0.05)  # only the time of the kill is random
             agent.process.kill()
         agent.process.communicate()
         assert read_export(directory / "7.chain.json").agent_id == 7

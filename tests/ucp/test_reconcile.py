@@ -188,7 +188,7 @@ def test_reconcile_ends_without_answers_in_phase_2() -> None:
     air.fate = lambda s, r, m: [] if isinstance(m, NextInSequenceResponse) else latency(s, r, m)
     air.reconcile(1)
     assert air.branches(1, "reconcile_phase_2_timer_expiration") == ["no response"]
-    assert len(air.agents[1].state.chain) == 1  # its own block went back on top
+    assert len(air.agents[1].state.chain) == 1  # its own block is on top of the chain again
 
 
 @takes("reconcile_phase_3_timer_expiration", "gave up")

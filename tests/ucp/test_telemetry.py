@@ -188,7 +188,7 @@ def test_buffer_between_reads_is_limited() -> None:
     events = source()
     frame = frames(heartbeat())
     events.receive(frame[:10], 0.0)
-    for _ in range(2000):  # no read ends with a message
+    for _ in range(2000):  # no read ends at the end of a message
         events.receive(frame[10:] + frame[:10], 0.0)
         assert len(events._parser.buf) < 2 * len(frame)
 
@@ -236,7 +236,8 @@ def test_messages_with_random_values_give_readable_events(data: st.DataObject, k
             assert 1 <= event_id <= 254
             assert len(event_data) <= telemetry.MAX_DATA_BYTES
             unreadable = describe(event_id, event_data) == "unreadable"
-            assert not unreadable or event_id in (STATUS_TEXT, FAILSAFE)  # MAV_SEVERITY ends at 7, MAV_STATE at 8
+            # The largest MAV_SEVERITY is 7, and the largest MAV_STATE is 8.
+            assert not unreadable or event_id in (STATUS_TEXT, FAILSAFE)
 
 
 @given(st.integers(-5, 300), st.binary(max_size=300))

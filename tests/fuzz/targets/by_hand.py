@@ -60,14 +60,14 @@ async def _converse(hand: Interventions, simulation: Simulation, folder: Path, l
         writer.write(line + b"\n")
         answer = await reader.readline()
         if not answer and hand.closed is not None:
-            break  # it was asked to go on, and has ended
+            break  # the run was asked to continue, and has ended
         require(answer.endswith(b"\n"), f"no answer to {line[:200]!r}")
         document: Any = json.loads(answer)
         require(isinstance(document.get("ok"), bool), "the answer is none")
         if not document["ok"]:
             sound(document["error"])
     writer.close()
-    with suppress(ScenarioError, OSError):  # it may have ended
+    with suppress(ScenarioError, OSError):  # the run may have ended
         await ask_run(folder, command="pace", factor=None)
         await ask_run(folder, command="go_on")
     await playing

@@ -31,7 +31,7 @@ def test_task_started_while_a_mission_fails_causes_no_warning() -> None:
             finally:
                 watchers.start(wait())
 
-    gc.collect()  # objects of other tests may warn at their end
+    gc.collect()  # objects of other tests may raise warnings when they are deleted
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         with pytest.raises(LostError, match="agent 2 ended by itself"):

@@ -115,7 +115,7 @@ def test_ages_give_timestamps_in_the_required_order() -> None:
     ages = BlockAges()
     for ordinal in (1, 2, 3):
         ages.completed(ordinal)
-    ages.renumber((3, 1))  # now the third is 1, the first is 2, the second is 3
+    ages.renumber((3, 1))  # the third block becomes 1, the first 2, and the second 3
     ages.require_older(1, [2])
     events: list[dict[str, Any]] = [{"at_s": float(number), "agent": number} for number in (1, 2, 3)]
     assert ages.date(events)

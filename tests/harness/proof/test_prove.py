@@ -186,7 +186,7 @@ def test_ctrl_c_prints_the_progress(tmp_path: Path) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         while not scenario.parent.exists():
             time.sleep(0.05)
-        time.sleep(0.5)  # it goes on for minutes
+        time.sleep(0.5)  # the proof takes minutes
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     proof = json.loads(out)
@@ -216,7 +216,7 @@ def test_ctrl_c_during_the_start_of_workers_is_not_lost(monkeypatch: pytest.Monk
     os.register_at_fork(before=lambda: signal.raise_signal(interruptions.pop()) if interruptions else None)
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
     swarm = ModelSwarm(Bounds(2, 3, "lossy"))
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's job in the background ignores
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a shell ignores SIGINT
     try:
         with Workers(swarm, 2) as workers:
             graph = explore(swarm, most_bytes=8e9, most_s=60, workers=workers)

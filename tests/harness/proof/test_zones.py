@@ -39,7 +39,7 @@ def test_zone_finds_timers_that_expire_at_the_same_moment() -> None:
     zone = zones.after(NOTHING_RUNS, (), (-11, -11))
     assert zone is not None
     assert zones.tied(zone) == [(0, 1), (0, 1)]
-    apart = zones.after(zone, (), (1, 2, -6))  # the third was started any time later
+    apart = zones.after(zone, (), (1, 2, -6))  # the third timer was started at any later time
     assert apart is not None
     assert zones.tied(apart) == [(0, 1), (0, 1), (2,)]
 

@@ -40,7 +40,8 @@ def forms(secret: bytes) -> Iterator[bytes]:
     yield secret
     yield secret.hex().encode()
     yield secret.hex().upper().encode()
-    for shift in range(3):  # what stands around it moves it; the characters that are of it alone are these
+    # The bytes before the secret shift its base64 form; these characters depend on the secret alone.
+    for shift in range(3):
         its_own = slice(-(-4 * shift // 3), 4 * (shift + len(secret)) // 3)
         yield base64.b64encode(bytes(shift) + secret)[its_own]
         yield base64.urlsafe_b64encode(bytes(shift) + secret)[its_own]

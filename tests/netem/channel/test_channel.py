@@ -170,7 +170,7 @@ def test_sender_receives_nothing_while_it_sends() -> None:
 def test_full_queue_drops_messages() -> None:
     made = channel(replace(QUIET, queue_frames=2), 0, 10)
     answers = [made.send(0, 1.0, ANSWER) for _ in range(5)]
-    assert answers == [0, 1, 2, FrameFate.QUEUE, FrameFate.QUEUE]  # the first one is on the air
+    assert answers == [0, 1, 2, FrameFate.QUEUE, FrameFate.QUEUE]  # while the first frame is sent
     assert made.send(0, 1.0 + AIRTIME_S + DIFS_S + 31 * 20e-6, ANSWER) == 3
 
 

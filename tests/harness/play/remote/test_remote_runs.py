@@ -126,7 +126,7 @@ def test_lost_connection_cuts_the_vehicle_off_until_it_returns(computers: TwoCom
     assert 0 < first["from_s"] < first["until_s"] < second["from_s"] < second["until_s"]
     assert record["remote"]["2"]["joins"] > 1
     assert f"agent 2 was cut off from {first['from_s']:.0f} s to {first['until_s']:.0f} s" in output
-    assert "2" not in record["datagrams"]  # its stand-in read datagrams that it did not get
+    assert "2" not in record["datagrams"]  # its stand-in read datagrams that the remote agent did not get
 
 
 RECORD = """

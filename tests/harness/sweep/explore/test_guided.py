@@ -262,7 +262,7 @@ def test_nights_report_new_ongoing_and_resolved_findings(tmp_path: Path, monkeyp
     assert {*again.values()} <= {"ongoing", "rare"}
     monkeypatch.setattr(
         "harness.sweep.explore.guided._hunt_trial.identities", lambda *found: ()
-    )  # the agents are mended
+    )  # the agents no longer have the error
     mended = night(directory, wrong, runs=1)
     assert {each.status for each in mended.findings} == {"resolved"}
     assert mended.exit_status == 0

@@ -35,7 +35,8 @@ def test_script_of_a_run_reproduces_the_run(keys: dict[str, Any]) -> None:
     asked = scenario(agents=4, duration_s=600, final_reconcile=True, **keys)
     original = simulate(asked, 5, tracing=True)
     faithful = scenario_of(next(replays(document_of(asked), record(asked, 5))))
-    again = simulate(faithful, 5, tracing=True, deliver_all="quirks" in keys)  # who has quirks hears everything
+    # Agents with deliberate errors receive all messages.
+    again = simulate(faithful, 5, tracing=True, deliver_all="quirks" in keys)
     uncounted = {"bytes"}  # events have other data, and blocks other hashes
     assert again.result.figures.items() - uncounted == original.result.figures.items() - uncounted
     for agent_id, trace in original.evidence.traces.items():
