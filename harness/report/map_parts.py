@@ -36,7 +36,7 @@ class NetworkDivision:
     alone: frozenset[int]
     """The living vehicles that reach no other vehicle."""
     together: frozenset[int]
-    """All living vehicles if all of them reach each other. Empty otherwise."""
+    """All living vehicles if all of them reach each other. Otherwise the set is empty."""
 
     @property
     def living(self) -> frozenset[int]:

@@ -474,7 +474,9 @@ def _parse_prefix(text: str) -> Any:
 
 
 def _intact_blocks(text: str) -> Iterator[Any]:
-    """Yield each block in a text whose hash is correct. The text between the blocks may be anything."""
+    """Search a text for blocks, and yield each block whose hash is correct. The text between the blocks may be
+    anything.
+    """
     for candidate in _FLAT_OBJECT.finditer(text):
         try:
             block = ExportedBlock.model_validate_json(candidate[0])

@@ -185,8 +185,8 @@ def write(plan: MissionPlan, directory: Path, *, overwrite: bool = False) -> lis
 
 
 def manifest(name: str, missions: Mapping[str, Mission]) -> Manifest:
-    """Return the manifest of at least one mission file. `missions` maps the name of each mission file to its
-    content.
+    """Return the manifest that describes these mission files. `missions` maps the name of each mission file to its
+    content, and contains at least one file.
     """
     first = next(iter(missions.values()))
     return Manifest(

@@ -95,7 +95,7 @@ def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[M
 
 
 def _other_flight(match: MatchedLog, nearest: Mapping[int, float]) -> MatchedLog:
-    """Return the match. Remove its agent if a different log fits the clock of this agent better."""
+    """Return the match. If a different log fits the agent's clock better, return the match without its agent."""
     if match.agent_id is None or match.clock_ahead_s is None:
         return match
     later_s = nearest[match.agent_id] - match.clock_ahead_s

@@ -60,7 +60,9 @@ class JudgedTrace:
     def with_known_states(
         self, incarnations: Sequence[Sequence[RecordedInput]]
     ) -> list[list[RecordedInput | KnownState]]:
-        """Return the inputs that can be simulated. The known state after lost inputs replaces these inputs."""
+        """Return the inputs that can be simulated. If inputs are lost, the result contains the known state after them
+        in their place.
+        """
         parts = [[*self._parts(inputs)] for inputs in incarnations]
         for before, after in zip(parts, incarnations[1:], strict=False):
             if after and isinstance(after[0].cause, BootedFromDisk) and (disk := _disk(after[0])) is not None:

@@ -20,7 +20,9 @@ from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
 
 MAX_PLACES = 3
-"""Maximum number of places with messages without a line that lost lines or a full socket can explain."""
+"""Maximum number of places at which messages may lack a trace line. If there are more such places, lost lines and a
+full socket are no sufficient explanation.
+"""
 MAX_TRIED = 200
 """Maximum number of messages without a line for which the effect is computed."""
 

@@ -158,8 +158,8 @@ WITHIN = 200
 change.
 """
 MESSAGES = 3
-"""Number of messages before a possible clock change, and after it, whose median time difference is compared. The
-messages are those between the agent and one other agent.
+"""Size of two groups of messages between the agent and one other agent. One group is before a possible clock change,
+the other after it. The detector compares the median time differences of both groups.
 """
 MIN_SHIFT_S = 1.0
 """Minimum change of a clock, in seconds, that the detector reports."""

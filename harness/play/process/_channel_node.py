@@ -297,8 +297,8 @@ def _sequence(data: bytes, vehicle: int) -> int | None:
 
 
 def main() -> int:
-    """Run the radio channel until it is stopped. Return the exit status: 1 if the process has no access to
-    the network.
+    """Run the radio channel until it is stopped. Return the exit status: 0 after a stop, and 1 if the process has no
+    access to the network.
     """
     with contextlib.suppress(OSError):  # an ordinary user may not run before all other programs
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))

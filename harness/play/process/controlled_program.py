@@ -83,8 +83,8 @@ class ControlledProgram:
     ) -> Self:
         """Start the program in `directory` without waiting until it is ready. Its output goes to `log`.
 
-        The time limit of an answer is ANSWER_LIMIT_S by default. With `has_children` false, the program starts no
-        processes, so none are sought at its end. Raises SpawnError, NetemError.
+        The time limit of an answer is ANSWER_LIMIT_S by default. If `has_children` is false, the program starts no
+        other processes, and the harness does not search for them at its end. Raises SpawnError, NetemError.
         """
         children = ChildProcesses()
         env = children.environment(os.environ)

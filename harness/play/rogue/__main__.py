@@ -137,7 +137,9 @@ def _load_keys(path: Path) -> "CapturedKeys":
 
 
 def main() -> int:
-    """Run the rogue node until it is stopped. Return the exit status: 1 if the process has no access to the network."""
+    """Run the rogue node until it is stopped. Return the exit status: 0 after a stop, and 1 if the process has no
+    access to the network.
+    """
     try:
         RogueNode(Path.cwd()).run()
     except OSError as error:

@@ -65,8 +65,8 @@ class RecurrenceSearch:
     def _reset(self) -> None:
         self._steps: list[CycleStep] = []
         self._answered_by: dict[int, set[int]] = defaultdict(set)
-        """The agents that have answered the queries of an agent in a reconcile since the stored state, by the ID of the
-        agent in the reconcile.
+        """A set for each agent in a reconcile, by agent ID. It contains the agents that have answered its queries since
+        the last state was stored.
         """
         self._order_is_certain = True
         """False if two timers expire so close to each other that rounding may decide their order."""

@@ -341,8 +341,8 @@ class VirtualAir:
     def _interested_receivers(self, received: int, flight: MessageInFlight, at: float) -> Iterable[int]:
         """Return the receivers on which the message can have an effect.
 
-        An agent that reconciles ignores queries. An answer arrives at once, so it affects only agents that are waiting
-        for answers at this time. The exceptions are paused agents, which may send a query before they read the answer.
+        An agent that reconciles ignores queries. The message arrives now, so an answer affects only agents that are
+        waiting for answers now. The exceptions are paused agents, which may send a query before they read the answer.
         """
         if self._deliver_all or self._medium.latest > 0:
             return numbers(received)

@@ -46,15 +46,17 @@ class DecidedDelivery:
     """
 
     arrivals: list[tuple[int, float]] = field(default_factory=list)
-    """(receiver, time): the copy arrives at the receiver at this time."""
+    """Pairs (receiver, time). The copy for the receiver arrives at this time."""
     waiting: list[tuple[int, str]] = field(default_factory=list)
-    """(receiver, name): the copy arrives after the message that the fate with this name matches."""
+    """Pairs (receiver, name). The copy for the receiver arrives directly after the message that the rule with this name
+    matches.
+    """
     held: list[tuple[int, int, float]] = field(default_factory=list)
-    """(number, receiver, time): the copy arrives at this time. If the hold with this number ends later, the copy
-    arrives at the end of the hold.
+    """Triples (number, receiver, time). The copy for the receiver arrives at this time. If the hold with this number
+    ends later, the copy arrives at the end of the hold.
     """
     named: list[tuple[str, float]] = field(default_factory=list)
-    """(name, time): the message that the fate with this name matches arrives at this time."""
+    """Pairs (name, time). The message that the rule with this name matches arrives at this time."""
 
 
 class FateScript:
