@@ -4,7 +4,7 @@
 check of the model.
 
 The model plays a mission of 20 minutes with Algorithms 1 to 21, in the reading of the thesis that the agents use by
-default. All messages go through one queue. It has an entry for each receiver that does not lose the message. A
+default. All messages go through one queue, which has an entry for each receiver that does not lose the message. A
 programmer would write such a model to study the protocol alone. The model has no datagrams, no records, no checks and
 no faults, and all agents are correct. Hashes are those of Python tuples, not SHA-256.
 

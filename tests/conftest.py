@@ -1,7 +1,7 @@
 """Settings for all tests, and the pytest markers `lab`, `docker` and `uml`.
 
 A test with the marker `lab` needs private network namespaces, one with `docker` needs a Docker engine, and one with
-`uml` needs User Mode Linux. Without this requirement, the test is skipped with a reason.
+`uml` needs User Mode Linux. On other machines, the test is skipped with a reason.
 """
 
 import os

@@ -44,8 +44,9 @@ def unavailable(engine: str | None) -> LabUnavailable | None:
 
 
 def require(engine: str | None) -> None:
-    """Skip the test if this machine cannot open a virtual network with this engine. Fail the test if UCP_REQUIRE names
-    the engine.
+    """Skip the test if this machine cannot open a virtual network with this engine.
+
+    If UCP_REQUIRE names the engine, fail the test instead.
     """
     if (error := unavailable(engine)) is None:
         return

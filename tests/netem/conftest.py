@@ -25,7 +25,7 @@ PACKETS = int(os.environ.get("UCP_TEST_PACKETS", "4000"))
 
 @pytest.fixture(params=["netem", "nftables"])
 def engine(request: pytest.FixtureRequest) -> str:
-    """Return each engine in turn."""
+    """Return the name of an engine. The test runs with each engine in turn."""
     require(request.param)
     return str(request.param)
 

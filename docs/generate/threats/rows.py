@@ -12,19 +12,20 @@ LOST_S, REVOKED_S, ATTACK_S = 100, 200, 300
 
 @dataclass(frozen=True)
 class Row:
-    """One attack. `attack` contains timeline entries without their times.
-
-    With `captured` the attacker has the keys of vehicle 3. With `revoked` these keys are revoked before the attack.
-    `quirks` are wrong handlers of vehicle 3. `own` replaces keys of the scenario.
-    """
+    """One attack, which is a row of the table."""
 
     who: str
     does: str
     attack: tuple[dict[str, Any], ...] = ()
+    """Entries of the timeline without their times."""
     captured: bool = False
+    """Whether the attacker has the keys of vehicle 3."""
     revoked: bool = False
+    """Whether the keys of vehicle 3 are revoked before the attack."""
     quirks: tuple[str, ...] = ()
+    """Deliberate errors of the handlers of vehicle 3."""
     own: Mapping[str, Any] = field(default_factory=dict)
+    """Keys that replace those of the scenario."""
 
     @property
     def scenario(self) -> Scenario:

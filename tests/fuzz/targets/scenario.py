@@ -1,7 +1,7 @@
 """Fuzz target: a scenario in YAML. The reader refuses it in one sentence, or the writer reproduces it.
 
-The target also plays short scenarios, so that scripted fates, delays, datagrams and events are not only read but take
-effect.
+The target also plays short scenarios, so that scripted deliveries, delays, datagrams and events are not only read but
+take effect.
 """
 
 import json
