@@ -92,9 +92,9 @@ class MissionPlan:
     scenario: Scenario
     initial_data: bytes
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings that replace the settings of the scenario."""
+    """Values that replace single settings of the scenario."""
     events: Mapping[str, Any] = field(default_factory=dict)
-    """Values that replace the event values of the scenario."""
+    """Values that replace single values in the section `events` of each mission file."""
     subnet: ipaddress.IPv4Network | None = None
     """The network from which the addresses of vehicles without an entry in `addresses` are computed. If it is None,
     these vehicles have the same addresses as in a run (`netem.addresses`).

@@ -81,9 +81,11 @@ class _ReceivedDatagram:
     sender: int
     name: str
     message: Message | None
-    """The message in the datagram, or None if the datagram is encrypted."""
+    """The message in the datagram, or None if the datagram is encrypted and the rogue node cannot decrypt it."""
     request: "AnsweredRequest | None"
-    """The identification that an answer to the datagram must contain."""
+    """The identification that an answer to an encrypted datagram must contain. The value is None if the datagram is not
+    encrypted, or cannot be decrypted.
+    """
     datagram: bytes
 
 
