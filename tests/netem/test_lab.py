@@ -114,7 +114,9 @@ def test_an_idle_lab_is_silent(tmp_path: Path) -> None:
 
 
 def test_kernel_counts_datagrams_that_programs_read(tmp_path: Path) -> None:
-    """Vehicle 2 reads three datagrams to it, and leaves a broadcast unread in the socket. Vehicle 1 has no socket."""
+    """Vehicle 2 reads three datagrams that were sent to it, and leaves a broadcast unread in the socket. Vehicle 1 has
+    no socket.
+    """
     program = (
         "import socket, sys; s = socket.socket(type=socket.SOCK_DGRAM); s.bind(('', 9)); "
         "s.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1); "

@@ -1,4 +1,4 @@
-"""Test timers that are longer for each next agent."""
+"""Test timers whose duration increases from agent to agent."""
 
 from dataclasses import replace
 from typing import Any

@@ -59,7 +59,7 @@ def leaks(known: dict[str, bytes], contents: Iterable[tuple[str, bytes]]) -> lis
 
 
 def left_in(directory: Path) -> Iterator[tuple[str, bytes]]:
-    """Yield each file with its name and content."""
+    """Yield the name and the content of each file."""
     for path in directory.rglob("*"):
         if path.is_file() and not path.is_symlink():
             yield str(path), path.read_bytes()

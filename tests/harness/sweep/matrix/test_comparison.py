@@ -188,7 +188,9 @@ def test_single_changed_run_is_named_and_no_regression(tmp_path: Path) -> None:
 
 
 def slightly_busier(scenario: Scenario, seed: int) -> Result:
-    """Judge like `judge`, but with one or two more reconciles. Seeds differ by more than that."""
+    """Judge like `judge`, but with one or two more reconciles. The numbers of different seeds differ by more than
+    that.
+    """
     result = judge(scenario, seed)
     result.figures["reconciles"] += 1 + seed % 2  # type: ignore[operator]
     return result

@@ -91,8 +91,9 @@ class Story:
         self.expire()
 
     def named(self, block: Block | None, *senders: int, timestamp_us: int | None = None) -> None:
-        """Give the agent answers of phase 2 from these senders. They name `block` as the successor, or the end of the
-        chain if it is None.
+        """Give the agent answers of phase 2 from these senders. They name `block` as the successor.
+
+        If `block` is None, they answer that the chain ends here.
         """
         if block is None:
             self.hear(NextInSequenceResponse(self.top, None, 0), *senders)
