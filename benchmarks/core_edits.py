@@ -63,25 +63,32 @@ class Edit(NamedTuple):
     """An edit of a file of `ucp`, and the handler that the edit breaks. `handler` is empty if no handler is broken."""
 
     about: str
-    handler: str
     file: str
     old: str
     new: str
+    handler: str = ""
 
-    def make(self, clone: Path) -> None:
-        """Write a clone of the project with this edit. Raises ValueError if the file no longer contains the text to
-        replace.
-        """
-        for folder in FOLDERS:
-            shutil.copytree(ROOT / folder, clone / folder)
-        shutil.copy2(ROOT / "pyproject.toml", clone)
-        for name, content in FILES.items():
-            (clone / name).write_text(content, "utf-8")
-        file = clone / "ucp" / self.file
+    def make(self, directory: Path) -> None:
+        """Edit the copy of `ucp` in this directory. Raises ValueError if the file no longer has the old text."""
+        file = directory / "ucp" / self.file
         text = file.read_text("utf-8")
         if self.old not in text:
             raise ValueError(f"ucp/{self.file} has changed: write the edit {self.about!r} anew")
         file.write_text(text.replace(self.old, self.new, 1), "utf-8")
+
+
+def read_edits(path: Path) -> list[Edit]:
+    return [Edit(**edit) for edit in yaml.safe_load(path.read_text("utf-8"))]
+
+
+def clone_with(edit: Edit, clone: Path) -> None:
+    """Write a clone of the project with this edit."""
+    for folder in FOLDERS:
+        shutil.copytree(ROOT / folder, clone / folder)
+    shutil.copy2(ROOT / "pyproject.toml", clone)
+    for name, content in FILES.items():
+        (clone / name).write_text(content, "utf-8")
+    edit.make(clone)
 
 
 def outcome(edit: Edit, clone: Path, arguments: tuple[str, ...]) -> str:
@@ -103,14 +110,14 @@ def outcome(edit: Edit, clone: Path, arguments: tuple[str, ...]) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    edits = [Edit(**edit) for edit in yaml.safe_load(EDITS.read_text("utf-8"))]
+    edits = read_edits(EDITS)
     chosen = [int(argument) for argument in arguments] or range(1, len(edits) + 1)
     missed = False
     sys.stdout.write(f"| edit | handler | {' | '.join(COMMANDS)} |\n{'|---' * (len(COMMANDS) + 2)}|\n")
     for number in chosen:
         edit = edits[number - 1]
         with tempfile.TemporaryDirectory(prefix="core-edit-") as name:
-            edit.make(Path(name))
+            clone_with(edit, Path(name))
             row = [outcome(edit, Path(name), arguments) for arguments in COMMANDS.values()]
         missed |= any(result not in ("named", "red") for result in row)
         sys.stdout.write(f"| {edit.about} | {edit.handler} | {' | '.join(row)} |\n")

@@ -10,13 +10,14 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 import yaml
 
 import harness
 import ucp
+from benchmarks.core_edits import Edit, read_edits
 
 SCENARIO = {
     "name": "edited core",
@@ -27,27 +28,14 @@ SCENARIO = {
 }
 
 
-class Edit(NamedTuple):
-    """An edit of a file of `ucp`, and the handler that the edit breaks. `handler` is empty if no handler is broken."""
-
-    about: str
-    file: str
-    old: str
-    new: str
-    handler: str = ""
-
-
 def edits(name: str) -> list[Edit]:
-    return [Edit(**edit) for edit in yaml.safe_load(Path(__file__).with_name(name).read_text("utf-8"))]
+    return read_edits(Path(__file__).with_name(name))
 
 
 def verdict_after(edit: Edit, scenario: dict[str, Any], folder: Path, status: int = 1) -> list[str]:
     """Play the scenario with a copy of `ucp` that has this edit. Return the sentences of the verdict on the steps."""
     shutil.copytree(Path(ucp.__file__).parent, folder / "ucp", ignore=shutil.ignore_patterns("__pycache__"))
-    file = folder / "ucp" / edit.file
-    text = file.read_text("utf-8")
-    assert edit.old in text, f"ucp/{edit.file} has changed: write this edit anew"
-    file.write_text(text.replace(edit.old, edit.new, 1), "utf-8")
+    edit.make(folder)
     (folder / "scenario.yaml").write_text(yaml.safe_dump(scenario), "utf-8")
     paths = os.pathsep.join([str(folder), str(Path(harness.__file__).parent.parent)])
     command = ("run", "scenario.yaml", "--backend", "sim", "--seed", "1", "--out", "out")
