@@ -16,7 +16,7 @@ from harness.conformance._virtual_agent import VirtualProgram
 from harness.conformance.conformance_run import ConformanceRequest, conform
 from harness.conformance.results_table import to_junit
 from harness.conformance.vectors import VectorSet
-from tests.harness.command import harness, processes, sentences
+from tests.harness.command import DEADLINE_S, harness, processes, sentences
 
 OURS = (sys.executable, "-P", "-m", "ucp.node")
 
@@ -108,12 +108,20 @@ def test_program_without_answers_is_no_agent(
 
 @pytest.mark.parametrize(
     "script",
-    ["yes", "exec >&-; sleep 1000", "setsid sleep 30 & sleep 1000"],
+    [
+        'head -c 32000 /dev/zero; touch "$0"; yes',
+        'exec >&-; touch "$0"; sleep 1000',
+        'setsid sleep 30 & touch "$0"; sleep 1000',
+    ],
     ids=["prints too much", "closes its output", "leaves a child with its pipes"],
 )
 def test_program_can_be_closed_with_full_or_shared_pipes(script: str, tmp_path: Path) -> None:
-    program = VirtualProgram(("sh", "-c", f"echo; {script}"), tmp_path / "errors.log")
-    time.sleep(0.5)  # the program fills the pipe in the meantime
+    ready = tmp_path / "ready"
+    program = VirtualProgram(("sh", "-c", f"echo; {script}", str(ready)), tmp_path / "errors.log")
+    deadline = time.monotonic() + DEADLINE_S
+    while not ready.exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
     program.close()
 
 

@@ -227,8 +227,8 @@ def test_truncated_trace_does_not_contradict_a_later_export(run: Path, tmp_path:
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
     imported(tmp_path / "out", tmp_path / "home")
-    told_by_check = verdicts(tmp_path / "out")
-    assert told_by_check["records"][0] == "not applicable" and told_by_check["1"][0] == "not applicable"
+    verdict_of = verdicts(tmp_path / "out")
+    assert verdict_of["records"][0] == "not applicable" and verdict_of["1"][0] == "not applicable"
     (tmp_path / "home" / "1.chain.json").unlink()
     imported(tmp_path / "killed", tmp_path / "home")
     trace = read_trace(tmp_path / "killed" / "agents" / "1.trace.jsonl")

@@ -97,7 +97,7 @@ def test_wrong_agent_changes_the_story(tmp_path: Path, figure: str, quirk: str, 
 def test_sentences_do_not_coincide_with_the_end_of_a_timer(path: Path) -> None:
     """If two inputs are simultaneous, their order depends on chance in runs with real processes."""
     text = path.read_text()
-    told_at = {*re.findall(r"^(\d+) s: ", text, re.MULTILINE)}
+    printed_at = {*re.findall(r"^(\d+) s: ", text, re.MULTILINE)}
     instants = re.split(r"^    at (\d+) s\n", text, flags=re.MULTILINE)[1:]
     ended_at = {at for at, lines in zip(instants[::2], instants[1::2], strict=True) if "Timer Expiration:" in lines}
-    assert not told_at & ended_at
+    assert not printed_at & ended_at

@@ -43,9 +43,9 @@ def read(file: Path) -> Messages:
             if schema.encoding == "jsonschema":
                 content: Any = json.loads(message.data)
                 if schema.name not in validators:
-                    told_of = {**json.loads(schema.data), "additionalProperties": False}
-                    jsonschema.Draft202012Validator.check_schema(told_of)
-                    validators[schema.name] = jsonschema.Draft202012Validator(told_of)
+                    strict = {**json.loads(schema.data), "additionalProperties": False}
+                    jsonschema.Draft202012Validator.check_schema(strict)
+                    validators[schema.name] = jsonschema.Draft202012Validator(strict)
                 validators[schema.name].validate(content)
             else:
                 assert schema.name.startswith("foxglove.")
