@@ -1,4 +1,4 @@
-"""The engine "nftables": it applies loss and partitions with rules in `table bridge air`, on kernels without netem.
+"""The engine "nftables". It applies loss and partitions on kernels without netem, with rules in `table bridge air`.
 
 The rules are in the forward hook of the bridge. The switch copies a broadcast before this hook, so the hook handles
 each packet of any protocol once per receiver. Losses are therefore drawn separately for each receiver. A rule first
@@ -13,10 +13,11 @@ marks the packet with the group of its incoming port. The rules in the chain of 
     chain to_v7_0 { numgen random mod 1000000000 < 150000000 counter name "lost_v7" drop
                     counter name "passed_v7" }
 
-The cost of a packet therefore does not grow with the number of vehicles. Chain 0 of a receiver applies to most senders.
-Each other loss rate has a further chain. A change is one nft transaction, so no packet meets a partial change. Only a
-change of thousands of links exceeds the amount that an ordinary user may send at once. Such a change is made receiver
-by receiver. The counters are separate objects and survive changes of rules. See nft(8) and libnftables-json(5).
+The cost of a packet therefore does not grow with the number of vehicles. Chain 0 of a receiver has the loss rate of
+most of its senders. Each other loss rate has a chain of its own. A change is one nft transaction, so the rules never
+handle a packet when a change is only partly done. A change of thousands of links is an exception, because it is larger
+than an ordinary user may send at once. The engine makes such a change receiver by receiver. The counters are separate
+objects and survive changes of rules. See nft(8) and libnftables-json(5).
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ send more at once, because of the kernel parameter net.core.wmem_max.
 
 
 class NftablesEngine(Engine):
-    """An engine that applies partitions, and independent loss for each pair of sender and receiver.
+    """The engine that applies partitions, and independent loss for each pair of sender and receiver.
 
     The engine does not support conditions that need a queue or a memory of earlier packets.
     """

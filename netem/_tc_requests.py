@@ -88,7 +88,7 @@ class TrafficClass:
 
 
 class TrafficControl:
-    """A builder of requests for one switch port, which is identified by its interface number."""
+    """A builder of requests for one switch port. `index` is the interface number of the port."""
 
     def __init__(self, index: int) -> None:
         self.index = index

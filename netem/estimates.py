@@ -47,7 +47,8 @@ class MachineLateness:
 class ReceivedStream:
     """The packets of one sender that arrived at one receiver. The packets are numbered from 0.
 
-    `sent_s` contains the sending times. `arrivals` contains (number, time) of each received copy, in order of time.
+    `sent_s` contains the sending times. `arrivals` contains, for each received copy in order of time, the number of the
+    packet and the time of arrival.
     """
 
     sent_s: Sequence[float]

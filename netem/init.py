@@ -70,7 +70,9 @@ def _module_of(argv: list[str]) -> Callable[[], None]:
 
 
 class LabServer:
-    """A server that executes requests of the harness. It trusts the requests, but refuses invalid ones."""
+    """A server that executes requests of the harness. The server trusts the sender of the requests, but refuses invalid
+    requests.
+    """
 
     def __init__(self, control: socket.socket) -> None:
         control.setblocking(False)
@@ -285,8 +287,8 @@ class LabServer:
     # Children
 
     def _reap(self, _: int) -> None:
-        """Report the child processes that have ended. Orphans, which the kernel assigns to this process, are removed
-        without a report.
+        """Report the child processes that have ended. The kernel also assigns orphaned processes to this process. These
+        are removed without a report.
         """
         with contextlib.suppress(BlockingIOError):
             os.read(self._wake, 4096)

@@ -4,7 +4,7 @@
         agent = await lab.spawn(1, ["my-agent"], cwd=..., env=..., stdout=..., stderr=...)
         await lab.apply(NetworkConditions(LinkConditions(loss=0.15)))
 
-The lab is not visible from outside: it adds no interface, rule or name to the caller's network. Files and Unix sockets
+The lab is not visible from outside. It adds no interface, rule or name to the caller's network. Files and Unix sockets
 are shared with the caller. The lab ends with `close`, or with the caller's process. Process IDs belong to the lab, so
 `LabProcess.pid` has no meaning outside.
 
@@ -127,9 +127,9 @@ class Lab:
         """Open a virtual network for these vehicle IDs, 1 to 65535. The output of its first process goes to `log`.
 
         `engine` is the engine to use; by default the lab chooses one. `needs` lists the conditions other than loss and
-        partition that the engine must support (`NetworkConditions.needs`). `networks` has descriptors of existing
-        network namespaces of vehicles (root only). The caller closes them. Raises LabUnavailable if this machine cannot
-        run a lab, or has no engine for these needs.
+        partition that the engine must support (`NetworkConditions.needs`). `networks` maps vehicles to file descriptors
+        of existing network namespaces. Only root may use this argument. The caller closes the descriptors. Raises
+        LabUnavailable if this machine cannot run a lab, or has no engine for these needs.
         """
         ids = _checked(vehicles)
         namespaces = dict(networks or {})
@@ -244,13 +244,13 @@ class Lab:
     ) -> LabProcess:
         """Start a program in the network of a vehicle.
 
-        With `vehicle` None, the program runs in the lab's own network, which no vehicle reaches.
+        If `vehicle` is None, the program runs in the lab's own network, which no vehicle can reach.
 
         `env` is its whole environment. Its output is appended to the files `stdout` and `stderr`. Its input is empty.
         `role` names the program in errors. The program cannot make a file larger than `max_file_bytes`: a write beyond
-        this size fails with EFBIG. With `fork`, the command must be `python -P -m MODULE ...` of this interpreter. The
-        module then runs in a fork of the lab's first process, which is faster than a new interpreter. Raises SpawnError
-        with the message of the operating system.
+        this size fails with EFBIG. If `fork` is true, the module runs in a fork of the lab's first process, because a
+        fork starts faster than a new interpreter. The command must then be `python -P -m MODULE ...` with this
+        interpreter. Raises SpawnError with the message of the operating system.
         """
         self._check_vehicle(vehicle)
         where = {"cwd": str(cwd), "stdout": str(stdout), "stderr": str(stderr), "max_file_bytes": max_file_bytes}

@@ -1,4 +1,4 @@
-"""The engine "netem": it applies all network conditions with the kernel's netem at the switch ports.
+"""The engine "netem". It applies all network conditions with the kernel's netem at the switch ports.
 
 A packet gets two numbers at its sender's port: the group of its sender in a partition, and the *kind* of its sender.
 Every receiver has the same conditions for all senders of one kind. At the receiver's port the packet passes two stages.
@@ -12,15 +12,16 @@ contains one netem:
                   class 1:1     netem loss 15 %           packets of kind 1 to vehicle 7
                   class 1:3     netem delay 100 ms        packets of kind 3 to vehicle 7
 
-A switch handles a packet once per receiver, so random losses and delays are drawn separately for each receiver. On
-links with memory (bursts, rate, limit), each sender is its own kind, because only its own packets count.
+A switch handles a packet once per receiver, so random losses and delays are drawn separately for each receiver. On some
+links, earlier packets affect later packets (links with memory: bursts, rate, limit). Each sender on such a link is a
+kind of its own, because only its own packets may affect its later packets.
 
-If only values change, netem is changed in place. It keeps its queue, and other netems are not affected. If the kinds
-change, the engine first adds new classes and then moves the senders one by one. An old class is removed after its last
-packet has left. A partition does not change the classes. First, the receivers accept the new groups in addition to the
-old ones. Then the senders move to their new groups one by one. At last, the receivers stop accepting the old groups. At
-any time, each pair therefore has either the old or the new conditions. The duration of a change grows with the number
-of vehicles, not with the number of pairs.
+If only values change, the engine changes the existing netem. The netem keeps its queue, and other netems are not
+affected. If the kinds change, the engine first adds new classes and then moves the senders one by one. The engine
+removes an old class after the last packet has left the class. A partition does not change the classes. First, the
+receivers accept the new groups in addition to the old ones. Then the senders move to their new groups one by one. At
+last, the receivers stop accepting the old groups. At any time, each pair therefore has either the old or the new
+conditions. The duration of a change grows with the number of vehicles, not with the number of pairs.
 
 Since 2025 (6.1.148, 6.6.102, 6.12.42, 6.16.1), Linux requires that a netem with duplication is the only one at its
 port. Duplication is then refused if a receiver does not treat all senders alike, or on links with memory. Newer kernels

@@ -143,9 +143,9 @@ def run(argv: Sequence[str], *, cwd: Path, env: Mapping[str, str]) -> int:
     """Run a command in its own kernel. Return its exit status. If a signal killed the command, the status is 128 plus
     the number of the signal.
 
-    `env` is the environment of the command, except for TMPDIR. In the main thread, Ctrl-C and SIGTERM go to the
-    command. Before the guest has booted, they end the guest, and the status is 130. Raises UmlError if User Mode Linux
-    is missing, does not boot, hangs or panics.
+    `env` is the environment of the command, except for TMPDIR. If `run` is called in the main thread, Ctrl-C and
+    SIGTERM go to the command. Before the guest has booted, these signals end the guest, and the status is 130. Raises
+    UmlError if User Mode Linux is missing, does not boot, hangs or panics.
     """
     kernel = find()
     with tempfile.TemporaryDirectory(prefix="uml-", ignore_cleanup_errors=True) as name:

@@ -4,11 +4,11 @@ parsers.
 `Autopilot` is the vehicle. A client exchanges bytes with it through a `ClientChannel` (serial_channel.py). The module
 streams.py defines the messages that the vehicle sends at intervals. Times are simulated seconds since boot.
 
-A client cannot distinguish the autopilot's answers from those of ArduPilot. For example, the autopilot refuses to arm
-until its position is known. If a client sets a mode in the first seconds after boot, the autopilot acknowledges the
-mode and then leaves it again. A copter begins a mission on command. A plane and a rover begin a mission as soon as they
-are armed in AUTO mode. The position of the vehicle follows from formulas, not from simulated time steps. A new movement
-begins exactly when the previous movement ends, regardless of the step size of `advance`.
+The autopilot answers its clients as ArduPilot does. For example, it refuses to arm until its position is known. If a
+client sets a mode in the first seconds after boot, the autopilot acknowledges the mode and then leaves it again. A
+copter begins a mission on command. A plane and a rover begin a mission as soon as they are armed in AUTO mode. The
+position of the vehicle follows from formulas, not from simulated time steps. A new movement begins exactly when the
+previous movement ends, regardless of the step size of `advance`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ACCEPTED, FAILED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_FAIL
 
 
 class MessageListener(Protocol):
-    """An object that receives the messages that the vehicle sends on its own, without a request."""
+    """An object that receives the messages that the vehicle sends without a request."""
 
     def send(self, message: Any) -> None: ...
 
@@ -247,7 +247,9 @@ class Autopilot:
         return self.failsafes.look(self.now_s, self.battery_used, self.motion.point, self.station_heard_s)
 
     def _save(self, failsafe: Failsafe) -> None:
-        """React to a failsafe as ArduPilot does. Without a position, for example, a copter lands and a rover stops."""
+        """React to a failsafe as ArduPilot does. For example, if the position is lost, a copter lands and a rover
+        stops.
+        """
         can_land = self.vehicle_type == "copter"
         if failsafe == "ekf":
             self.say(mavlink.MAV_SEVERITY_CRITICAL, "EKF variance")
@@ -270,7 +272,7 @@ class Autopilot:
             self.set_mode(MODES[self.vehicle_type][mode])
 
     def _lose_thrust(self) -> None:
-        """Let the vehicle fall, because one of its four motors has failed and it cannot stay level."""
+        """Let the vehicle fall. One of its four motors has failed, and with three motors it cannot stay level."""
         self.say(mavlink.MAV_SEVERITY_EMERGENCY, "Potential Thrust Loss (2)")
         self.say(mavlink.MAV_SEVERITY_EMERGENCY, "Crash: Disarming")
         self.disarm(force=True)
@@ -377,7 +379,7 @@ class Autopilot:
                 self._land(place, self._place_before(number))
 
     def _go_on_to(self, place: LocalPlace, number: int) -> None:
-        """Fly to a place from the current position in the current wind."""
+        """Fly from the current position to a place. The current wind changes the ground speed."""
         here = self.motion.point
         bearing_rad = math.atan2(place.east_m - here.east_m, place.north_m - here.north_m)
         speed_ms = self.failsafes.over_ground(self._speed_ms, bearing_rad)

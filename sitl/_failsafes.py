@@ -1,8 +1,7 @@
-"""Simulate faults of the embedded vehicle, and decide when its failsafes act.
-
-Parameters have the names of ArduPilot and its simulation. Each vehicle has a GPS, a battery, a receiver of a remote
-control, and a fence. Only a copter has motors that can fail. Only a plane is affected by wind. No vehicle has a
-compass. A vehicle does not know the parameters of parts that it lacks.
+"""Simulate faults of the embedded vehicle, and decide when its failsafes act. The parameters have the same names as in
+ArduPilot and its simulation. Each vehicle has a GPS, a battery, a receiver of a remote control, and a fence. Only a
+copter has motors that can fail. Only a plane is affected by wind. No vehicle has a compass. A vehicle does not know the
+parameters of parts that it lacks.
 """
 
 from __future__ import annotations

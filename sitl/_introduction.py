@@ -62,8 +62,8 @@ class VehicleIntroduction:
                 link.request_parameter(name)  # ArduPilot's list omits the parameters of groups that are switched off
 
     def _ask_for_list(self) -> None:
-        """Request all parameters until the first parameter arrives. When no more parameters arrive, request the missing
-        ones.
+        """Request the list of all parameters until the first parameter arrives. When no more parameters arrive, request
+        the missing parameters one by one.
         """
         link = self._link
         if link.parameter_count is None:

@@ -1,9 +1,10 @@
-"""Implement the vehicle's side of the MAVLink mission protocol: receive a mission, and send the current one.
+"""Implement the vehicle's side of the MAVLink mission protocol. The vehicle receives a new mission from a client, and
+sends its current mission to a client.
 
 The vehicle requests one mission item after another. A new mission replaces the old mission when it is complete. The
-vehicle needs no timers, because a client without an answer sends MISSION_COUNT again, which restarts the transfer.
-Results equal those of ArduPilot (https://mavlink.io/en/services/mission.html; MAV_MISSION_RESULT). Item 0 is the home
-position. The vehicle keeps its own home position.
+vehicle needs no timers. A client that gets no answer sends MISSION_COUNT again, which restarts the transfer. The result
+codes are the same as those of ArduPilot (https://mavlink.io/en/services/mission.html; MAV_MISSION_RESULT). Item 0 is
+the home position. The vehicle keeps its own home position.
 """
 
 from __future__ import annotations

@@ -43,7 +43,9 @@ _ADDRESS = frozenset({"target_system", "target_component", "command", "mavpacket
 
 
 class CommandLog:
-    """The recorded commands in order. Equal consecutive commands form one entry with a count and an end time."""
+    """The recorded commands in order. Equal consecutive commands form one entry, which contains their number and the
+    time of the last command.
+    """
 
     def __init__(self) -> None:
         self.left_out = 0

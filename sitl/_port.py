@@ -1,8 +1,8 @@
 """One TCP port of the embedded vehicle, for at most one client. It never blocks, and its memory is limited.
 
 A client that reads too slowly loses telemetry, because the vehicle does not wait for a client. ArduPilot, in contrast,
-waits if the speedup is above 1. A second client can connect, but receives nothing until the first disconnects, as with
-ArduPilot.
+waits if the speedup is above 1. A second client can connect, but receives nothing until the first client disconnects.
+ArduPilot behaves in the same way.
 """
 
 from __future__ import annotations

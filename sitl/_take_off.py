@@ -1,8 +1,8 @@
 """Procedures for a take-off without a flight plan, for the take-off at the beginning of a plan, and for the forced end
 of a flight.
 
-The commands are those of ArduPilot's developer documentation, "Copter Commands in Guided Mode". A plane cannot take off
-in GUIDED mode. It takes off in its mode TAKEOFF, to the altitude in its parameter TKOFF_ALT. A rover only arms.
+The commands come from "Copter Commands in Guided Mode" in ArduPilot's developer documentation. A plane cannot take off
+in GUIDED mode. It takes off in mode TAKEOFF, and climbs to the altitude in its parameter TKOFF_ALT. A rover only arms.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""List ArduPilot's frames: the type of vehicle, the model name, and the default parameters of each.
+"""List ArduPilot's frames. For each frame, the list contains the type of vehicle, the model name, and the default
+parameters.
 
 The table contains the frames of ArduPilot's sim_vehicle.py that ArduPilot's own simulation can fly. The default
 parameters are files of ArduPilot's Tools/autotest. The vehicle reads them in the order of the list. A user must give

@@ -1,10 +1,10 @@
 """Find a binary of ArduPilot SITL, and start it without user interaction.
 
 The command line is that of ArduPilot's SITL (`arducopter --help`, developer documentation "SITL Simulator"). Each
-vehicle is instance 0 in its own network namespace, so all vehicles have the same ports. Builds with CAN need a
-multicast route in this namespace, or exit with status 1. The directory of a vehicle contains copies of its parameter
-files. ArduPilot also writes `eeprom.bin` and `logs/` there. The run directory therefore documents the parameters of
-each vehicle.
+vehicle is instance 0 in its own network namespace, so all vehicles have the same ports. A build of ArduPilot with CAN
+needs a multicast route in this namespace. Without the route, it exits with status 1. The directory of a vehicle
+contains copies of its parameter files. ArduPilot also writes `eeprom.bin` and `logs/` there. The run directory
+therefore documents the parameters of each vehicle.
 """
 
 from __future__ import annotations

@@ -60,12 +60,12 @@ GPS_REGAINED = SimulatedFailure("a GPS that is back", GPS_ON)
 COMPASS_LOST = SimulatedFailure("the loss of its compasses", (dict.fromkeys(_COMPASSES, 1.0), {_COMPASSES[0]: 1.0}))
 COMPASS_REGAINED = SimulatedFailure("compasses that are back", (dict.fromkeys(_COMPASSES, 0.0), {_COMPASSES[0]: 0.0}))
 MOTOR_STOPPED = SimulatedFailure("the failure of a motor", ({"SIM_ENGINE_MUL": 0.0, "SIM_ENGINE_FAIL": 1.0},))
-"""The failure of one motor. SIM_ENGINE_FAIL 1 stops the second motor if the value is the number of an output, and the
-first motor if it is a bit mask.
+"""The failure of one motor. Some versions of ArduPilot use SIM_ENGINE_FAIL as the number of an output. The value 1 then
+stops the second motor. Other versions use it as a bit mask. The value 1 then stops the first motor.
 """
 
 RC_LOST = SimulatedFailure("the loss of its remote control", ({"SIM_RC_FAIL": 1.0},))
-"""The loss of the remote control. With SIM_RC_FAIL 1, the receiver gives no pulses."""
+"""The loss of the remote control. If SIM_RC_FAIL is 1, the simulated receiver sends no pulses."""
 RC_REGAINED = SimulatedFailure("a remote control that is back", ({"SIM_RC_FAIL": 0.0},))
 STATION_LOST = SimulatedFailure("the loss of its ground station", ({},), station_is_heard=False)
 STATION_REGAINED = SimulatedFailure("a ground station that is back", ({},), station_is_heard=True)
@@ -74,8 +74,8 @@ FENCE_BREACHED = SimulatedFailure(
     "a breach of its fence",
     ({"FENCE_TYPE": 3.0, "FENCE_ALT_MAX": FENCE_M, **_AROUND_HOME}, {"FENCE_TYPE": 2.0, **_AROUND_HOME}),
 )
-"""A breach of the fence. With FENCE_TYPE 3, the fence is a maximum altitude and a circle around home. With 2, it is
-only the circle, for a rover.
+"""A breach of the fence. If FENCE_TYPE is 3, the fence is a maximum altitude and a circle around home. If it is 2, as
+for a rover, the fence is only the circle.
 """
 FENCE_LIFTED = SimulatedFailure("a flight without a fence", ({"FENCE_ENABLE": 0.0},))
 

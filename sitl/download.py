@@ -1,9 +1,9 @@
 """Download files over HTTP, with limits on size and silence. An interrupted download is resumed.
 
 The received part is stored in `NAME.part`. `NAME.part.json` has the total size of the file, and the version mark (ETag
-or Last-Modified) that the server sent. The missing part is requested with Range and If-Range (RFC 9110, sections 13.1.5
-and 14.2). If the answer does not fit, the download restarts. Proxies come from the environment (`https_proxy`,
-`no_proxy`: urllib.request.getproxies).
+or Last-Modified) that the server sent. The module requests the missing part with Range and If-Range (RFC 9110, sections
+13.1.5 and 14.2). If the server's answer does not continue the received part, the download restarts. Proxies come from
+the environment (`https_proxy`, `no_proxy`: urllib.request.getproxies).
 """
 
 from __future__ import annotations
@@ -196,8 +196,8 @@ def _validator(answer: Any) -> str | None:
 
 
 def _size(url: str, answer: Any, limit: int) -> int:
-    """Return the size that the server announces. Raises DownloadError if it announces no size, or one above `limit`
-    bytes.
+    """Return the size that the server announces. Raises DownloadError if the server announces no size, or a size above
+    `limit` bytes.
     """
     size: int | None = answer.length
     if size is None:

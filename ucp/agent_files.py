@@ -79,7 +79,7 @@ class LogFile:
 
 
 class TraceFile:
-    """A trace file. It contains only complete lines, and ends before the first line that cannot be written.
+    """A trace file. It contains only complete lines. If a line cannot be written, the trace ends before this line.
 
     An incomplete last line of an earlier incarnation is removed. `problem` is the reason why the trace ends. It
     distinguishes a trace that ended early from an agent that became silent.

@@ -2,8 +2,9 @@
 
 The store is a journal. An entry is a line: the CRC-32 of the rest in eight hexadecimal digits, a space, and JSON. The
 first entry identifies the agent. Each other entry has the changes by one input, as in a trace, and the new blocks. The
-agent writes an entry before other agents can observe the changes. Each entry has all changes of its input, so the
-entries up to any line describe a state that the agent had. A reader stops at the first damaged line.
+agent writes an entry before other agents can observe the changes. Each entry has all changes by one input. The entries
+from the first to any later line therefore describe a state that the agent had. A reader stops at the first damaged
+line.
 
 An agent that boots writes a new journal with the recovered data, and replaces the old journal when the new one is on
 disk. A valid journal therefore exists at any time.

@@ -2,12 +2,12 @@
 
 A station with a frame sends immediately if the channel has been idle for DIFS. If the channel is busy, the station
 draws a number of slots from 0 to the contention window. It begins to count after DIFS, counts down one slot whenever
-the channel was idle for the duration of a slot, and sends at 0. After a frame it draws again, even if no further frame
-waits. A broadcast is never acknowledged, so the window never grows. After a frame with an error, a station waits for
-the longer interval EIFS instead of DIFS.
+the channel was idle for the duration of a slot, and sends at 0. After a frame the station draws a new number, even if
+it has no further frame. A broadcast is never acknowledged, so the contention window never grows. After a frame with an
+error, a station waits for the longer interval EIFS instead of DIFS.
 
-Two stations whose counters end in the same slot both send, because neither can sense the other in time: a frame that
-began less than `sense_s` ago is not sensed yet.
+A station senses a frame only `sense_s` after the beginning of the frame. If the counters of two stations reach 0 in the
+same slot, both stations therefore send.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The revocations that an agent knows. A revoked agent stays revoked: the union of all revocations counts.
-
-The files of the authority may be lost, copied or used in any order, so a revocation with a higher number need not list
-the agents of an earlier one. An agent therefore keeps each revocation that lists a further agent. Agents compare a
-digest of the union with each datagram, and broadcast their revocations if the digests differ.
+"""The revocations that an agent knows. A revoked agent stays revoked. An agent therefore counts as revoked if any
+revocation lists it. The files of the authority may be lost, copied or used in any order. A revocation with a higher
+number may therefore omit agents that an earlier revocation lists. An agent therefore keeps each revocation that lists a
+further agent. Each datagram contains a digest of all agents that its sender knows to be revoked. An agent whose own
+digest differs broadcasts its revocations.
 """
 
 from collections.abc import Iterable

@@ -1,7 +1,8 @@
 """Open the secured datagrams of a capture after a mission.
 
 An agent drops replayed and old datagrams (`ucp.secure.session`). The reader of a capture wants to see all datagrams, so
-an opener accepts them in any order and any number of times. It still rejects datagrams that are not authentic.
+an opener accepts datagrams in any order, and the same datagram any number of times. It still rejects datagrams that are
+not authentic.
 """
 
 from ucp.messages import MalformedDatagramError
