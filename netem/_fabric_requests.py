@@ -100,7 +100,7 @@ def default_route(what: str, index: int) -> NetlinkRequest:
 
 
 def forwarding(netlink: NetlinkSocket) -> set[int]:
-    """Return the interface numbers of the ports on which the bridge forwards."""
+    """Return the interface numbers of the ports through which the bridge forwards packets."""
     ports = netlink.dump("list the ports of the bridge", RTM_GETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, 0, 0, 0))
     return {_IFINFOMSG.unpack_from(port)[2] for port in ports if _forwards(port)}
 

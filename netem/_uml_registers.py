@@ -36,8 +36,8 @@ _COMPILE = ("cc", "-O2", "-shared", "-fPIC", "-ffreestanding", "-nostdlib")
 
 
 def needed(kernel: Path | None) -> bool:
-    """Return true if User Mode Linux needs the library on this processor. If `kernel` is None, the answer does not
-    depend on the kernel's version.
+    """Return true if User Mode Linux needs the library on this processor. A new enough kernel does not need it. If
+    `kernel` is None, its version is not considered.
     """
     if os.environ.get(FORCE):
         return True

@@ -129,10 +129,9 @@ def rate(received: ReceivedStream, packet_bits: int) -> Estimate:
 
 
 def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
-    """Estimate the limit of the delay queue: the number of packets that waited in it when a packet was lost.
-
-    When a packet was lost, the packets whose delay was not over must still have waited. The packets that had not
-    arrived yet may have waited. The limits of the estimate are the medians of these two numbers over all lost packets.
+    """Estimate the limit of the delay queue. The limit is the number of packets in the queue when a packet is lost. At
+    this time, packets whose delay is not over are certainly in the queue. Packets that have not arrived yet may be in
+    the queue. The limits of the estimate are the medians of these two numbers over all lost packets.
     """
     received_packets = dict(received.arrivals)
     must: list[int] = []

@@ -1,4 +1,6 @@
-"""Provide the packets for measurements: real packets in a virtual network, or simulated packets in virtual time."""
+"""Provide the packets for measurements. They are real packets in a virtual network, or simulated packets in virtual
+time.
+"""
 
 from __future__ import annotations
 

@@ -49,8 +49,8 @@ class PilotLink(asyncio.Protocol):
     """A connection to one vehicle over a connected socket. It may be used in one event loop only.
 
     The link sends two kinds of heartbeats. The heartbeats of the pilot have the pilot's system ID. The heartbeats of a
-    ground station have the ID that the vehicle expects from its ground station, because its failsafe acts without such
-    heartbeats. If the run has a real ground station, the link sends only the heartbeats of the pilot.
+    ground station have the ID that the vehicle expects from its ground station. Without such heartbeats, the vehicle's
+    failsafe would act. If the run has a real ground station, the link sends only the heartbeats of the pilot.
     """
 
     def __init__(self, sysid: int, sock: socket.socket, tlog: Path, speedup: float, home: Home) -> None:

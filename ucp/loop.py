@@ -31,8 +31,9 @@ class ScheduledCall:
 class Loop:
     """An event loop. `run` calls functions one after another when they are due, until `stop` is called.
 
-    `on_error` gets the exception of a callback, and the loop continues. Without `on_error`, the exception ends the
-    loop. `selector` waits for sockets. The default selector rounds waiting times up to milliseconds.
+    If a callback raises an exception, the loop calls `on_error` with the exception and continues. Without `on_error`,
+    the exception ends the loop. `selector` waits for sockets. The default selector rounds waiting times up to
+    milliseconds.
     """
 
     def __init__(

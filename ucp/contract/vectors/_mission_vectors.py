@@ -1,6 +1,5 @@
-"""Whole missions in virtual time. Together they take every branch of the 20 algorithms.
-
-Each function plays a mission. Its name is the name of the transcript, and its docstring is the description.
+"""Record complete missions in virtual time. Together these missions take every branch of the 20 algorithms. Each
+function runs one mission. The name of the function is the name of the transcript, and its docstring is the description.
 """
 
 from collections.abc import Callable

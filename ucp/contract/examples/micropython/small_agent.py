@@ -590,7 +590,9 @@ class Program:
     # Requests
 
     def accept(self):
-        """Accept a client. A further client waits until one of them closes its connection."""
+        """Accept a client. If there are already as many clients as allowed, a further client waits until one of them
+        closes its connection.
+        """
         client, _ = self.listener.accept()
         client.setblocking(False)
         self.clients.append([client, b""])
