@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from harness.commands._shared_options import refuse_existing, write_new
+from harness.commands._shared_options import RARE, refuse_existing, write_new
 from harness.commands.terminal import complain, output, print_json
 from harness.conformance.conformance_page import read_agents, to_html
 from harness.conformance.conformance_run import ConformanceRequest, conform, remote_agents
@@ -65,7 +65,12 @@ def conformance_command(
         Path | None, typer.Option(metavar="FILE", help="File with the secret that the other computer has, too.")
     ] = None,
     write: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the generated vectors, and test nothing; must be new.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write the generated vectors, and test nothing; must be new.",
+            rich_help_panel=RARE,
+        ),
     ] = None,
 ) -> None:
     """Test one agent alone with thousands of generated cases.

@@ -38,7 +38,7 @@ def test_missing_binary_raises_no_binary_error(tmp_path: Path) -> None:
 
 
 def test_wrong_directory_in_environment_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(UnusableBinaryError, match=r"ARDUPILOT_SITL is .* no directory"):
+    with pytest.raises(UnusableBinaryError, match=r"ARDUPILOT_SITL is .* not a directory"):
         ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path / "gone"), "PATH": ""})
     with pytest.raises(UnusableBinaryError, match="does not exist"):
         ArduPilot.find(None, {"ARDUPILOT_SITL": str(tmp_path), "PATH": ""})

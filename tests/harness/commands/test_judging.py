@@ -36,13 +36,14 @@ def test_run_shows_each_step_of_its_judging(tmp_path: Path) -> None:
     judged = Judged()
     run(SWARM, 1, tmp_path / "run", judged, "sim")
     assert judged.steps == [
-        *(f"reading trace {number} of 3" for number in (1, 2, 3)),
         *(f"judging the steps of agent {number}, trace {number} of 3" for number in (1, 2, 3)),
         "writing the report",
     ]
 
 
-@pytest.mark.parametrize("step", ["reading trace 2 of 3", "judging the steps of agent 3, trace 3 of 3"])
+@pytest.mark.parametrize(
+    "step", ["judging the steps of agent 1, trace 1 of 3", "judging the steps of agent 3, trace 3 of 3"]
+)
 def test_run_interrupted_while_judged_can_be_judged_later(tmp_path: Path, step: str) -> None:
     out = tmp_path / "run"
     with pytest.raises(InterruptedRunError) as raised:

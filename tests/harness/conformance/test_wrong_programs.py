@@ -50,7 +50,7 @@ def test_records_of_reference_pass(case: str, tmp_path: Path) -> None:
         ("leaves_children", "the agent leaves no process running at its end", "came sleep"),
         ("leaks_descriptors", "inputs and clients leave no descriptors open", "after 50 messages and clients; came 5"),
         ("writes_export_in_place", "a chain export replaces the earlier one in one step", "came the same"),
-        ("leaves_other_files", "SIGTERM exports the chain, exit status 0", "came scratch.tmp"),
+        ("leaves_other_files", "the agent leaves no control socket and no other files at its end", "came scratch.tmp"),
         ("sends_after_sigterm", "SIGINT exports the chain, exit status 0", "came Chain Contain Query"),
         (
             "ends_with_status_3_without_a_mission",

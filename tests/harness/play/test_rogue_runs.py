@@ -257,7 +257,7 @@ def test_dead_and_paused_agents_receive_rogue_datagrams_as_usual(tmp_path: Path)
         ({"forge": {"message": "Request for Block", "sender": 1}}, "it should be 'Commit Block', 'Block Add Response'"),
         (
             {"forge": {"message": "Block Add Response", "sender": 1}},
-            "`for_s` is needed by forged answers",
+            "forged answers (Block Add Response",
         ),
         ({"forge": {"message": "Commit Block", "sender": 1, "approve": True}}, "a Commit Block has no vote"),
         ({"flood": {"for_s": 100, "per_s": 5000}}, "500000 messages are too many: a flood has at most 100000"),

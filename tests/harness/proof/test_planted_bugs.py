@@ -72,7 +72,7 @@ def test_agent_that_depends_on_a_counter_is_refused(tmp_path: Path) -> None:
     core = edited(tmp_path, Bug("commit.py", NOT_APPROVED, wrong))
     done = with_core(core, "prove", "--agents", 2, "--blocks", 2, cwd=tmp_path)
     assert done.returncode == 2
-    assert "or on how often it has done something before (reconciles" in done.stderr
+    assert "or on a counter (reconciles" in done.stderr
     assert "Traceback" not in done.stderr
 
 

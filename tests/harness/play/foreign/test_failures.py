@@ -160,7 +160,7 @@ def test_dead_program_is_a_finding_of_a_run_in_memory(tmp_path: Path, tracing: b
     assert simulated.result.wrong == (ENDED,)
     (finding,) = simulated.result.judgements[ENDED].evidence
     assert finding.agent_id == 2
-    assert finding.detail.startswith("crashed: it ended by itself with status 3 when it was given an event at 12.5 s")
+    assert finding.detail.startswith("crashed: it ended by itself with status 3 after it received an event at 12.5 s")
 
 
 def test_program_that_fails_at_its_export_is_a_finding_in_memory(tmp_path: Path) -> None:

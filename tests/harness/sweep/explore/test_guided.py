@@ -305,7 +305,7 @@ def test_a_corpus_is_of_one_scenario_and_of_one_command(tmp_path: Path) -> None:
         opened(tmp_path / "corpus", ordinary(name="other"), limits)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").write_text("mine")
-    with pytest.raises(RunDirectoryError, match="no corpus"):
+    with pytest.raises(RunDirectoryError, match="not a corpus"):
         opened(tmp_path / "mine", ordinary(), limits)
 
 

@@ -143,7 +143,7 @@ def test_a_full_disk_is_one_sentence_with_the_way_on(tmp_path: Path) -> None:
         with Path("/dev/full").open("r+b", buffering=0) as full:
             results._file = full
             with pytest.raises(
-                MachineError, match=r"No space left on device; what had ended is there, and the same com"
+                MachineError, match=r"No space left on device; it has all finished runs: free some space"
             ):
                 results.add(run)
     assert not results.runs
