@@ -119,7 +119,7 @@ class BareAgent:
         self._stack: list[Block] = []
         self.reconciling = False
         self._timers: dict[str, int] = {}
-        """For each running timer, the number of its last start.
+        """Running timer -> the number of its last start.
 
         If the timer is started again or stopped, its expiry in the queue no longer has this number and is ignored.
         """
@@ -128,7 +128,7 @@ class BareAgent:
         self._voted_chain = INCEPTION
         self._answers = Tally()
         self._successors: dict[Block, list[int]] = {}
-        """For each successor, the number of agents that named it, and its timestamp."""
+        """Successor -> the number of agents that named it, and its timestamp."""
         self._responders: set[int] = set()
         self._wanted: Block | None = None
         network.after(network.random.random(), self._maybe_log)

@@ -99,7 +99,7 @@ COMMANDS = {
     "chain": CommandEntry(
         "look",
         "harness.commands.chain:chain_command",
-        "Print each agent's chain, or draw a map of the vehicles' positions.",
+        "Print each agent's chain, or map the vehicles' positions.",
     ),
     "packets": CommandEntry(
         "look",

@@ -28,8 +28,8 @@ class LabError(NetemError):
 
 
 class LabUnavailable(LabError):  # noqa: N818  (a state of the machine)
-    """An error: this machine cannot run the virtual network or the requested engine. `way_out` describes what the user
-    can do.
+    """An error: this machine cannot run the virtual network or the requested engine. `way_out` is the
+    remedy.
     """
 
     def __init__(self, reason: str, way_out: str, stage: str = "namespaces") -> None:

@@ -20,9 +20,9 @@ from netem.lab import Lab, LabError
 
 @dataclass(frozen=True)
 class LabRequirement:
-    """A requirement of the virtual network. The object states whether this machine meets the requirement, what was
-    observed, and what the user can do otherwise. If this machine does not meet a `needed` requirement, it cannot open a
-    lab. One working engine is enough.
+    """A requirement of the virtual network, with an observation that shows whether this machine meets it, and a remedy.
+
+    A machine that does not meet a `needed` requirement cannot open a lab. One working engine is enough.
     """
 
     name: str

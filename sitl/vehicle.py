@@ -138,7 +138,7 @@ class VehicleKind(Protocol):
 
     @property
     def lack(self) -> str | None:
-        """A sentence about a missing requirement for a flight, and what the user can do. None if nothing is missing."""
+        """A sentence that names a missing requirement for a flight and its remedy. None if nothing is missing."""
 
     @property
     def uses_udp(self) -> bool:

@@ -29,7 +29,7 @@ def chain_command(
     ] = None,
     depot_key: DepotKey = None,
 ) -> None:
-    """Print each agent's chain, or draw a map of the vehicles' positions."""
+    """Print each agent's chain, or map the vehicles' positions."""
     archive = RunArchive(*paths)
     whole = logbook.read(archive, depot_of(depot_key))
     shown = whole if agent is None else whole.only(agent)

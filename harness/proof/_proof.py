@@ -132,7 +132,7 @@ class Proof:
     incomplete.
     """
     way: list[str] = field(default_factory=list)
-    """With the network `any`, the steps of a single agent that lead to the violation."""
+    """The steps of a single agent that lead to the violation. Only with the network `any`."""
     shown: dict[str, ViolationExample | None] = field(default_factory=dict)
     """Characteristic that an attacker can violate (see `OF_CAPTORS`) -> a scenario that shows the nearest such
     violation. With the network `any`, the value is None.

@@ -50,7 +50,7 @@ class BreakableConnection:
         threading.Thread(target=self._serve, daemon=True).start()
 
     def silent(self) -> None:
-        """From now on, accept connections but forward nothing."""
+        """Accept further connections, but forward nothing."""
         self._open.clear()
 
     def cut(self) -> None:

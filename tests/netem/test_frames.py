@@ -22,7 +22,7 @@ def test_broadcast_frame_has_correct_headers_and_checksums(vehicle: int, data: b
 
 
 def test_checksum_0_becomes_all_ones_only_in_udp() -> None:
-    """In UDP, a checksum of 0 means that there is no checksum (RFC 768)."""
+    """A UDP checksum of 0 means that there is no checksum (RFC 768)."""
     udp = {udp_broadcast(1, 14600, word.to_bytes(2, "big"))[40:42] for word in range(0x10000)}
     ip = {udp_broadcast(vehicle, 14600, b"")[24:26] for vehicle in range(1, 0x10000)}
     assert b"\xff\xff" in udp - ip

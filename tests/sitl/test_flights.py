@@ -60,7 +60,7 @@ def places(tlog: Path) -> Iterator[tuple[float, tuple[float, float, float]]]:
 
 @pytest.mark.parametrize("vehicle_type", TYPES)
 def test_mission_in_auto_mode_follows_the_computed_track(vehicle_type: VehicleType, tmp_path: Path) -> None:
-    """At every second, the vehicle is within a metre of the position that is computed for this second."""
+    """The vehicle is within a metre of the position that is computed for each second."""
     tlog = tmp_path / "3.tlog"
     pilot = flown(vehicle_type, "mission", tlog)
     assert pilot.state.armed is (vehicle_type == "rover")
@@ -306,7 +306,7 @@ def test_ready_vehicle_only_needs_arming(by: By, vehicle_type: VehicleType, tmp_
 
 
 def test_vehicle_that_revokes_its_readiness_is_not_ready(tmp_path: Path) -> None:
-    """For 2.4 s, ArduPilot 4.7 reports that a rover is ready. Then it reports for 17 s that the rover is not ready."""
+    """ArduPilot 4.7 reports for 2.4 s that a rover is ready. Then it reports for 17 s that the rover is not ready."""
 
     async def fly() -> None:
         async with on_strings(tmp_path, "rover") as (pilot, puppet):

@@ -31,7 +31,7 @@ def link(tmp_path: Path) -> Iterator[PilotLink]:
 
 @pytest.mark.parametrize("name", GOOD_S)
 def test_position_is_unknown_until_the_estimate_is_good(name: Name, link: PilotLink) -> None:
-    """At first, a plane reports a position near 0 N, 0 E, and a rover reports an altitude of 0."""
+    """A plane first reports a position near 0 N, 0 E, and a rover first reports an altitude of 0."""
     for frame in frames(name):
         link.data_received(frame)
         if (link.state.time_s or 0.0) < GOOD_S[name] - 0.1:

@@ -67,7 +67,7 @@ def test_store_always_equals_the_state_of_the_agent(tmp_path: Path) -> None:
 
 
 def test_booted_agent_has_its_blocks_and_commits_completed_ones() -> None:
-    """In a mission with loss, power failures during votes and reconciles neither lose nor duplicate a block."""
+    """Power failures during votes and reconciles neither lose nor duplicate a block, even if messages are lost."""
     air = Air([1, 2, 3], uniform_latency(Random(2), loss=0.3))
     air.generate_events(seed=2, mean_s=5.0)
     rng = Random(3)

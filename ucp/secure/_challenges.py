@@ -71,7 +71,7 @@ class PendingChallenges:
         return is_newest and sequence >= self._closed.get(sender, 0)
 
     def close(self, sender: int, next_sequence: int) -> None:
-        """From now on, ignore echoes of this sender to challenges with a lower sequence number than this one."""
+        """Ignore further echoes of this sender to challenges with a lower sequence number than this one."""
         self._closed[sender] = next_sequence
 
 

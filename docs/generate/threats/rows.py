@@ -19,9 +19,9 @@ class Row:
     attack: tuple[dict[str, Any], ...] = ()
     """Entries of the timeline without their times."""
     captured: bool = False
-    """Whether the attacker has the keys of vehicle 3."""
+    """True if the attacker has the keys of vehicle 3."""
     revoked: bool = False
-    """Whether the keys of vehicle 3 are revoked before the attack."""
+    """True if the keys of vehicle 3 are revoked before the attack."""
     quirks: tuple[str, ...] = ()
     """Deliberate errors of the handlers of vehicle 3."""
     own: Mapping[str, Any] = field(default_factory=dict)

@@ -32,7 +32,7 @@ NOTHING = "**nothing**"
 ALIKE = {
     "count_no_votes": "commit_whatever_the_vote",
 }
-"""For a quirk, another quirk that has the same effect outside the agent but belongs to another Algorithm."""
+"""Quirk -> another quirk that has the same effect outside the agent but belongs to another Algorithm."""
 
 
 def test(quirk: str) -> ConformanceResults:

@@ -188,8 +188,8 @@ class ClockChangeDetector:
 
     @cached_property
     def _differences(self) -> list[list[tuple[int, float]]]:
-        """For each other agent, a list with a pair for each message between it and this agent: the position of the
-        message in the trace, and the difference of both clocks in seconds.
+        """Lists of the messages between each other agent and this agent. Each message is a pair: its position in the
+        trace, and the difference of both clocks in seconds.
         """
         own = self._record.agent_id
         differences = []

@@ -29,9 +29,9 @@ class StateGraph:
     """If false, a state can also represent states with smaller zones, which are contained in its own zone."""
     states: StateStore = field(init=False)
     parents: "array[int]" = field(default_factory=lambda: array("q"))
-    """For each state, the state from which it was first reached."""
+    """The state from which each state was first reached."""
     quiet: SuccessorStore = field(default_factory=SuccessorStore)
-    """For each state, the field `by_timer` of its `StateExpansion`."""
+    """State -> the field `by_timer` of its `StateExpansion`."""
     crossing: dict[int, tuple[int, ...]] = field(default_factory=dict)
     """State -> the field `crossing` of its `StateExpansion`."""
     transitions: int = 0

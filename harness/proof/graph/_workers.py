@@ -298,7 +298,7 @@ class Workers:
         return sum(other.steps for other in self._handles)
 
     def pays_off(self, waiting: int) -> bool:
-        """Return true if so many states are waiting that the use of the workers saves time."""
+        """Return true if the number of waiting states is so large that the workers save time."""
         return self._size > 1 and waiting >= WORTH_WORKERS
 
     def expansions(

@@ -17,7 +17,7 @@ from harness.proof.model._snapshot import NAMES_OF_OTHERS
 from harness.proof.model._zones import ZoneTable
 
 Places = tuple[int, ...]
-"""For each position of a state, the previous position of the agent that is now there."""
+"""The previous position of the agent that is now at each position of a state."""
 
 
 class OrderedAgents(NamedTuple):

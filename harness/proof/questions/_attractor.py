@@ -26,7 +26,7 @@ class BackwardReachableStates:
         self._any_order = any_order
         self._inside = bytearray(len(by_timer))
         self._open = array("q", map(len, by_timer))
-        """For each state, the number of its timers that are not yet known to lead to a goal."""
+        """The number of timers of each state that are not yet known to lead to a goal."""
         self._whose = array("q", (number for number, choices in enumerate(by_timer) for _ in choices))
         """The state to which each timer belongs. The timers of all states are numbered consecutively."""
         self._leads = bytearray(len(self._whose))

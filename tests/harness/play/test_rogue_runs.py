@@ -154,10 +154,10 @@ def test_rogue_node_reaches_all_groups_and_is_no_vehicle(tmp_path: Path) -> None
     replay = {"at_s": 180, "replay": {"message": "Commit Block"}}
     finished = run(injecting(replay, apart, FORGE, **chatty, capture=True), 1, tmp_path / "run", SilentProgress())
     assert finished.played.outcome == "completed", finished.played.outcome_detail
-    replayed, forged = finished.rogue
-    assert (sum(replayed.messages[0].handled.values()), replayed.messages[0].changed) == (4, 0)
-    assert set(forged.messages[0].handled) <= {"committed", "does not succeed", "reconcile in progress"}
-    assert sum(forged.messages[0].handled.values()) == 4
+    replay_record, forge_record = finished.rogue
+    assert (sum(replay_record.messages[0].handled.values()), replay_record.messages[0].changed) == (4, 0)
+    assert set(forge_record.messages[0].handled) <= {"committed", "does not succeed", "reconcile in progress"}
+    assert sum(forge_record.messages[0].handled.values()) == 4
     assert {"1", "4"} <= violated(finished)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     for counted in (record["agents"], record["counters"]["receivers"]):
