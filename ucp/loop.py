@@ -66,7 +66,7 @@ class Loop:
         return timer
 
     def stop_on(self, *signals: int) -> None:
-        """Stop the loop when the process receives one of these signals, until `close` is called."""
+        """Let these signals stop the loop until `close` is called."""
         wakeup_receiver, self._wakeup_sender = socket.socketpair()
         for end in (wakeup_receiver, self._wakeup_sender):
             end.setblocking(False)

@@ -281,9 +281,9 @@ def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterato
 
 
 def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer: bool) -> bool:
-    """Return true if `count` is practically impossible as the number of successes in `number` random draws. `means`
-    contains the minimum and the maximum probability of a success, averaged over the draws. If `fewer` is true, the
-    function tests whether the count is too low. Otherwise it tests whether the count is too high.
+    """Return true if `count` is practically impossible as the number of successes in `number` random draws. `means` is
+    a lower and an upper bound of the mean probability of a success. If `fewer` is true, the function tests whether the
+    count is too low. Otherwise it tests whether the count is too high.
     """
     share = min(1.0, count / number)
     mean = min(1.0, max(0.0, means[0] if fewer else means[1]))

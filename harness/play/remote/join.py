@@ -119,8 +119,9 @@ class _RunOverError(Exception):
 
 
 def join(request: JoinRequest, say: Callable[[str], None]) -> None:
-    """Run incarnations of the agent until the run has ended, or without end as a service. Raises MachineError if this
-    machine has no private networks. Raises JoinError if no harness listens, or if the harness refuses the agent.
+    """Run incarnations of the agent until the run has ended. As a service, continue with the next run, without end.
+    Raises MachineError if this machine has no private networks. Raises JoinError if no harness listens, or if the
+    harness refuses the agent.
     """
     try:
         first_process = far_network.first_process([sys.executable, "-P", "-m", "harness.play.remote.far_worker"])

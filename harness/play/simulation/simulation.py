@@ -429,8 +429,8 @@ class Simulation(EventLoop):
         return (incarnation for incarnation in self._alive if incarnation is not None)
 
     def exporting(self) -> Iterator[SimulatedIncarnation]:
-        """Yield the agents that have a chain export, in the order of the roster: living agents, and agents that were
-        switched off.
+        """Yield the agents that have a chain export, in the order of the roster. These are living agents and agents
+        that were switched off.
         """
         for number, incarnation in enumerate(self._alive):
             if (leaves := self._switched_off.get(number, incarnation)) is not None:

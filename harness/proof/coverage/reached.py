@@ -38,7 +38,7 @@ KEPT = 20_000
 
 @dataclass
 class ReachedStates:
-    """The agent states that runs reached, and the (state, input) pairs in which the input had an effect or caused an
+    """The agent states that any run reached, and the (state, input) pairs in which the input had an effect or caused an
     answer.
     """
 

@@ -57,7 +57,9 @@ def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | N
 
 
 def is_deceived(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> bool:
-    """Return true if the agent holds a block in the name of the captured agent that this agent never completed."""
+    """Return true if the agent holds a block that names the captured agent, although the captured agent never completed
+    it.
+    """
     if captured is None:
         return False
     return any(maker == captured and made not in completed for made, maker in _makers(state).items())

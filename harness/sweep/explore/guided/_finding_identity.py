@@ -92,9 +92,7 @@ def _form(cycle: Cycle) -> list[str]:
 
 
 def _one_repetition(pattern: Sequence[str]) -> Sequence[str]:
-    """Return one repetition of a sequence of timers. If the sequence contains the vote timer, the repetition starts
-    with it.
-    """
+    """Return one period of a repeating sequence of timers. The period starts with the vote timer if it contains one."""
     length = len(pattern)
     divisors = (part for part in range(1, length + 1) if length % part == 0)
     once = next(part for part in divisors if [*pattern[:part]] * (length // part) == pattern)
