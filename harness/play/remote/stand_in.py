@@ -284,7 +284,7 @@ class StandIn:
         """Record that the far computer does not respond. From now on, this program answers requests in place of the
         agent.
         """
-        if self._cut_off or not self._begun:
+        if self._cut_off or not self._begun or self._over.done():  # after its last message, the far end disconnects
             return
         self._cut_off = True
         self._tell({"cut_off": True})

@@ -1,5 +1,6 @@
 """Test conformance of an agent on another computer, which is a network namespace at the other end of a cable."""
 
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -22,7 +23,6 @@ from tests.harness.two_computers import FAR, LISTEN, TwoComputers, needs_two_com
 pytestmark = [pytest.mark.lab, *needs_two_computers]
 
 OURS = [sys.executable, "-P", "-m", "ucp.node"]
-LOCAL = "127.0.0.1:14701"
 PLAYED = {
     "before the mission starts, the agent answers no message, and refuses to log and to reconcile",
     "SIGINT exports the chain, exit status 0",
@@ -40,9 +40,15 @@ NOT_VISIBLE = {
 }
 
 
+def free_address() -> str:
+    """Return an address of this machine with a free port, because other tests listen at the same time."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        return f"127.0.0.1:{listener.getsockname()[1]}"
+
+
 @contextmanager
-def joined(secret: Path, *command: str) -> Iterator[None]:
-    words = ["join", LOCAL, "--as", "1", "--secret-file", str(secret), "--service", "--", *command]
+def joined(address: str, secret: Path, *command: str) -> Iterator[None]:
+    words = ["join", address, "--as", "1", "--secret-file", str(secret), "--service", "--", *command]
     far = subprocess.Popen([*COMMAND, *words], stdout=subprocess.DEVNULL)
     try:
         yield
@@ -60,9 +66,10 @@ def vectors(longest: int) -> list[VectorSet]:
 
 def results_of(place: Path, *command: str, handwritten: bool, longest: int = 0) -> ConformanceResults:
     create_secret(place / "lab.key")
-    pool = remote_agents(LOCAL, read_secret(place / "lab.key"))
+    address = free_address()
+    pool = remote_agents(address, read_secret(place / "lab.key"))
     request = ConformanceRequest((), None, None, handwritten=handwritten, max_suspicions=2, remote=pool)
-    with joined(place / "lab.key", *command):
+    with joined(address, place / "lab.key", *command):
         return conform(request, place, lambda count, total: None, vectors(longest))
 
 
