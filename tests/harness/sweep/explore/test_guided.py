@@ -155,7 +155,7 @@ def test_livelocks_differ_by_their_cycles_of_timers() -> None:
         return identity.shape
 
     assert shape("v12", "12v") == "2 agents going round every 20 s (voting, phase one, phase two)"
-    assert shape("2v12v1", "vf12") == shape("v12", "12v"), "twice round, entered elsewhere, with what is not a timer"
+    assert shape("2v12v1", "vf12") == shape("v12", "12v"), "the same cycle, played twice and begun elsewhere"
     assert shape("v12", "v1") == shape("1v", "2v1") != shape("v12", "v12")
     assert shape("v12", "v12", "1").startswith("3 agents")
 
