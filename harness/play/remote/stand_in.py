@@ -92,6 +92,7 @@ class StandIn:
         self._cut_off = False
         self._server: asyncio.Server | None = None
         self._udp: socket.socket | None = None
+        self._opening: asyncio.Task[None] | None = None
         self._paused = False
         self._released = 0
         """Number of the agent's datagrams that this program sent to the lab."""
@@ -306,14 +307,20 @@ class StandIn:
 
     def _open(self) -> None:
         """Open the mission's UDP port and the control socket. Afterwards, the agent counts as ready."""
-        if self._udp is not None:
-            return
-        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._udp.setblocking(False)
-        self._udp.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-        self._udp.bind(("", self._task.port))
-        self._loop.add_reader(self._udp, self._arrive)
-        self._opening = self._loop.create_task(self._serve())
+        self._open_port()
+        if self._opening is None:
+            self._opening = self._loop.create_task(self._serve())
+
+    def _open_port(self) -> socket.socket:
+        """Return the socket at the mission's UDP port. Open the socket if necessary."""
+        if self._udp is None:
+            self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._udp.setblocking(False)
+            self._udp.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            self._udp.bind(("", self._task.port))
+            if not self._paused:
+                self._loop.add_reader(self._udp, self._arrive)
+        return self._udp
 
     def _arrive(self) -> None:
         """Send the datagrams that arrived at the vehicle to the remote agent."""
@@ -329,11 +336,13 @@ class StandIn:
                 self._connection.send(Kind.DATAGRAM, socket.inet_aton(address) + data)
 
     def _release(self, data: bytes) -> None:
-        """Broadcast a datagram of the remote agent in the lab."""
-        self._released += 1
-        if self._udp is not None:
-            with contextlib.suppress(OSError):
-                self._udp.sendto(data, (addresses.BROADCAST, self._task.port))
+        """Broadcast a datagram of the remote agent in the lab.
+
+        A restarted agent can send before it is ready, because it continues with the blocks on its disk.
+        """
+        with contextlib.suppress(OSError):  # the datagram counts as lost
+            self._open_port().sendto(data, (addresses.BROADCAST, self._task.port))
+            self._released += 1
 
     # Files
 

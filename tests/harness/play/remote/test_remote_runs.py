@@ -76,6 +76,7 @@ def test_remote_agent_is_paused_rebooted_and_killed_as_any_agent(computers: TwoC
         computers.directory,
         duration_s=240,
         network={"loss": 0.1},
+        capture=True,
         timeline=[
             {"at_s": 40, "pause": [2]},
             {"at_s": 60, "resume": [2]},
