@@ -30,6 +30,15 @@ from ucp.trace import CommandEntry, DroppedDatagram
 NAME = "every step"
 
 
+def first_cause(judgement: Judgement | None) -> str | None:
+    """Return what the verdict `deviates` is about: the handler of the first step that deviates, or the edited files of
+    the code that judge and agents share. Return None for other verdicts, and if neither is known.
+    """
+    if judgement is None or judgement.verdict != "deviates":
+        return None
+    return _shared_code.broken_files() or next((finding.handler for finding in judgement.evidence), None)
+
+
 def check(evidence: Evidence) -> Judgement:
     """Return the verdict on all steps. The verdict is `deviates` after any difference from the reference, `not
     applicable` if a step could not be judged, and `as specified` otherwise.

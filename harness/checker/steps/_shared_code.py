@@ -59,6 +59,11 @@ def defect() -> str | None:
     return found and f"{' and '.join(edited())} was edited and contradicts the agent contract: {found}"
 
 
+def broken_files() -> str | None:
+    """Return the edited files of the shared code if a test vector contradicts them. Return None otherwise."""
+    return " and ".join(edited()) if defect() is not None else None
+
+
 def _contradictions() -> Iterator[str]:
     yield from _hashes()
     yield from _messages()

@@ -37,7 +37,9 @@ class Run(CellRecord):
     figures: dict[str, float | int | None] = {}
     verdicts: dict[str, Verdict] = {}
     deviates_in: str | None = None
-    """The handler of the first step that deviates from the algorithms. None if no step deviates."""
+    """The handler of the first step that deviates from the algorithms. If an edit broke code that the judge shares with
+    the agents, the edited files instead. None if no step deviates.
+    """
     steps: str = ""
     """The fingerprint of the run's handler runs (see `_run_steps`). It is empty for real processes, and for runs
     without traces.
@@ -64,8 +66,7 @@ class Cell(CellRecord):
     `failed` and `unsupported` are numbers of runs without numeric results. `estimates` contains an estimate for each
     metric. `verdicts` contains the number of runs with each verdict, for each check. `violated` contains the seeds of
     runs with a bad verdict, for each check. `unfinished` contains the seeds of runs in which the swarm only needed more
-    time. In some runs, a step deviates from the algorithms. `deviations` counts these runs by the handler of the first
-    such step.
+    time. In some runs, a step deviates from the algorithms. `deviations` counts these runs by `Run.deviates_in`.
     """
 
     runs: int

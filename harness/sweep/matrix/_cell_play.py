@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from harness.archive.archive import RunArchive
 from harness.checker import Result, gather
+from harness.checker.steps import first_cause
 from harness.errors import VIOLATED, HarnessError, InterruptedRunError, UnsupportedError
 from harness.gc_pause import gc_paused
 from harness.play.backends import BACKENDS
@@ -103,7 +104,7 @@ class RunPlayer:
             seed=task.seed,
             figures=figures,
             verdicts=verdicts,
-            deviates_in=_first_deviation(judged.result),
+            deviates_in=first_cause(judged.result.beside.get("steps")),
             steps=judged.steps,
             reached=reached,
         )
@@ -136,14 +137,6 @@ class RunPlayer:
         if not finished.result.bad and self.matrix.keep == "violated":
             shutil.rmtree(directory)
         return JudgedRun(finished.played, finished.result)
-
-
-def _first_deviation(result: Result) -> str | None:
-    """Return the handler of the first step that deviates from the algorithms. Return None if no step deviates."""
-    steps = result.beside.get("steps")
-    if steps is None or steps.verdict != "deviates":
-        return None
-    return next((finding.handler for finding in steps.evidence), None)
 
 
 def directory_name(task: MatrixTask) -> str:

@@ -164,11 +164,9 @@ def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
 
 
 def _first_deviations(cell: Cell) -> str:
-    """Return the handlers of the first steps that deviate from the algorithms, with the number of runs for each
-    handler.
-    """
-    handlers = [f"{handler} ({count})" for handler, count in cell.deviations.items()]
-    return f"; first in {', '.join(handlers)}" if handlers else ""
+    """Return the places of the first deviations from the algorithms, with the number of runs for each place."""
+    places = [f"{place} ({count})" for place, count in cell.deviations.items()]
+    return f"; first in {', '.join(places)}" if places else ""
 
 
 def unsupported(record: MatrixRecord, cell: Cell) -> Iterable[str]:

@@ -32,14 +32,12 @@ def edits(name: str) -> list[Edit]:
     return read_edits(Path(__file__).with_name(name))
 
 
-def verdict_after(edit: Edit, scenario: dict[str, Any], folder: Path, status: int = 1) -> list[str]:
-    """Play the scenario with a copy of `ucp` that has this edit. Return the sentences of the verdict on the steps."""
+def run_edited(edit: Edit, folder: Path, *command: str) -> subprocess.CompletedProcess[str]:
+    """Run a command of the harness with a copy of `ucp` that has this edit."""
     shutil.copytree(Path(ucp.__file__).parent, folder / "ucp", ignore=shutil.ignore_patterns("__pycache__"))
     edit.make(folder)
-    (folder / "scenario.yaml").write_text(yaml.safe_dump(scenario), "utf-8")
     paths = os.pathsep.join([str(folder), str(Path(harness.__file__).parent.parent)])
-    command = ("run", "scenario.yaml", "--backend", "sim", "--seed", "1", "--out", "out")
-    done = subprocess.run(
+    return subprocess.run(
         [sys.executable, "-m", "harness.cli", *command],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": paths},
@@ -47,6 +45,12 @@ def verdict_after(edit: Edit, scenario: dict[str, Any], folder: Path, status: in
         text=True,
         check=False,
     )
+
+
+def verdict_after(edit: Edit, scenario: dict[str, Any], folder: Path, status: int = 1) -> list[str]:
+    """Play the scenario with an edited copy of `ucp`. Return the sentences of the verdict on the steps."""
+    (folder / "scenario.yaml").write_text(yaml.safe_dump(scenario), "utf-8")
+    done = run_edited(edit, folder, "run", "scenario.yaml", "--backend", "sim", "--seed", "1", "--out", "out")
     assert done.returncode == status, done.stdout + done.stderr
     record = json.loads((folder / "out" / "run.json").read_text("utf-8"))
     assert record["versions"]["core"].endswith(f"(ucp/{edit.file})")
@@ -63,6 +67,15 @@ def test_edit_of_the_core_is_found_and_its_handler_named(edit: Edit, tmp_path: P
 def test_edit_of_shared_code_is_found_and_its_file_named(edit: Edit, tmp_path: Path) -> None:
     found = verdict_after(edit, {"name": "edited code", "duration_s": 100}, tmp_path)
     assert f"ucp/{edit.file} was edited and contradicts the agent contract" in found[1]
+
+
+def test_matrix_names_the_file_of_an_edit_of_shared_code(tmp_path: Path) -> None:
+    edit = edits("edits_of_shared_code.yaml")[0]
+    matrix = {"name": "edited", "scenario": {"duration_s": 100}, "loss": [0.0], "seeds": 2}
+    (tmp_path / "matrix.yaml").write_text(yaml.safe_dump(matrix), "utf-8")
+    done = run_edited(edit, tmp_path, "matrix", "matrix.yaml", "--backend", "sim", "--out", "out", "--jobs", "1")
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert f"steps deviate in 2 of 2 runs, seeds 1, 2; first in ucp/{edit.file} (2)" in done.stdout
 
 
 def test_harmless_edit_of_shared_code_is_mentioned(tmp_path: Path) -> None:

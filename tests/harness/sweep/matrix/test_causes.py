@@ -134,7 +134,7 @@ def silent(step: str) -> None:
 
 def test_search_names_each_commit_that_changes_the_figure(repository: dict[str, str]) -> None:
     tonight, baseline = regression(repository["a"], repository["f"])
-    (culprit,) = find_culprits(tonight, baseline, 60, silent)
+    (culprit,) = find_culprits(tonight, baseline, 900, silent)
     assert (culprit.metric, culprit.seed) == ("reconciles", 1)
     assert [(commit.subject, commit.before, commit.after) for commit in culprit.commits] == [("c", 20, 22)]
     assert culprit.problem == "it is one of 2 commits, most of which cannot be played"
@@ -147,10 +147,10 @@ def test_search_names_each_commit_that_changes_the_figure(repository: dict[str, 
 def test_search_ends_at_its_budget_and_without_commits(repository: dict[str, str]) -> None:
     (late,) = find_culprits(*regression(repository["a"], repository["c"]), 0, silent)
     assert (late.commits, late.problem) == ([], "the time for the search was used up")
-    (edited,) = find_culprits(*regression(repository["a"], f"{repository['c']}-dirty"), 60, silent)
+    (edited,) = find_culprits(*regression(repository["a"], f"{repository['c']}-dirty"), 900, silent)
     assert edited.problem is not None
     assert "is not a commit of a repository" in edited.problem
-    (same,) = find_culprits(*regression(repository["e"], repository["f"]), 60, silent)
+    (same,) = find_culprits(*regression(repository["e"], repository["f"]), 900, silent)
     assert same.problem == "the run has the same figure at both commits, so no commit is named"
 
 
