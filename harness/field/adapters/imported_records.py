@@ -37,12 +37,10 @@ from harness.field.adapters.adapter import (
     Unusable,
 )
 from harness.field.depot.mission_files import SUFFIX as MISSION_SUFFIX
-from harness.field.ingest._file_owners import summarise_capture
-from harness.field.ingest._file_search import files_of
+from harness.field.ingest._file_owners import files_of, summarise_capture
 from harness.field.ingest._ingest import FileRemark, Flight, IngestResult, UnusedPart
-from harness.field.ingest._logged_events import SUFFIX as LOGGED_SUFFIX
-from harness.field.ingest._logged_events import EventLine
-from harness.field.ingest._sorting import RecordSorter
+from harness.field.ingest._sorting import SUFFIX as LOGGED_SUFFIX
+from harness.field.ingest._sorting import EventLine, RecordSorter
 from harness.field.ingest._trace_incarnations import TraceReader
 from harness.gc_pause import gc_paused
 from harness.scenario.strict_model import VehicleKey

@@ -19,8 +19,7 @@ from harness.field.calibrate._delivery_model import (
     fit,
     wilson,
 )
-from harness.field.calibrate._positions import Positions, find_positions
-from harness.field.calibrate._signal import SignalFit, fit_signal
+from harness.field.calibrate._positions import Positions, SignalFit, find_positions, fit_signal
 from harness.field.ingest import ingest_files
 from harness.scenario import Scenario
 from netem.channel import PRESETS

@@ -40,7 +40,7 @@ from harness.field.depot.mission_comparison import INCEPTION, ROSTER, ComparedFi
 from harness.field.depot.mission_comparison import read as read_compared_file
 from harness.field.flight_logs import FlightLog, flight_log_kind, read_flight_log
 from harness.field.ingest import UnusedPart
-from harness.field.ingest._file_search import files_of
+from harness.field.ingest._file_owners import files_of
 from harness.gc_pause import gc_paused
 from harness.report.logbook.book import logged_telemetry
 from ucp.block import BLOCK_HEADER, InceptionBlock, next_chain_hash

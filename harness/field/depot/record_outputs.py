@@ -13,7 +13,7 @@ from harness.field.depot.consolidation import MergedRecord, RecordedBlock, event
 from harness.field.depot.record_lines import Fork, ForkBranch, MissingItem, ReconcileResult, RecordLine
 from harness.field.flight_logs import Position
 from harness.field.flight_logs._matching import MatchedLog, match_logs
-from harness.field.flight_logs._summary import in_words as flight_log_in_words
+from harness.field.flight_logs._matching import in_words as flight_log_in_words
 from harness.report.chain_tree import ranges
 from harness.report.logbook.positions import LAST_TIMESTAMP_US, EventTrack, RoundedPosition, track_of, utc
 from ucp.events import LoggableEvent

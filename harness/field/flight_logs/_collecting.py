@@ -1,12 +1,14 @@
-"""Collect the records in a flight log, detect jumps of its clock, and convert its times to UTC.
+"""Collect the records in a flight log, detect jumps of its clock, and convert its times to UTC. Count damaged parts.
 
 A clock segment is the part of a log between two jumps of its clock. In each segment, times are converted by straight
 lines through points. Each point is the median of GPS time in ten seconds. The median ignores single late or damaged
 records. The lines account for the drift of the clock, and for a simulated vehicle that flies faster than real time.
 """
 
+import math
 from bisect import bisect_left
 from collections.abc import Hashable
+from dataclasses import dataclass
 from statistics import median
 from typing import Any, TypeVar
 
@@ -171,3 +173,100 @@ class _PiecewiseLinearClock:
             return before_utc + round((at_us - before_at) * (after_utc - before_utc) / (after_at - before_at))
         near_at, near_utc = self._points[min(after, len(self._points) - 1)]
         return near_utc + round((at_us - near_at) * self._rate)
+
+
+_EPOCH_S = 315_964_800
+"""The beginning of GPS time, 1980-01-06, in seconds since the Unix epoch."""
+_WEEK_MS = 7 * 86_400_000
+_LEAPS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (1_230_768_000, 15), (1_136_073_600, 14))
+"""Leap seconds as pairs: seconds since the Unix epoch, and GPS time minus UTC from this time on. The newest pair is
+first (IERS Bulletin C).
+"""
+_OLDEST_S, _NEWEST_S = 1_136_073_600, 4_102_444_800
+"""The years 2006 and 2100, as limits of a plausible time. Times outside of these limits come from damage, or from a
+receiver without a fix.
+"""
+
+
+def gps_time_from_week(at_us: int, week: int, week_ms: int) -> GpsTime | None:
+    """Return the GPS time for a GPS week and the milliseconds in this week. Return None if the time is impossible."""
+    gps_ms = week * _WEEK_MS + week_ms
+    unix_s = _EPOCH_S + gps_ms / 1000
+    if not (_OLDEST_S <= unix_s <= _NEWEST_S and 0 <= week_ms < _WEEK_MS):
+        return None
+    leap_s = _leap_seconds(unix_s)
+    return GpsTime(at_us, (_EPOCH_S - leap_s) * 1_000_000 + gps_ms * 1000, week, week_ms, leap_s)
+
+
+def gps_time_from_utc(at_us: int, utc_us: int) -> GpsTime | None:
+    """Return the GPS time for a time in UTC. Return None if the time is impossible."""
+    if not _OLDEST_S <= utc_us / 1e6 <= _NEWEST_S:
+        return None
+    leap_s = _leap_seconds(utc_us / 1e6)
+    week, week_ms = divmod(utc_us // 1000 - (_EPOCH_S - leap_s) * 1000, _WEEK_MS)
+    return GpsTime(at_us, utc_us, week, week_ms, leap_s)
+
+
+def _leap_seconds(unix_s: float) -> int:
+    return next((leap_s for since_s, leap_s in _LEAPS if unix_s >= since_s), _LEAPS[-1][1])
+
+
+MAX_SEARCHES = 500_000
+"""Maximum number of times that the reader searches for the next message in a file."""
+_NO_PLACE_DEG = 0.01
+_ALTITUDES_M = (-1000.0, 100_000.0)
+
+
+@dataclass
+class DamagedBytes:
+    """A counter of the bytes in a flight log that belong to no message."""
+
+    searches: int = 0
+    skipped_bytes: int = 0
+    first_at: int | None = None
+    ends_at: int | None = None
+    """Position of the byte at which reading stopped because of too much damage, or None if the file was read to its
+    end.
+    """
+    unusable: int = 0
+    """Number of messages with an unknown layout or impossible values."""
+
+    def skip(self, at: int, size: int) -> None:
+        self.searches += 1
+        self.skipped_bytes += size
+        if self.first_at is None:
+            self.first_at = at
+
+    def ends_reading(self, at: int) -> bool:
+        """Return true if the damage before the position `at` is so large that reading must stop."""
+        if self.searches <= MAX_SEARCHES:
+            return False
+        self.ends_at = at
+        return True
+
+    def sentences(self) -> list[str]:
+        """Return a sentence for each kind of damage in a flight log."""
+        sentences = []
+        if self.skipped_bytes:
+            sentences.append(
+                f"{self.skipped_bytes:,} bytes are no whole message and are skipped, first at byte {self.first_at:,}"
+            )
+        if self.ends_at is not None:
+            sentences.append(f"the part after byte {self.ends_at:,} is not read, because the file has too much damage")
+        if self.unusable:
+            messages = "1 message has" if self.unusable == 1 else f"{self.unusable:,} messages have"
+            sentences.append(f"{messages} an unknown layout or impossible values and are left out")
+        return sentences
+
+
+def is_place(lat_deg: float, lon_deg: float, alt_m: float) -> bool:
+    """Return true if these values are a position on Earth.
+
+    A place near 0° N, 0° E does not count, because vehicles report it while they do not know their position.
+    """
+    return (
+        -90 <= lat_deg <= 90
+        and -180 <= lon_deg <= 180
+        and _ALTITUDES_M[0] <= alt_m <= _ALTITUDES_M[1]
+        and math.hypot(lat_deg, lon_deg) > _NO_PLACE_DEG
+    )

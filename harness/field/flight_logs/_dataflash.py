@@ -12,9 +12,14 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO, NamedTuple
 
-from harness.field.flight_logs import _gps_time
-from harness.field.flight_logs._collecting import LogClock, RecordBudget, RecordCollector
-from harness.field.flight_logs._limits import DamagedBytes, is_place
+from harness.field.flight_logs._collecting import (
+    DamagedBytes,
+    LogClock,
+    RecordBudget,
+    RecordCollector,
+    gps_time_from_week,
+    is_place,
+)
 from harness.field.flight_logs._records import (
     ArmingChange,
     Battery,
@@ -200,7 +205,7 @@ class DataFlashReader:
         )
         if instance != 0 or fix < 3:
             return
-        if (time := _gps_time.from_week(at_us, values["GWk"], values["GMS"])) is not None and (
+        if (time := gps_time_from_week(at_us, values["GWk"], values["GMS"])) is not None and (
             self.vehicle.add_gps_time(time)
         ):
             self.gps_positions.use_gps_time(time)

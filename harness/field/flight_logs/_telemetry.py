@@ -13,9 +13,14 @@ from typing import Any, BinaryIO
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from harness.field.flight_logs import _gps_time
-from harness.field.flight_logs._collecting import LogClock, RecordBudget, RecordCollector
-from harness.field.flight_logs._limits import DamagedBytes, is_place
+from harness.field.flight_logs._collecting import (
+    DamagedBytes,
+    LogClock,
+    RecordBudget,
+    RecordCollector,
+    gps_time_from_utc,
+    is_place,
+)
 from harness.field.flight_logs._records import (
     ArmingChange,
     Battery,
@@ -157,7 +162,7 @@ class TelemetryReader:
             )
 
     def _system_time(self, system: SystemLog, at_us: int, values: Values) -> None:
-        if (time := _gps_time.from_utc(at_us, values["time_unix_usec"])) is not None and (
+        if (time := gps_time_from_utc(at_us, values["time_unix_usec"])) is not None and (
             system.collector.add_gps_time(time)
         ):
             self.radio.use_gps_time(time)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from harness.field.ingest._file_search import is_incarnation_copy
+from harness.field.ingest._file_owners import is_incarnation_copy
 from harness.field.ingest._ingest import UnusedPart
 from harness.field.ingest._trace_incarnations import TraceIncarnation, jumps_in
 from ucp.trace import HandlerRun

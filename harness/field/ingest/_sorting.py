@@ -1,40 +1,153 @@
-"""Recognise the format of each file by its content, and group the records by flight."""
+"""Recognise the format of each file by its content, and group the records by flight.
 
-from collections.abc import Iterable, Iterator
+A separate recorder can write events (`ucp-events/1`) as one JSON object per line:
+
+{"schema": "ucp-events/1", "agent_id": 7, "time_us": 1790000000000000, "event_id": 3, "data": "<base64>"}
+"""
+
+import base64
+from base64 import b64decode
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from harness.archive.bounded_file import BoundedFile
-from harness.archive.exports import MAX_EXPORT_BYTES, Export, json_error, parse_export
+from harness.archive.exports import MAX_EXPORT_BYTES, AgentId, Base64, Export, json_error, parse_export
 from harness.archive.packets.pcap import MAGICS
+from harness.archive.traces import MAX_LINE_BYTES, MAX_LINE_WEIGHT
 from harness.errors import CaptureError, ExportError, FieldError
 from harness.field.flight_logs import FlightLog, flight_log_kind, read_flight_log
+from harness.field.flight_logs._matching import in_words, match_logs
 from harness.field.ingest._file_owners import (
     PUBLIC_SCHEMA,
     CaptureSummary,
     assign_keys,
     assign_mission_files,
+    files_of,
     read_mission_file,
     read_public_keys,
     summarise_capture,
 )
-from harness.field.ingest._file_search import files_of
-from harness.field.ingest._flight_logs import assign_flight_logs
 from harness.field.ingest._flights import group_by_flight
-from harness.field.ingest._ingest import FileRemark, IngestResult, UnusedPart
-from harness.field.ingest._logged_events import read_logged
+from harness.field.ingest._ingest import FileRemark, Flight, IngestResult, UnusedPart
 from harness.field.ingest._trace_incarnations import TraceIncarnation, read_incarnations
 from harness.gc_pause import gc_paused
-from ucp.events import LoggableEvent
+from ucp.events import LoggableEvent, MalformedEventsError, decode_events
 from ucp.export import SCHEMA as EXPORT_SCHEMA
 from ucp.mission import SCHEMA as MISSION_SCHEMA
 from ucp.mission import Mission
-from ucp.plain_file import parse_json_at
+from ucp.plain_file import check_weight, parse_json_at
 from ucp.store import SCHEMA as STORE_SCHEMA
+from ucp.telemetry import Position, position_of
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
     from ucp.secure.opening import DatagramOpener
+
+
+SCHEMA: Literal["ucp-events/1"] = "ucp-events/1"
+SUFFIX = ".events.jsonl"
+MAX_EVENTS = 1_000_000
+
+
+class EventLine(BaseModel):
+    """One recorded event. `time_us` is in microseconds since the Unix epoch."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    schema_: Annotated[Literal["ucp-events/1"], Field(alias="schema")] = SCHEMA
+    agent_id: AgentId
+    time_us: Annotated[int, Field(ge=0, lt=2**64, strict=True)]
+    event_id: Annotated[int, Field(ge=1, le=254, strict=True)]
+    data: Annotated[Base64, Field(max_length=100_000)]
+
+    @classmethod
+    def of(cls, agent_id: int, event: LoggableEvent) -> "EventLine":
+        data = base64.b64encode(event.data).decode()
+        return cls(agent_id=agent_id, time_us=event.timestamp_us, event_id=event.event_id, data=data)
+
+    @property
+    def event(self) -> LoggableEvent:
+        return LoggableEvent(self.time_us, self.event_id, base64.b64decode(self.data))
+
+    def to_line(self) -> str:
+        return self.model_dump_json(by_alias=True) + "\n"
+
+
+def read_logged(path: Path, left_out: list[UnusedPart]) -> list[tuple[int, LoggableEvent]]:
+    """Return the events in a file, each with the ID of its agent. The list is empty if the file has another format.
+    Raises OSError.
+    """
+    events: list[tuple[int, LoggableEvent]] = []
+    damaged: list[int] = []
+    with BoundedFile(path) as file:
+        if SCHEMA.encode() not in file.peek(4096)[:4096]:
+            return []
+        number = 0
+        while len(events) < MAX_EVENTS and (text := file.readline(MAX_LINE_BYTES)):
+            number += 1
+            try:
+                check_weight(text, MAX_LINE_WEIGHT)
+                line = EventLine.model_validate_json(text)
+                events.append((line.agent_id, line.event))
+            except ValueError:
+                damaged.append(number)
+        if file.problem:
+            left_out.append(UnusedPart(path, file.problem))
+    if damaged:
+        more = f", and {len(damaged) - 1} more lines are" if len(damaged) > 1 else ""
+        left_out.append(UnusedPart(path, f"it is damaged{more}", damaged[0]))
+    return events
+
+
+def assign_flight_logs(
+    flights: Sequence[Flight], logs: Iterable[FlightLog], left_out: list[UnusedPart], remarks: list[FileRemark]
+) -> None:
+    """Assign each flight log to the first flight in which an agent flew on the vehicle of the log. Omit the logs of
+    unknown vehicles.
+    """
+    fixes = [_logged_positions(flight) for flight in flights] if logs else []
+    for log in logs:
+        remarks += [FileRemark(log.path, problem) for problem in log.problems]
+        unmatched = []
+        for number in range(len(log.vehicles)):
+            why = ""
+            for flight, positions in zip(flights, fixes, strict=True):
+                match = match_logs([log], positions)[number]
+                if match.agent_id is not None:
+                    flight.flight_logs.append(match)
+                    remarks.append(FileRemark(log.path, in_words(match).removeprefix(f"{log.path}: ")))
+                    break
+                why = why or in_words(match).removeprefix(f"{log.path}: ")
+            else:
+                unmatched.append(why)
+        left_out += [UnusedPart(log.path, why or "a flight log without a flight of agents") for why in unmatched]
+        if not log.vehicles:
+            left_out.append(UnusedPart(log.path, f"a {log.kind} log without a vehicle"))
+
+
+def _logged_positions(flight: Flight) -> dict[int, list[tuple[int, Position]]]:
+    """Return the positions that each agent logged, in order of time, from all blocks that any record contains."""
+    found: dict[int, dict[int, Position]] = {agent_id: {} for agent_id in {*flight.agents, *flight.roster}}
+    data = {(block.agent_id, block.event_bytes) for export in flight.exports.values() for block in export.blocks()}
+    data |= {(agent_id, b64decode(export.current_block.event_data)) for agent_id, export in flight.exports.items()}
+    for agent_id, event_data in data:
+        try:
+            events = decode_events(event_data)
+        except MalformedEventsError:
+            continue
+        of_agent = found.setdefault(agent_id, {})
+        for event in events:
+            if (position := position_of(event.event_id, event.data)) is not None:
+                of_agent[event.timestamp_us] = position
+    for agent_id, logged in flight.logged.items():
+        for event in logged:
+            if (position := position_of(event.event_id, event.data)) is not None:
+                found[agent_id][event.timestamp_us] = position
+    return {agent_id: sorted(positions.items()) for agent_id, positions in found.items()}
+
 
 MAX_DOCUMENTS = 1000
 """Maximum number of chain exports in one file."""

@@ -11,7 +11,7 @@ from harness.field.ingest import Flight
 from harness.field.reconstruct._agent_inputs import RecordedInput, inputs_by_incarnation
 from harness.field.reconstruct._inferring import infer
 from harness.field.reconstruct._judged_trace import JudgedTrace
-from harness.field.reconstruct._other_records import OtherRecords
+from harness.field.reconstruct._known_mission import OtherRecords
 from harness.field.reconstruct._rehearsal import (
     Incarnations,
     ProtocolDeviation,

@@ -6,8 +6,7 @@ from pathlib import Path
 from harness.checker.recorded_inputs import stored_blocks
 from harness.checker.steps.deviation import StepDeviation
 from harness.field.ingest import Flight
-from harness.field.reconstruct._agent_inputs import BootedFromDisk, RecordedInput
-from harness.field.reconstruct._bridging import KnownState
+from harness.field.reconstruct._agent_inputs import BootedFromDisk, KnownState, RecordedInput
 from harness.field.replay import RecordedTrace, RecordPlayer
 from harness.field.replay._record_search import IngestedRecords
 from harness.field.replay.replay_names import ReplayNames

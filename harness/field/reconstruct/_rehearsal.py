@@ -22,11 +22,12 @@ from harness.field.reconstruct._agent_inputs import (
     BootedFromDisk,
     DatagramReceived,
     EventLogged,
+    InferredInputPath,
+    KnownState,
     ReconcileRequested,
     RecordedInput,
     TimerExpired,
 )
-from harness.field.reconstruct._bridging import InferredInputPath, KnownState
 from harness.play.simulation.fate_script import LateTimers, RunningTimer
 from ucp.agent import Agent, drop_reason
 from ucp.block import next_chain_hash

@@ -16,9 +16,8 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 
 from harness.field.reconstruct._agent_inputs import BootedFromDisk, DatagramReceived
-from harness.field.reconstruct._clock_offsets import MAX_RATE, MIN_RATE, ClockLine, estimate
 from harness.field.reconstruct._rehearsal import PlayedInput, SoloSimulation, TimerStart
-from harness.field.replay._peer_messages import DeliveredMessage
+from harness.field.replay._peer_messages import MAX_RATE, MIN_RATE, ClockLine, DeliveredMessage, estimate
 
 MIN_GAP_S = 2e-5
 """Minimum number of seconds between two inputs of an agent, and between the sending and the arrival of a message."""

@@ -13,8 +13,7 @@ from harness.checker.signatures import TrustedKeys, vouch
 from harness.errors import FieldError, MachineError
 from harness.field.ingest import Flight
 from harness.field.reconstruct._comparing import FirstDifference, SoloSimulations, first_difference
-from harness.field.reconstruct._known_mission import NO_INPUTS, known_mission
-from harness.field.reconstruct._other_records import OtherRecords
+from harness.field.reconstruct._known_mission import NO_INPUTS, OtherRecords, known_mission
 from harness.field.reconstruct._rehearsal import SoloSimulation
 from harness.field.reconstruct._timetable import InputTimetable, timetable
 from harness.field.reconstruct._timetable_script import scenario_document

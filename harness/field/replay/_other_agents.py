@@ -8,9 +8,8 @@ from itertools import accumulate
 from rich.text import Text
 
 from harness.archive.traces import Trace
-from harness.field.reconstruct._clock_offsets import ClockLine, estimate
 from harness.field.replay._agent_record import RecordedTrace
-from harness.field.replay._peer_messages import PeerMessages
+from harness.field.replay._peer_messages import ClockLine, PeerMessages, estimate
 from harness.field.replay._player import RecordPlayer
 from harness.present.text import shown
 from ucp.clock import MICROSECONDS

@@ -10,8 +10,7 @@ from tempfile import TemporaryDirectory
 from harness.errors import HarnessError
 from harness.field.depot.record_outputs import flown_tracks
 from harness.field.flight_logs import read_flight_log
-from harness.field.flight_logs._matching import match_logs
-from harness.field.flight_logs._summary import changes, in_words
+from harness.field.flight_logs._matching import changes, in_words, match_logs
 from harness.report.logbook.positions import RoundedPosition
 from tests.fuzz.finding import require, sound
 from tests.harness.field import flight_log_files as files

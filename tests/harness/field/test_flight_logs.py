@@ -10,7 +10,8 @@ from pymavlink import mavutil
 from pymavlink.DFReader import DFReader_binary
 
 from harness.errors import FieldError
-from harness.field.flight_logs import FlightLog, GpsTime, _reading, flight_log_kind, read_flight_log
+from harness.field import flight_logs
+from harness.field.flight_logs import FlightLog, GpsTime, flight_log_kind, read_flight_log
 from tests.harness.field import flight_log_files as files
 
 WRITERS: dict[str, Callable[[], bytes]] = {"1.bin": files.dataflash_file, "1.tlog": files.telemetry_file}
@@ -264,7 +265,7 @@ def test_other_files_are_no_flight_logs(tmp_path: Path) -> None:
 @pytest.mark.parametrize("beginning", [b"", b"{}", b'{"schema": "ucp-trace/2"}\n', b"Notes of \xfd5 November\n"])
 def test_other_files_need_no_message_definitions(monkeypatch: pytest.MonkeyPatch, beginning: bytes) -> None:
     """Loading the message definitions of pymavlink takes 110 MiB of memory."""
-    monkeypatch.setattr(_reading, "_begins_with_frame", lambda beginning: pytest.fail("pymavlink is imported"))
+    monkeypatch.setattr(flight_logs, "_begins_with_frame", lambda beginning: pytest.fail("pymavlink is imported"))
     assert flight_log_kind(Path("10.trace.jsonl"), beginning) is None
 
 

@@ -11,9 +11,8 @@ from harness.field.depot.consolidation import consolidate
 from harness.field.depot.page import draw
 from harness.field.depot.record_outputs import flight_logs, flown_tracks
 from harness.field.flight_logs import read_flight_log
-from harness.field.flight_logs._matching import Fixes, MatchedLog, match_logs
-from harness.field.flight_logs._summary import changes
-from harness.field.reconstruct._clock_offsets import DeliveredMessage, estimate
+from harness.field.flight_logs._matching import Fixes, MatchedLog, changes, match_logs
+from harness.field.replay._peer_messages import DeliveredMessage, estimate
 from harness.report.logbook.positions import RoundedPosition
 from tests.harness.command import harness, sentences
 from tests.harness.field.flight_log_files import (
