@@ -138,8 +138,7 @@ def watch_command(
 
 async def _show(feed: "ChangeFeed", run: Path, port: int) -> None:
     from harness.report.live.change_log import ChangeLog
-    from harness.report.live.feed_to_log import copy_finished_run
-    from harness.report.live.server import LivePageServer
+    from harness.report.live.server import LivePageServer, copy_finished_run
 
     with closing(ChangeLog()) as log:
         async with LivePageServer(log, run, live=False).open(port) as address:

@@ -14,7 +14,7 @@ from harness.errors import MachineError, RunDirectoryError, ScenarioError
 from harness.play.machine.running_runs import enter_command, running
 from harness.play.machine.uml_kernel import enter, runs_inside
 from harness.play.request_socket import ask_run
-from harness.report.stories.sentences import VERBS, StoryEntries
+from harness.report.stories.story_file import VERBS, StoryEntries
 from harness.scenario.scenario_file import in_one_line
 
 _TIME_COMMANDS: list[tuple[re.Pattern[str], str, str | None]] = [

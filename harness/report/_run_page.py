@@ -13,17 +13,7 @@ from harness.archive.exports import Export, name_blocks
 from harness.errors import RunDirectoryError
 from harness.gc_pause import gc_paused
 from harness.present.colours import AgentColours
-from harness.report import (
-    _map_section,
-    _network_section,
-    _remote_section,
-    _rogue_section,
-    _survival_section,
-    _swarm_section,
-    facts,
-    html,
-    verdict_section,
-)
+from harness.report import _fault_sections, _map_section, _network_section, _swarm_section, facts, html, verdict_section
 from harness.report import _timeline_section as timeline
 from harness.report._report_source import ReportSource, read_source
 from harness.report._run_summary import to_junit, to_markdown
@@ -66,18 +56,18 @@ def draw(left: ReportSource) -> str:
         ],
         verdicts=judged,
         figures=facts.figures(record),
-        survival=_survival_section.section(record.survival, ink),
+        survival=_fault_sections.survival_section(record.survival, ink),
         pictures=_pictures(exports.by_agent, left.archive.before_final_reconcile, ink),
         counts=_swarm_section.counts(exports.by_agent, record),
         blocks=_swarm_section.block_rows(exports.by_agent, ink),
         timeline=timeline_section,
         strip=_network_section.strip(left.network, record.faults, timeline.end_s(left), record.channel),
         channel=_network_section.channel(record),
-        remote=_remote_section.sentences(record),
+        remote=_fault_sections.remote_sentences(record),
         network=_network_section.initial_state(record.network),
         happened=_network_section.event_rows(record),
         ground_station=_network_section.ground_station(record),
-        rogue=_rogue_section.section(record.rogue),
+        rogue=_fault_sections.rogue_section(record.rogue),
         flight=_map_section.section(left.archive.tracks(ink), left.network, ink, facts.vehicle_types(record)),
         agents=_swarm_section.agents_table(left.archive, ink),
         versions=record.versions,

@@ -8,7 +8,7 @@ from harness.present import text
 from harness.present import text as words
 from harness.present.junit import JunitCase, to_xml
 from harness.present.text import escaped, row
-from harness.report import _network_section, _remote_section, _rogue_section, _survival_section, facts
+from harness.report import _fault_sections, _network_section, facts
 from harness.report._report_source import ReportSource
 from harness.report.verdict_section import VerdictEntry, headline, verdicts
 from harness.scenario.expect import AS_EXPECTED, Expect
@@ -31,13 +31,13 @@ def to_markdown(left: ReportSource) -> str:
     lines += [*_verdict_table(judged), *_evidence(judged)] if judged else []
     if figures := facts.figures(record):
         lines += [" \u00b7 ".join(f"{_short(label)} **{_short(figure)}**" for label, figure in figures), ""]
-    if survived := _survival_section.section(record.survival, left.ink):
+    if survived := _fault_sections.survival_section(record.survival, left.ink):
         lines += _listed(survived.sentences)
     lines += _happened(_network_section.event_rows(record))
     lines += _listed(_network_section.channel(record))
-    lines += _listed(_remote_section.sentences(record))
+    lines += _listed(_fault_sections.remote_sentences(record))
     lines += _listed([station] if (station := _network_section.ground_station(record)) else [])
-    lines += _listed(_rogue_section.sentences(record.rogue))
+    lines += _listed(_fault_sections.rogue_sentences(record.rogue))
     if record.scenario is not None:
         lines += [f"Play this run again: `{facts.command_again(record, 'RUN_DIRECTORY')}`", ""]
     versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())

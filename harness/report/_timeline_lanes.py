@@ -25,7 +25,7 @@ from harness.archive.history import (
 )
 from harness.archive.run_record import FaultRecord
 from harness.present.svg import n
-from harness.report._timeline_plot import (
+from harness.report._timeline_charts import (
     PartitionShade,
     draw_background,
     fault_text,

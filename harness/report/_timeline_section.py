@@ -29,8 +29,8 @@ from harness.present import text
 from harness.present.colours import AgentColours
 from harness.report import _timeline_charts, _timeline_lanes, facts
 from harness.report._report_source import ReportSource
+from harness.report._timeline_charts import PartitionShade, axis, format_seconds
 from harness.report._timeline_lanes import OUTCOMES
-from harness.report._timeline_plot import PartitionShade, axis, format_seconds
 from harness.report.map_parts import divisions
 
 _HERE = Path(__file__).parent

@@ -12,16 +12,20 @@ from markupsafe import Markup
 from harness.archive.exports import Export, name_blocks
 from harness.present import text as words
 from harness.present.colours import AgentColours
-from harness.report._chain_tree_layout import (
+from harness.report.chain_tree import (
     BOX_HEIGHT,
     FONT_SIZE,
     LINE_HEIGHT,
     SMALL_FONT_SIZE,
     ChainTreeLayout,
+    ChainTreeNode,
     PlacedMark,
+    chain_tree,
+    holders,
     lay_out,
+    marks,
+    ranges,
 )
-from harness.report.chain_tree import ChainTreeNode, chain_tree, holders, marks, ranges
 
 STYLE = (Path(__file__).parent / "chain_tree.css").read_text(encoding="utf-8")
 

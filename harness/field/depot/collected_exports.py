@@ -42,7 +42,7 @@ from harness.field.flight_logs import FlightLog, flight_log_kind, read_flight_lo
 from harness.field.ingest import UnusedPart
 from harness.field.ingest._file_owners import files_of
 from harness.gc_pause import gc_paused
-from harness.report.logbook.book import logged_telemetry
+from harness.report.logbook import logged_telemetry
 from ucp.block import BLOCK_HEADER, InceptionBlock, next_chain_hash
 from ucp.export import SCHEMA
 from ucp.plain_file import parse_json

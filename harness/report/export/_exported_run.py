@@ -2,17 +2,27 @@
 
 The run may have been interrupted, some of its files may be damaged, or the command `import` may have created it from
 field logs. The export contains everything that is readable. `problems` contains a sentence for each file that is not.
+
+Each line in the log file of a program begins with its time. Agents may use any log format. A line without a time gets
+the time of the previous line. If the first line has no time, it gets the start of the mission. Log files do not name
+their time zone. The reader assumes the zone in which the first line is nearest to the start of the mission.
 """
 
+import math
+import re
 from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
 from functools import cached_property
 from heapq import merge
-from itertools import groupby
+from itertools import chain, groupby, islice
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pymavlink import mavutil
+
 from harness.archive.archive import RunArchive
+from harness.archive.bounded_file import BoundedFile
 from harness.archive.connectivity import Components, Connectivity, LossRates, Topology
 from harness.archive.exports import name_blocks
 from harness.archive.history import (
@@ -28,7 +38,6 @@ from harness.archive.run_record import FaultRecord
 from harness.archive.tracks import VehicleTracks
 from harness.errors import ExportError, RunDirectoryError
 from harness.report import logbook
-from harness.report.export._logs import log_files, read_log
 from harness.report.export._samples import (
     DropSample,
     EarthPosition,
@@ -43,10 +52,10 @@ from harness.report.export._samples import (
     ReconcileSample,
     ReplicationSample,
     Sample,
+    TelemetrySample,
     VoteSample,
     mission_time,
 )
-from harness.report.export._telemetry import read_telemetry, telemetry_logs
 from harness.report.logbook.positions import tracks
 from harness.scenario.strict_model import MAX_AGENTS
 from harness.scenario.verdict_names import kind_of
@@ -55,6 +64,122 @@ from ucp.trace import DroppedDatagram
 
 if TYPE_CHECKING:
     from ucp.secure.sealing import Depot
+
+
+NAME = "telemetry.tlog"
+MAX_BYTES = 1024 * 1024 * 1024
+MAX_FILES = 1000
+_LIFE = re.compile(r"([1-9]\d{0,4})(?:-([1-9]\d{0,3}))?")
+
+
+def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
+    """Return the vehicle and the path of each telemetry log. A restarted vehicle has several logs."""
+    logs = []
+    for path in islice((directory / "vehicles").glob(f"*/{NAME}"), MAX_FILES):
+        if named := _LIFE.fullmatch(path.parent.name):
+            logs.append((int(named[1]), int(named[2] or 1), path))
+    return [(vehicle, path) for vehicle, _, path in sorted(logs)]
+
+
+def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[str]) -> Iterator[TelemetrySample]:
+    """Yield the messages of a telemetry log. At the end, add sentences about damage in the log to `problems`."""
+    damaged = untimed = 0
+    if not path.is_file():
+        problems.append(f"{path}: cannot be read: it is not a file")
+        return
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            problems.append(
+                f"{path}: larger than {MAX_BYTES // 1024**2} MiB, which is too large for a log of a "
+                "flight; it is left out"
+            )
+            return
+        log = mavutil.mavlogfile(str(path), robust_parsing=True)
+    except OSError as error:
+        problems.append(f"{path}: cannot be read: {error.strerror}")
+        return
+    try:
+        while (message := log.recv_msg()) is not None:
+            kind = message.get_type()
+            if kind == "BAD_DATA":
+                damaged += 1
+            elif (at_ns := time.of_wall(message._timestamp)) is None:
+                untimed += 1
+            elif not kind.startswith("UNKNOWN_"):
+                yield TelemetrySample(at_ns, vehicle, message)
+    finally:
+        log.f.close()
+    if damaged:
+        problems.append(f"{path}: damaged in {damaged} places; the messages between are read")
+    if untimed:
+        problems.append(f"{path}: {untimed} messages with an impossible time are left out")
+
+
+MAX_BYTES = 32 * 1024 * 1024
+MAX_LINE_BYTES = 64 * 1024
+MAX_FILES = 3000
+_ZONE_STEP_S = 15 * 60
+_FURTHEST_ZONE_S = 14 * 3600
+_TIME = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(?:[.,](\d{1,6}))?\s*")
+_WORSE = re.compile(r"\b(error|exception|traceback|fatal|critical|panic)\b", re.IGNORECASE)
+_BAD = re.compile(r"\bwarn(ing)?\b", re.IGNORECASE)
+
+
+def log_files(directory: Path) -> Iterator[tuple[str, Path]]:
+    """Yield the name and path of each log file of the run. Log files exist for the network, the rogue node, the agents
+    and the vehicles.
+    """
+    files = chain(directory.glob("*.log"), directory.glob("agents/**/*.log"), directory.glob("vehicles/*/output.log"))
+    for path in sorted(islice(files, MAX_FILES)):
+        yield str(path.relative_to(directory)).encode("utf-8", "replace").decode(), path
+
+
+def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) -> Iterator[LogLine]:
+    """Yield the lines of a log file. If a part cannot be read, add a sentence to `problems`."""
+    at_ns, zone_s = time.at(0.0), None
+    try:
+        with BoundedFile(path, MAX_BYTES) as file:
+            while line := file.readline(MAX_LINE_BYTES):
+                text = line.decode("utf-8", "replace").rstrip()
+                if timed := _TIME.match(text):
+                    wall_s = _seconds(timed)
+                    if wall_s is not None and zone_s is None:
+                        zone_s = _zone_s(wall_s - time.epoch_ns / 1e9)
+                    moment = None if wall_s is None or zone_s is None else time.of_wall(wall_s - zone_s)
+                    at_ns = at_ns if moment is None else moment
+                    text = text[timed.end() :]
+                if text:
+                    yield LogLine(at_ns, _level(text), source, text)
+            if file.problem:
+                problems.append(f"{path}: {file.problem}")
+    except OSError as error:
+        problems.append(f"{path}: cannot be read: {error.strerror}")
+
+
+def _zone_s(ahead_s: float) -> float:
+    """Return the time zone of a log file as an offset in seconds. The offset is the difference between the first line
+    of the log file and the start of the mission. Return infinity if no zone matches, for example in virtual time.
+    """
+    zone_s = round(ahead_s / _ZONE_STEP_S) * _ZONE_STEP_S
+    return zone_s if abs(zone_s) <= _FURTHEST_ZONE_S else math.inf
+
+
+def _seconds(timed: re.Match[str]) -> float | None:
+    """Parse a text as a time in UTC, and return it in seconds since the Unix epoch. Return None if the text is not a
+    valid time.
+    """
+    try:
+        whole = datetime.fromisoformat(timed[1]).replace(tzinfo=UTC).timestamp()
+    except ValueError:
+        return None
+    return whole + float(f"0.{timed[2] or 0}")
+
+
+def _level(text: str) -> Level:
+    if _WORSE.search(text):
+        return "error"
+    return "warning" if _BAD.search(text) else "info"
+
 
 FAULTS, OPERATOR, VERDICTS = "faults", "operator", "verdicts"
 MAX_LINKED = 100

@@ -16,16 +16,19 @@ from harness.archive.history import LATEST_S
 from harness.archive.traces import TraceGap, TraceHeader
 from harness.errors import MachineError, extra
 from harness.report.export._exported_run import ExportedRun
-from harness.report.export._links import FIELD, CurrentLinks, LinkLine, vehicle_frame
 from harness.report.export._samples import (
+    FIELD,
+    CurrentLinks,
     FieldPosition,
     HandlerRunSample,
+    LinkLine,
     LogLine,
     LossSample,
     Metres,
     NetworkSample,
     Sample,
     TelemetrySample,
+    vehicle_frame,
 )
 
 with extra("export", "writing a ROS bag"):

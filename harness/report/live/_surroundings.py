@@ -11,8 +11,7 @@ from pydantic import ValidationError
 
 from harness.archive.connectivity import NETWORK_FILE, NetworkLine, NetworkReplay, Pair
 from harness.archive.tracks import TRACKS_FILE, TrackLine
-from harness.report.live._agent_course import Change
-from harness.report.live._live_trace import GrowingFile
+from harness.report.live._agent_course import Change, GrowingFile
 from harness.scenario.changes import RANGE
 from harness.scenario.faults import fault_class
 from harness.scenario.faults.fault import PAUSED, Fault

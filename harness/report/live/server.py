@@ -1,9 +1,13 @@
-"""The web server of the live page. It listens on 127.0.0.1 only, and requires the secret token in the page's address.
+"""The web server of the live page, and the functions that write the changes of a run to the log that it serves.
+
+The server listens on 127.0.0.1 only, and requires the secret token in the page's address.
 
 At its start, the server makes a list of the files that it serves, so no address can reach another file. The
 Content-Security-Policy lets browsers load from this server only. Three checks reject requests from other pages in the
 same browser: other pages do not know the token, the header Origin shows their origin, and the header Host shows a
 foreign host name that resolves to 127.0.0.1.
+
+The changes of an active run are written as they occur, and the changes of a finished run all at once.
 """
 
 import asyncio
@@ -26,6 +30,7 @@ from harness.errors import MachineError
 from harness.report.html import PALETTE
 from harness.report.live._agent_course import Change
 from harness.report.live.change_log import ChangeLog
+from harness.report.live.feed import ChangeFeed, RunClock
 
 _PAGE = Path(__file__).parent / "page"
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
@@ -217,3 +222,38 @@ def _log() -> logging.Logger:
 
 def _is_own_error(record: logging.LogRecord) -> bool:
     return record.exc_info is None or not isinstance(record.exc_info[1], HttpProcessingError)
+
+
+STRIDE_S = 20.0
+"""Mission seconds of a finished run that are read from all files in one step."""
+
+
+async def copy_finished_run(feed: ChangeFeed, log: ChangeLog) -> None:
+    """Write all changes of a finished run to a log, in order of time."""
+    until_s = 0.0
+    log.append([feed.run_change(live=False)])
+    while True:
+        changes, more = feed.poll(until_s)
+        log.append(changes)
+        await asyncio.sleep(0)
+        if more:
+            continue
+        if (next_s := feed.next_s) is None:
+            break
+        until_s = max(until_s, next_s) + STRIDE_S
+    log.append(feed.final_changes())
+
+
+async def copy_live_run(feed: ChangeFeed, log: ChangeLog, ended: asyncio.Event, clock: RunClock) -> None:
+    """Write the changes of an active run to a log until the run has a result. Also stop when the event `ended` is set,
+    which means that the process of the run has ended. `clock` contains the mission seconds that the run reported.
+    """
+    log.append([feed.run_change(live=True)])
+    while True:
+        over = feed.over or ended.is_set()
+        changes, more = feed.poll_live(clock)
+        log.append(changes)
+        if over and not more:
+            break
+        await asyncio.sleep(0 if more else UPDATE_S)
+    log.append(feed.final_changes())

@@ -7,7 +7,7 @@ from typing import Any
 from harness.archive.event_data import SealedError
 from harness.archive.exports import Export, ExportedBlock
 from harness.present.text import moment
-from harness.report.logbook.book import Logbook
+from harness.report.logbook import Logbook
 from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.telemetry import describe, vehicle_type
 

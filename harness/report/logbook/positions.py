@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 from harness.archive.exports import ExportedBlock
 from harness.archive.run_record import RunRecord
 from harness.archive.tracks import PositionFix, VehicleTracks
-from harness.report.logbook.book import Logbook
+from harness.report.logbook import Logbook
 from sitl.vehicle import Home
 from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.telemetry import position_of

@@ -12,8 +12,7 @@ import pytest
 
 from harness.errors import RunDirectoryError
 from harness.play.progress import SilentProgress
-from harness.report.difference import AgentDifference, ChainDifference, KeyDifference, compare
-from harness.report.difference._run_difference import differing_keys
+from harness.report.difference import AgentDifference, ChainDifference, KeyDifference, compare, differing_keys
 from harness.run.run import run
 from harness.scenario import load_scenario
 from tests.harness.command import harness, sentences

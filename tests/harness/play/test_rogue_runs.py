@@ -17,7 +17,7 @@ from harness.errors import ScenarioError
 from harness.play.process.process_preflight import add_rogue_listener
 from harness.play.progress import SilentProgress
 from harness.play.rogue.rogue_line import injection_of
-from harness.report._rogue_section import section
+from harness.report._fault_sections import rogue_section
 from harness.run.run import Run, run
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
@@ -141,10 +141,10 @@ def test_forged_commit_is_found_and_reported(tmp_path: Path) -> None:
 def test_invalid_rogue_record_is_left_out_of_the_report() -> None:
     hostile = {"at_s": 1, "what": "<script>", "detail": "x", "refused": {"<b>": 2}}
     record, _ = validate_leniently(RunRecord, {"rogue": [hostile, {"at_s": "soon"}]})
-    outcome = section(record.rogue)
+    outcome = rogue_section(record.rogue)
     assert outcome is not None
     assert [(row.what, row.message, row.sent) for row in outcome.rows] == [("<script>", "none: <b>", "2")]
-    assert section([]) is None
+    assert rogue_section([]) is None
 
 
 @pytest.mark.lab

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.archive.exports import name_blocks
-from harness.report._chain_tree_layout import CHARACTER_WIDTH, ChainTreeLayout, PlacedMark, lay_out
-from harness.report.chain_tree import chain_tree, marks
+from harness.report.chain_tree import CHARACTER_WIDTH, ChainTreeLayout, PlacedMark, chain_tree, lay_out, marks
 from tests.harness.report.runs import Chains, exports
 
 Box = tuple[float, float, float, float]
