@@ -14,12 +14,16 @@ rogue.jsonl         datagrams that the rogue node sent, if the timeline injects 
 lag.jsonl           delays of programs that the machine woke late, and the load of each agent (harness.archive.lag)
 lab.log             output of the lab
 report.html  report.md  junit.xml  chains.svg
+
+`past_runs` lists the run directories in a folder.
 """
 
 import json
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from heapq import nlargest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +31,7 @@ from harness.archive.channel_journal import CHANNEL_FILE
 from harness.archive.connectivity import NETWORK_FILE
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, SUFFIX, export_paths
 from harness.archive.lag import LAG_FILE
-from harness.archive.run_listing import RUNS
+from harness.archive.record_file import read_record
 from harness.archive.run_record import RunRecord
 from harness.archive.trace_files import SUFFIX as TRACE_SUFFIX
 from harness.archive.trace_files import open_trace
@@ -38,6 +42,44 @@ from ucp.agent_files import end_of_last_line, write_json_atomically
 
 if TYPE_CHECKING:
     from ucp.secure.bundle import PublicKeys
+
+
+RUNS = Path("runs")
+"""Name of the folder for runs that were started without --out."""
+
+
+@dataclass(frozen=True)
+class PastRun:
+    """A run directory with its record. `problem` is the reason why the record cannot be read. It is None for a readable
+    record.
+    """
+
+    path: Path
+    record: RunRecord
+    problem: str | None
+
+    @property
+    def report(self) -> Path:
+        return self.path / "report.html"
+
+
+def past_runs(folder: Path, most: int) -> Iterator[PastRun]:
+    """Yield the runs in `folder` whose run.json was written last, at most `most` of them. The newest run is first.
+
+    Raises RunDirectoryError if `folder` is not a folder.
+    """
+    try:
+        written = [(path.stat().st_mtime_ns, path) for path in folder.glob(f"*/{RUN_FILE}")]
+    except OSError as error:
+        raise RunDirectoryError(f"{folder} cannot be read: {error.strerror}") from None
+    if not folder.is_dir():
+        raise RunDirectoryError(
+            f"{folder} does not exist: `ucp-harness run` creates it; otherwise name the folder of your runs"
+        )
+    for _, path in nlargest(most, written):
+        file = read_record(path)
+        yield PastRun(path.parent, file.record, str(file.error) if file.error else None)
+
 
 ROGUE_FILE = "rogue.jsonl"
 PUBLIC_KEYS_FILE = "public.json"

@@ -1,15 +1,14 @@
 """Find the traces of a run, read them, and pack large traces with gzip.
 
 A trace of a process contains every received datagram, so the traces of a large swarm take gigabytes. Packed, they take
-about a sixth. The harness packs finished parts during the run (`harness.archive.packed_parts`), and the rest after it.
+about a sixth. The harness packs finished parts during the run (`harness.archive.bounded_file`), and the rest after it.
 All readers accept `7.trace.jsonl.gz`, and they accept `7.trace.jsonl` even if a part of it is packed.
 """
 
 from collections.abc import Callable
 from pathlib import Path
 
-from harness.archive.bounded_file import BoundedFile
-from harness.archive.packed_parts import can_free_parts, has_finished_part, pack_whole
+from harness.archive.bounded_file import BoundedFile, can_free_parts, has_finished_part, pack_whole
 
 SUFFIX = ".trace.jsonl"
 PACKED_SUFFIX = f"{SUFFIX}.gz"

@@ -7,7 +7,7 @@ from harness.archive.exports import Export, ExportedBlock
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding, Judgement, agents, violated
-from harness.checker.missing_incarnations import may_be_of_missing_incarnation
+from harness.checker.lost_lines import may_be_of_missing_incarnation
 from harness.checker.signatures import SignatureChecks, is_older, unanchored
 from ucp.block import Block, InceptionBlock, next_chain_hash
 

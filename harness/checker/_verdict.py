@@ -15,11 +15,10 @@ from harness.checker import (
     steps,
     uniform_chain,
 )
-from harness.checker._figures import figures
+from harness.checker._liveness import figures
 from harness.checker.evidence import Evidence, gather
 from harness.checker.judgement import Judgement
-from harness.checker.records import cross_examine
-from harness.checker.records._doubt import in_doubt
+from harness.checker.records import cross_examine, in_doubt
 from harness.errors import INCOMPLETE, VIOLATED
 from harness.scenario.verdict_names import ALL_CHECKS, UNFINISHED
 

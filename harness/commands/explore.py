@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from harness.archive.directory import RUNS
 from harness.archive.recorded_scenario import load_recorded_scenario
-from harness.archive.run_listing import RUNS
 from harness.commands._shared_options import complete_scenario, seconds_of
 from harness.commands.terminal import complain, output, print_json
 from harness.run.parallel import cores

@@ -10,12 +10,17 @@ import typer
 from harness.archive.packets import packets_text
 from harness.archive.packets.block_names import BlockNames, run_directories
 from harness.archive.packets.capture_files import Captures, capture_files, read_captures
-from harness.archive.packets.channel_losses import channel_losses
-from harness.archive.packets.exchanges import RequestAnswers, count_losses, loss_matrix
+from harness.archive.packets.exchanges import (
+    MessageFilter,
+    RequestAnswers,
+    count_losses,
+    exchanges_about,
+    in_order,
+    loss_matrix,
+)
 from harness.archive.packets.packets_document import document
 from harness.archive.packets.packets_text import Paint, TransmissionFormatter
-from harness.archive.packets.selection import MessageFilter, exchanges_about, in_order
-from harness.archive.packets.transmissions import join
+from harness.archive.packets.transmissions import channel_losses, join
 from harness.commands._shared_options import BundleOption, opener_of
 from harness.commands.terminal import complain, output, print_lines
 from harness.errors import WRONG_REQUEST

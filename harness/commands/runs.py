@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from harness.archive.run_listing import RUNS, PastRun, past_runs
+from harness.archive.directory import RUNS, PastRun, past_runs
 from harness.archive.run_record import RunRecord
 from harness.commands.terminal import MARKS, STYLES, complain, output, print_json
 from harness.errors import RunDirectoryError

@@ -10,7 +10,6 @@ from pathlib import Path
 from harness.conformance import _udp_agent
 from harness.conformance import _virtual_agent as virtual
 from harness.conformance._blame import BlameEvidence
-from harness.conformance._handwritten import handwritten
 from harness.conformance._kept_failures import keep
 from harness.conformance._reference_model import AGENT
 from harness.conformance._suite import (
@@ -23,6 +22,7 @@ from harness.conformance._suite import (
     VectorSuite,
 )
 from harness.conformance._udp_lab import UdpLab
+from harness.conformance.cases import handwritten
 from harness.conformance.results import FURTHER_CHECKS, AlgorithmCounts, CaseResult, ConformanceResults
 from harness.conformance.vectors import VectorSet, generate
 from harness.errors import MachineError

@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.archive.packets.capture_reader import Capture
-from harness.archive.packets.datagram import NotUcpError, unwrap
+from harness.archive.packets.capture_reader import Capture, NotUcpError, unwrap
 from harness.archive.packets.pcap import OUTBOUND, CaptureFile
 from ucp.clock import MICROSECONDS
 from ucp.events import LoggableEvent

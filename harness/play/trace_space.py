@@ -14,7 +14,7 @@ import shutil
 from itertools import pairwise
 from pathlib import Path
 
-from harness.archive.packed_parts import can_free_parts
+from harness.archive.bounded_file import can_free_parts
 from harness.archive.trace_files import MAX_TRACE_BYTES, PACKED_FROM_BYTES, PACKED_SHARE
 from harness.scenario import Scenario
 

@@ -55,7 +55,7 @@ FigureName = Literal[
     "mutual_chain_before_final_reconcile",
     "distinct_chains_before_final_reconcile",
 ]
-"""Names of the numeric results that `harness.checker._figures` computes."""
+"""Names of the numeric results that `harness.checker._liveness` computes."""
 
 CHARACTERISTIC_NUMBERS = {number: int(number) for number in CHARACTERISTICS}
 """Number of a characteristic as a JSON key -> the same number as an integer."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import ucp
-from harness.conformance import _handwritten
+from harness.conformance import cases
 from harness.conformance._state_space import VARIANTS, explore
 from harness.conformance.cases import ALL_CASES
 from harness.conformance.conformance_run import ConformanceRequest, conform
@@ -45,7 +45,7 @@ def micropython(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.any_user
 def test_small_agent_passes_its_profile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     played = [case for case in ALL_CASES if case.name in {*LEFT_OUT, *REQUIRED}]
-    monkeypatch.setattr(_handwritten, "ALL_CASES", played)
+    monkeypatch.setattr(cases, "ALL_CASES", played)
     steps = list(explore(VARIANTS["default"]))
     wanted = {step.key: step for step in steps if len(step.path) <= 3 and step.before.activity != "voting"}
     vectors = [VectorSet(VARIANTS["default"], steps, wanted)]
@@ -84,6 +84,6 @@ def test_small_agent_flies_with_the_reference(tmp_path: Path) -> None:
 
 def test_large_machine_must_refuse_what_a_small_one_accepts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name = "the control socket answers each line, including invalid ones"
-    monkeypatch.setattr(_handwritten, "ALL_CASES", [case for case in ALL_CASES if case.name == name])
+    monkeypatch.setattr(cases, "ALL_CASES", [case for case in ALL_CASES if case.name == name])
     results = conform(ConformanceRequest((str(LAUNCHER),), None, None), tmp_path, lambda count, total: None, [])
     assert [case.verdict for case in results.cases] == ["failed"]

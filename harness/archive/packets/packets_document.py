@@ -11,9 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import CaptureClock, Captures
 from harness.archive.packets.capture_reader import Capture, ListenerName
-from harness.archive.packets.channel_losses import ChannelLosses, loss_reasons
 from harness.archive.packets.exchanges import LinkLosses, Outcome, RequestAnswers
-from harness.archive.packets.transmissions import Origin, Transmission
+from harness.archive.packets.transmissions import ChannelLosses, Origin, Transmission, loss_reasons
 
 SCHEMA = "ucp-packets/1"
 

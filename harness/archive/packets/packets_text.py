@@ -5,12 +5,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import Captures
-from harness.archive.packets.capture_reader import ListenerName
-from harness.archive.packets.channel_losses import DROPS, ChannelLosses, loss_reasons
-from harness.archive.packets.datagram import MessageSummary
-from harness.archive.packets.exchanges import Outcome, RequestAnswers, RequestOutcome
-from harness.archive.packets.selection import AnsweredMessage, block_arrivals
-from harness.archive.packets.transmissions import Transmission
+from harness.archive.packets.capture_reader import ListenerName, MessageSummary
+from harness.archive.packets.exchanges import AnsweredMessage, Outcome, RequestAnswers, RequestOutcome, block_arrivals
+from harness.archive.packets.transmissions import DROPS, ChannelLosses, Transmission, loss_reasons
 from harness.present.text import moment
 from ucp.messages import (
     BlockAddRequest,

@@ -3,15 +3,19 @@
 A datagram is identified by its bytes. An agent that was restarted may send the same bytes again. Each reception
 therefore belongs to the latest earlier transmission of the datagram. If a complete capture of the sender does not
 contain the transmission, the datagram is forged.
+
+`channel_losses` reads the losses on a shared radio channel from `channel.jsonl`.
 """
 
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Literal, NamedTuple
 
+from harness.archive.bounded_file import JsonLines
+from harness.archive.channel_journal import CHANNEL_FILE, ChannelLine
 from harness.archive.packets.capture_files import CaptureClock, Captures
-from harness.archive.packets.capture_reader import Capture, Datagram, ListenerName
-from harness.archive.packets.datagram import MessageSummary
+from harness.archive.packets.capture_reader import Capture, Datagram, ListenerName, MessageSummary
 from harness.archive.packets.pcap import OUTBOUND
 
 Origin = Literal["captured", "inferred", "forged"]
@@ -142,3 +146,33 @@ def _origin(sender: int, seen_leaving: ListenerName | None, would_have_been_seen
     if seen_leaving == sender:
         return "captured"
     return "forged" if seen_leaving is not None or would_have_been_seen else "inferred"
+
+
+ChannelLosses = Mapping[tuple[int, int], Mapping[str, list[int]]]
+"""(Sender, sequence number) -> reason -> vehicles that did not receive the message for this reason. The set is empty
+for the reasons in DROPS.
+"""
+
+DROPS = ("queue", "too_long")
+"""Reasons for which a radio does not send a message."""
+
+
+def channel_losses(runs: Iterable[Path]) -> ChannelLosses:
+    """Return the losses recorded in these run directories. Unreadable lines are ignored."""
+    return {
+        (line.sender, line.sequence): {line.dropped: []} if line.dropped else line.lost
+        for run in runs
+        for line in JsonLines(run / CHANNEL_FILE, ChannelLine)
+        if line.sequence is not None
+    }
+
+
+def loss_reasons(losses: ChannelLosses, transmission: Transmission) -> dict[str, list[ListenerName]]:
+    """Return, for each reason, the vehicles that did not receive the message on the channel. If the radio of the sender
+    dropped the message, no vehicle received it.
+    """
+    named = {
+        reason: [name for name in transmission.lost_by if reason in DROPS or name in vehicles]
+        for reason, vehicles in losses.get((transmission.sender, transmission.sequence), {}).items()
+    }
+    return {reason: names for reason, names in named.items() if names}

@@ -3,6 +3,8 @@
 Each file in this folder contains a function that compares records in an `Evidence` and yields each `Contradiction`. An
 unaltered run has no contradiction, because its records also list each kill, restart, reboot, pause, rogue node and full
 disk.
+
+If records contradict each other or are incomplete, `in_doubt` changes the verdict on a characteristic.
 """
 
 from collections.abc import Callable, Iterator
@@ -12,14 +14,11 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.records import (
     _captures_vs_traces,
-    _channel_vs_traces,
     _conditions_vs_network,
     _counters,
     _datagrams_vs_traces,
-    _export_vs_store,
     _export_vs_trace,
     _handled_vs_faults,
-    _headers,
     _heard_vs_sent,
     _losses,
     _scenario_vs_record,
@@ -30,8 +29,8 @@ from harness.checker.records.contradiction import Contradiction
 NAME = "every record"
 
 COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
-    _headers.compare_headers,
-    _headers.compare_algorithms,
+    _times.compare_headers,
+    _times.compare_algorithms,
     _export_vs_trace.compare_with_itself,
     _counters.compare_counters_of_run,
     _export_vs_trace.compare_export,
@@ -41,9 +40,9 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     _conditions_vs_network.compare,
     _scenario_vs_record.compare,
     _times.compare,
-    _export_vs_store.compare,
+    _export_vs_trace.compare,
     _losses.compare,
-    _channel_vs_traces.compare,
+    _datagrams_vs_traces.compare_channel,
     _captures_vs_traces.compare_counters,
     _captures_vs_traces.compare_captures,
     _datagrams_vs_traces.find_unrecorded,
@@ -137,3 +136,29 @@ def describe_incomplete(examination: RecordComparisons) -> str:
     others = len(examination.short) - 1
     more = f"; so are the traces of {others} more" if others else ""
     return f"the trace of agent {agent_id} is incomplete: {why}{more}"
+
+
+NEEDS_TRACES = frozenset("123")
+"""Characteristics that must hold at every step. Without complete traces, they are not known to hold."""
+NEEDS_CONNECTIVITY = frozenset("56")
+"""Characteristics that require full connectivity. An agent that could not send its messages was not connected."""
+
+
+def in_doubt(number: str, judgement: Judgement, examination: RecordComparisons) -> Judgement:
+    """Return the judgement on the characteristic with this number. Contradictory or incomplete records change its
+    verdict.
+    """
+    touching = examination.touching(number)
+    if touching:
+        contradict = f"{times(len(touching))}: the records behind this verdict contradict each other"
+        violated = judgement.verdict == "violated"
+        reason = f"{judgement.reason}; {contradict}" if violated else contradict
+        evidence = [*(judgement.evidence if violated else ()), *touching]
+        return Judgement(judgement.name, "violated", reason, evidence[:MAX_EVIDENCE])
+    if judgement.verdict == "holds" and number in NEEDS_TRACES and examination.short:
+        return Judgement(judgement.name, "not applicable", describe_incomplete(examination))
+    if judgement.verdict == "violated" and number in NEEDS_CONNECTIVITY and examination.unsent:
+        unsent = sum(examination.unsent.values())
+        reason = f"{agents([*examination.unsent])} could not send {unsent} messages, so not all agents were connected"
+        return Judgement(judgement.name, "not applicable", reason)
+    return judgement

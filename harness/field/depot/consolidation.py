@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from harness.archive.event_data import EventData, SealedError
 from harness.archive.exports import Export, ExportedBlock, name_blocks
 from harness.field.depot.collected_exports import CollectedExports, all_blocks
 from harness.field.depot.record_lines import (
@@ -30,6 +29,7 @@ from harness.field.depot.record_lines import (
 )
 from harness.gc_pause import gc_paused
 from harness.report.chain_tree import ranges
+from harness.report.logbook import EventData, SealedError
 from ucp.events import EVENT_FIELDS, EVENT_HEADER_BYTES, LoggableEvent
 from ucp.wire import struct_of
 

@@ -14,8 +14,7 @@ from harness.archive.exports import Export
 from harness.archive.run_record import JudgedRecord
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence
-from harness.checker.lost_lines import lost_lines
-from harness.checker.missing_incarnations import lacking_traces
+from harness.checker.lost_lines import lacking_traces, lost_lines
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.end_of_record import MessageArrival, sent_to, unfinished
 from harness.checker.steps.follower import StepComparer

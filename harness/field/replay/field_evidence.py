@@ -11,8 +11,7 @@ from pathlib import Path
 from harness.archive.traces import Trace
 from harness.checker import Evidence, steps
 from harness.checker.judgement import Judgement
-from harness.checker.lost_lines import lost_lines
-from harness.checker.missing_incarnations import lacking_traces
+from harness.checker.lost_lines import lacking_traces, lost_lines
 from harness.checker.steps.deviation import StepDeviation
 from harness.errors import FieldError
 from harness.field.ingest import Flight

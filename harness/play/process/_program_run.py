@@ -15,8 +15,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Self
 
+from harness.archive.bounded_file import pack_parts
 from harness.archive.directory import RunDirectory
-from harness.archive.packed_parts import pack_parts
 from harness.archive.run_record import AgentRecord, CapturedFrames, Counters, DatagramsRead
 from harness.archive.trace_files import packable_traces
 from harness.errors import HarnessError, InterruptedRunError, MachineError, ScenarioError

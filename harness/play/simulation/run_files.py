@@ -7,8 +7,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
+from harness.archive.bounded_file import pack_parts
 from harness.archive.directory import RunDirectory
-from harness.archive.packed_parts import pack_parts
 from harness.archive.trace_files import PACKED_FROM_BYTES, packable_traces
 from harness.archive.traces import Trace, TraceHeader
 from harness.play.simulation.incarnations import SimulatedIncarnation

@@ -4,10 +4,9 @@ import contextlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from harness.archive.event_data import SealedError
 from harness.archive.exports import Export, ExportedBlock
 from harness.present.text import moment
-from harness.report.logbook import Logbook
+from harness.report.logbook import Logbook, SealedError
 from ucp.events import LoggableEvent, MalformedEventsError
 from ucp.telemetry import describe, vehicle_type
 

@@ -1,12 +1,20 @@
 """Play seeds until a run violates a characteristic, and reduce that run to a small scenario.
 
 `_exploring` plays seed after seed in the simulation. `_recording` replaces the random parts of a run, which are the
-logged events and the lost messages, by a script in a document. `_shrink` removes parts of this document (delta
-debugging) as long as the violation remains. `_smaller` defines the order of these steps. The package `guided` explores
-for whole nights instead: it changes scenarios, and keeps those that reach new states.
+logged events and the lost messages, by a script in a document. `_smaller` removes parts of this document (delta
+debugging) as long as the violation remains. The package `guided` explores for whole nights instead: it changes
+scenarios, and keeps those that reach new states.
 """
 
-from harness.sweep.explore._explore_text import in_words, watching
-from harness.sweep.explore._exploring import MAX_RUNS, SEEDS, Explored, SearchProgress, ViolatingRun, explore
+from harness.sweep.explore._exploring import (
+    MAX_RUNS,
+    SEEDS,
+    Explored,
+    SearchProgress,
+    ViolatingRun,
+    explore,
+    in_words,
+    watching,
+)
 
 __all__ = ["MAX_RUNS", "SEEDS", "Explored", "SearchProgress", "ViolatingRun", "explore", "in_words", "watching"]

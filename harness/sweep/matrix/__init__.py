@@ -1,7 +1,7 @@
 """Play a scenario with all combinations (a matrix) of loss rate, number of agents, mission length, backend and seed.
 
 `_matrix_file` is the file that a user writes. `matrix_run` plays all runs on all cores, or on a Dask cluster
-(`_cluster`), and adds each result to `results.jsonl`, so that an interrupted matrix can continue. `_cell` summarises
+(`_away`), and adds each result to `results.jsonl`, so that an interrupted matrix can continue. `_cell` summarises
 the runs of one combination, with the confidence intervals of `_estimate`. With three or more sizes of swarm or mission,
 `_growth` fits power laws. `nights` finds an earlier night, and `_comparison` compares the cells with it.
 `matrix_outputs` writes all files.

@@ -17,11 +17,10 @@ from harness.present import text as words
 from harness.present.svg import Axis, ChartArea
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import Estimate
-from harness.sweep.matrix._growth import Growth
+from harness.sweep.matrix._growth import Growth, Law, Variable
 from harness.sweep.matrix._growth_metrics import BY_NAME
 from harness.sweep.matrix._growth_table import SYMBOLS, say, say_exponent, say_number
 from harness.sweep.matrix._matrix_file import Matrix
-from harness.sweep.matrix._power_law import Law, Variable
 from harness.sweep.matrix.matrix_record import MatrixRecord
 
 COLUMNS = 3

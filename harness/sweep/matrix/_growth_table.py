@@ -13,9 +13,8 @@ from rich.text import Text
 from harness.present import text as words
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import Estimate, Metric
-from harness.sweep.matrix._growth import Growth
+from harness.sweep.matrix._growth import Exponent, Growth, Law, Variable
 from harness.sweep.matrix._growth_metrics import BY_NAME
-from harness.sweep.matrix._power_law import Exponent, Law, Variable
 from harness.sweep.matrix.matrix_record import MatrixRecord
 
 SYMBOLS: dict[Variable, str] = {"agents": "N", "blocks": "B"}

@@ -1,10 +1,13 @@
-"""Read a matrix file: a scenario with lists of loss rates, numbers of agents, mission lengths, backends and seeds."""
+"""Read a matrix file: a scenario with lists of loss rates, numbers of agents, mission lengths, backends and seeds.
+Write the scenarios of a matrix as files, with which `ucp-harness run` can play each run again.
+"""
 
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from harness.backend_names import BackendName
@@ -13,6 +16,7 @@ from harness.play.backends import BACKENDS
 from harness.scenario import Scenario, explain, load_scenario, read_yaml
 from harness.scenario.scenario import MAX_DURATION_S
 from harness.scenario.strict_model import MAX_AGENTS, Probability, Seconds, StrictModel
+from ucp.agent_files import write_atomically
 from ucp.short_value import shown
 
 MAX_SEEDS = 10_000
@@ -241,3 +245,20 @@ def _each_once(values: list[Any]) -> list[Any]:
         if value in values[:index]:
             raise ValueError(f"names {value} twice")
     return values
+
+
+DIRECTORY = "cells"
+
+
+def scenario_file(point: MatrixPoint) -> str:
+    """Return the path of the scenario file, relative to the matrix's directory."""
+    return f"{DIRECTORY}/{point.file_name}.yaml"
+
+
+def write_scenarios(matrix: Matrix, directory: Path) -> None:
+    """Write the scenarios for all combinations of values. Raises OSError if a file cannot be written."""
+    (directory / DIRECTORY).mkdir(exist_ok=True)
+    for path, point in {scenario_file(point): point for point in matrix.points}.items():
+        scenario = matrix.scenario_at(point).model_dump(mode="json", exclude_defaults=True)
+        text = yaml.safe_dump(scenario, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+        write_atomically(directory / path, text)

@@ -23,10 +23,9 @@ from harness.errors import MachineError
 from harness.present.junit import JunitCase, to_xml
 from harness.scenario.verdict_names import CHARACTERISTICS, ENDED, FURTHER_CHECKS, RUN_CHECKS
 from harness.sweep.matrix._cell import Cell, Run
-from harness.sweep.matrix._cell_scenarios import write_scenarios
 from harness.sweep.matrix._estimate import METRICS
 from harness.sweep.matrix._growth_picture import draw_growth
-from harness.sweep.matrix._matrix_file import MatrixPoint
+from harness.sweep.matrix._matrix_file import MatrixPoint, write_scenarios
 from harness.sweep.matrix._matrix_picture import draw
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished

@@ -7,8 +7,7 @@ from harness.present.text import escaped, row
 from harness.report.agent_programs import asked_for, in_sentence
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import METRICS
-from harness.sweep.matrix._matrix_coverage import MatrixCoverage
-from harness.sweep.matrix.matrix_record import MatrixRecord
+from harness.sweep.matrix.matrix_record import MatrixCoverage, MatrixRecord
 from harness.sweep.matrix.matrix_table import (
     axes,
     changed_runs,

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from harness.archive.packets.datagram import NotUcpError, summarize, unwrap
+from harness.archive.packets.capture_reader import NotUcpError, summarize, unwrap
 from harness.archive.packets.pcap import CaptureFile
 from tests.fuzz.finding import require
 from ucp.events import MalformedEventsError, decode_events

@@ -9,9 +9,16 @@ import pytest
 from harness.archive.packets.block_names import BlockNames, run_directories
 from harness.archive.packets.capture_files import Captures as Read
 from harness.archive.packets.capture_files import capture_files, read_captures
-from harness.archive.packets.exchanges import LinkLosses, RequestAnswers, RequestOutcome, count_losses
+from harness.archive.packets.exchanges import (
+    LinkLosses,
+    MessageFilter,
+    RequestAnswers,
+    RequestOutcome,
+    block_arrivals,
+    count_losses,
+    exchanges_about,
+)
 from harness.archive.packets.packets_text import TransmissionFormatter
-from harness.archive.packets.selection import MessageFilter, block_arrivals, exchanges_about
 from harness.archive.packets.transmissions import Transmission, join
 from harness.errors import CaptureError
 from tests.harness.captures import INBOUND, OUTBOUND, Captures, CaptureScript, PcapNg, frame, pcap, wall_ns

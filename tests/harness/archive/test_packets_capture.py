@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.archive.packets.capture_reader import Capture, Datagram
-from harness.archive.packets.datagram import NotUcpError, unwrap
+from harness.archive.packets.capture_reader import Capture, Datagram, NotUcpError, unwrap
 from harness.archive.packets.pcap import INBOUND, OUTBOUND, CaptureFile, Frame
 from harness.errors import CaptureError
 from tests.harness.captures import PcapNg, frame, pcap

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from harness import checker
-from harness.archive import packed_parts, trace_files
+from harness.archive import bounded_file, trace_files
 from harness.archive.archive import RunArchive
-from harness.archive.packed_parts import can_free_parts, has_finished_part, pack_parts, packed_name
+from harness.archive.bounded_file import can_free_parts, has_finished_part, pack_parts, packed_name
 from harness.archive.trace_files import open_trace, pack_traces, packable_traces
 from harness.backend_names import BackendName
 from harness.field.depot.mission_comparison import compare
@@ -64,8 +64,8 @@ def test_run_packs_only_large_traces(plain: Path, tmp_path: Path, monkeypatch: p
 def partly_packed(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a run whose harness was killed. All but the end of each trace is packed."""
     monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 0)
-    monkeypatch.setattr(packed_parts, "PART_BYTES", 65536)
-    monkeypatch.setattr(packed_parts, "KEPT_BYTES", 1)
+    monkeypatch.setattr(bounded_file, "PART_BYTES", 65536)
+    monkeypatch.setattr(bounded_file, "KEPT_BYTES", 1)
     directory = shutil.copytree(plain, tmp_path / "run")
     if not can_free_parts(directory):
         pytest.skip("this file system cannot free a part of a file")
@@ -172,8 +172,8 @@ def test_programs_are_judged_alike_if_their_traces_are_packed_meanwhile(
 ) -> None:
     """Restart an agent, so that the harness appends to a trace of which some parts are already packed."""
     monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 1)
-    monkeypatch.setattr(packed_parts, "PART_BYTES", 4096)
-    monkeypatch.setattr(packed_parts, "KEPT_BYTES", 4096)
+    monkeypatch.setattr(bounded_file, "PART_BYTES", 4096)
+    monkeypatch.setattr(bounded_file, "KEPT_BYTES", 4096)
     monkeypatch.setattr(_program_run, "PACK_S", 0.1)
     packed: list[Path] = []
 

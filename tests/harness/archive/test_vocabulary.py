@@ -13,7 +13,7 @@ from harness.checker import Evidence, check
 from harness.checker.survival import in_words, survival
 from harness.field.replay import RecordPlayer, open_record
 from harness.play.progress import SilentProgress
-from harness.report._run_page import write_report
+from harness.report import write_report
 from harness.run.run import run
 from harness.run.simulate import simulate
 from tests.harness.command import harness

@@ -9,7 +9,7 @@ import pytest
 
 from harness import checker
 from harness.archive.archive import RunArchive
-from harness.checker.records._channel_vs_traces import compare
+from harness.checker.records._datagrams_vs_traces import compare_channel
 from tests.harness.command import harness
 
 CROWD = """
@@ -40,7 +40,7 @@ def details(run: Path, edit: Callable[[Lines], Lines] | None = None) -> list[str
         journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
     try:
         evidence = checker.gather(RunArchive(run))
-        return [contradiction.finding.detail for contradiction in compare(evidence)]
+        return [contradiction.finding.detail for contradiction in compare_channel(evidence)]
     finally:
         journal.write_text(original)
 

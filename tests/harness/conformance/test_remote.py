@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from docs.generate.wrong_agents import quirky
-from harness.conformance import _handwritten
+from harness.conformance import cases
 from harness.conformance._state_space import VARIANTS, explore
 from harness.conformance.cases import ALL_CASES
 from harness.conformance.conformance_run import ConformanceRequest, conform, remote_agents
@@ -74,7 +74,7 @@ def results_of(place: Path, *command: str, handwritten: bool, longest: int = 0) 
 
 
 def test_right_agent_on_another_computer_passes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_handwritten, "ALL_CASES", [case for case in ALL_CASES if case.name in PLAYED | NOT_VISIBLE])
+    monkeypatch.setattr(cases, "ALL_CASES", [case for case in ALL_CASES if case.name in PLAYED | NOT_VISIBLE])
     results = results_of(tmp_path, *OURS, handwritten=True)
     assert not results.failures, [case.wrong for case in results.failures]
     assert {case.name for case in results.cases if case.verdict == "passed"} == PLAYED

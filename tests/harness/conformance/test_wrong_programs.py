@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.conformance._handwritten import _play
 from harness.conformance._udp_lab import UdpLab
-from harness.conformance.cases import ALL_CASES
+from harness.conformance.cases import ALL_CASES, _play
 from harness.conformance.results import CaseResult
 from tests.harness.conformance import wrong_programs
 

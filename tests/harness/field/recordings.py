@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from harness.archive.packets.datagram import NotUcpError, unwrap
+from harness.archive.packets.capture_reader import NotUcpError, unwrap
 from harness.archive.packets.pcap import OUTBOUND, CaptureFile
 
 EPOCH_NS = 1_790_000_000_000_000_000

@@ -14,8 +14,7 @@ from benchmarks.field_damage import DAMAGES, Undamaged, bring_home, conclude
 from harness.archive.archive import RunArchive
 from harness.archive.traces import read_trace
 from harness.checker import Result, check, gather
-from harness.checker.lost_lines import lost_lines
-from harness.checker.missing_incarnations import may_be_of_missing_incarnation
+from harness.checker.lost_lines import lost_lines, may_be_of_missing_incarnation
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.trace_header import checked
 from harness.field.ingest import ingest_files

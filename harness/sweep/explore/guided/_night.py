@@ -24,8 +24,7 @@ from harness.scenario import Scenario
 from harness.sweep.explore._exploring import smallest_of
 from harness.sweep.explore._recording import record
 from harness.sweep.explore._scenario_document import Document
-from harness.sweep.explore._shrink import file_of
-from harness.sweep.explore._smaller import scenario_of
+from harness.sweep.explore._smaller import file_of, scenario_of
 from harness.sweep.explore.guided._corpus import Corpus, Finding, opened
 from harness.sweep.explore.guided._finding_identity import FindingIdentity
 from harness.sweep.explore.guided._hunt import CandidateRun, Hunt

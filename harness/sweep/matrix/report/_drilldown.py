@@ -11,7 +11,7 @@ from harness.report.verdict_section import ICONS
 from harness.scenario.verdict_names import RUN_CHECKS, kind_of
 from harness.sweep.matrix._cell import Run, is_wrong
 from harness.sweep.matrix._cell_play import directory_name
-from harness.sweep.matrix._cell_scenarios import scenario_file
+from harness.sweep.matrix._matrix_file import scenario_file
 from harness.sweep.matrix.matrix_run import Finished
 from harness.sweep.matrix.matrix_table import name_of
 from harness.sweep.matrix.report._heatmap import anchor

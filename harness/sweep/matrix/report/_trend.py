@@ -2,10 +2,13 @@
 
 Dots and lines are means, and bands are 95 % intervals. Each chart has its own scale, because the trend shows changes
 and not absolute values. Each step to the right is one night.
+
+The table of cells and nights shows whether each cell had violations or changes in each night.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from markupsafe import Markup
 
@@ -13,9 +16,10 @@ from harness.present import svg, text
 from harness.present.svg import Axis, ChartArea, n
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._estimate import Estimate
+from harness.sweep.matrix._matrix_file import MatrixPoint
 from harness.sweep.matrix._matrix_picture import LinePoint, curve
 from harness.sweep.matrix.matrix_record import MatrixRecord
-from harness.sweep.matrix.matrix_table import say, series, series_name
+from harness.sweep.matrix.matrix_table import name_of, say, series, series_name, violated
 from harness.sweep.matrix.report._heatmap import HeatmapFigure
 
 COLUMNS, PANEL_HEIGHT, FOOT = 4, 158, 4
@@ -103,3 +107,56 @@ def _value_axis(figure: HeatmapFigure, estimates: Sequence[Estimate], area: Char
 
 def _is_sane(estimate: Estimate) -> bool:
     return all(abs(bound) < LARGEST for bound in (estimate.low, estimate.mean, estimate.high) if bound is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class NightColumn:
+    """The heading of a table column about one night: the date of the night, and the commit of the code."""
+
+    date: str
+    commit: str
+    started: str
+
+
+@dataclass(frozen=True, slots=True)
+class NightCell:
+    """The state of a cell in one night: a short sign, all facts as text, and a CSS class."""
+
+    sign: str
+    in_words: str
+    kind: str
+
+
+def night_columns(nights: Sequence[MatrixRecord]) -> list[NightColumn]:
+    return [
+        NightColumn(night.started_at[5:10], night.versions.get("commit", "unknown"), text.started(night.started_at))
+        for night in nights
+    ]
+
+
+def night_rows(nights: Sequence[MatrixRecord], tonight: MatrixRecord) -> list[tuple[str, list[NightCell]]]:
+    """Return the name of each cell in the matrix of this night, with one table field for each night."""
+    return [
+        (name_of(tonight.matrix, point), [_night_cell(night, point) for night in nights])
+        for point in tonight.matrix.points
+    ]
+
+
+def _night_cell(night: MatrixRecord, point: MatrixPoint) -> NightCell:
+    cell = next((cell for cell in night.cells if cell.point == point), None)
+    if cell is None:
+        return NightCell("", "no runs", "unknown")
+    bad = violated(cell) + cell.failed
+    against = night.against
+    worse = sum(change.point == point for change in against.regressions) if against else 0
+    changed = sum(len(each.seeds) for each in against.changed_runs if each.point == point) if against else 0
+    facts = [
+        (bad, "✗", f"{bad} with a violation or failure", "violated"),
+        (worse, "▼", f"{worse} figure{'s' if worse > 1 else ''} worse than in the baseline", "violated"),
+        (changed, "△", f"{changed} changed run{'s' if changed > 1 else ''}", "unknown"),
+    ]
+    found = [(f"{sign}{count}", meaning, kind) for count, sign, meaning, kind in facts if count]
+    if not found:
+        return NightCell("✓", f"{cell.runs} runs, no violation", "holds")
+    signs, meanings = (" ".join(sign for sign, _, _ in found), ", ".join(meaning for _, meaning, _ in found))
+    return NightCell(signs, f"{cell.runs} runs: {meanings}", found[0][2])

@@ -25,7 +25,7 @@ from harness.run.simulate import simulate
 from harness.scenario import Scenario, load_scenario
 from harness.scenario.load import find_file
 from harness.sweep.explore._scenario_document import document_of, script
-from harness.sweep.explore.guided import NightResult, spend
+from harness.sweep.explore.guided import NightResult, in_words, spend
 from harness.sweep.explore.guided._corpus import MOST_BYTES, opened
 from harness.sweep.explore.guided._finding_identity import identities
 from harness.sweep.explore.guided._hunt import CandidateRun, Hunt, KeptRun
@@ -38,7 +38,6 @@ from harness.sweep.explore.guided._hunt_trial import (
     without_liveness_phase,
 )
 from harness.sweep.explore.guided._mutation import mutate
-from harness.sweep.explore.guided._night_text import in_words
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 
 ORDINARY = {

@@ -4,7 +4,7 @@ import pytest
 
 from harness.scenario import Scenario
 from harness.sweep.explore._scenario_document import Document, document_of, keep_agents, move_times, script, with_key
-from harness.sweep.explore._shrink import BudgetSpentError, Shrinker
+from harness.sweep.explore._smaller import BudgetSpentError, Shrinker
 from tests.harness.virtual import scenario
 
 START: Document = {

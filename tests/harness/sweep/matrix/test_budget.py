@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 
 from harness.sweep.matrix import matrix_outputs, run_matrix
-from harness.sweep.matrix._budget import informative
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._matrix_file import MatrixTask
-from harness.sweep.matrix.matrix_run import on_cores
+from harness.sweep.matrix.matrix_run import informative, on_cores
 from harness.sweep.matrix.matrix_summary import verdict
 from tests.harness.command import harness
 from tests.harness.sweep.matrix.stub import matrix

@@ -14,7 +14,7 @@ import pytest
 
 from harness.errors import HarnessError, MachineError
 from harness.play.machine import dask_cluster
-from harness.sweep.matrix._cluster import cluster
+from harness.sweep.matrix._away import cluster
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.dask_processes import Cluster, until
 

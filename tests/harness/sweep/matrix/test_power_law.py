@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 
-from harness.sweep.matrix._power_law import Variable, fit
+from harness.sweep.matrix._growth import Variable, fit
 
 AGENTS: list[Variable] = ["agents"]
 BOTH: list[Variable] = ["agents", "blocks"]

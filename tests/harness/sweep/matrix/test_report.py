@@ -13,7 +13,7 @@ from harness.scenario import Scenario, load_scenario
 from harness.sweep.matrix import Finished, MatrixRecord
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._cell_play import directory_name
-from harness.sweep.matrix._cell_scenarios import scenario_file, write_scenarios
+from harness.sweep.matrix._matrix_file import scenario_file, write_scenarios
 from harness.sweep.matrix.matrix_run import compare_with
 from harness.sweep.matrix.nights import BaselineNight, StoredNights
 from harness.sweep.matrix.report import _drilldown, _heatmap, _trend, to_html
