@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from harness.archive.packets import packets_text
 from harness.archive.packets.block_names import BlockNames, run_directories
 from harness.archive.packets.capture_files import Captures, capture_files, read_captures
 from harness.archive.packets.exchanges import (
@@ -19,11 +18,12 @@ from harness.archive.packets.exchanges import (
     loss_matrix,
 )
 from harness.archive.packets.packets_document import document
-from harness.archive.packets.packets_text import Paint, TransmissionFormatter
 from harness.archive.packets.transmissions import channel_losses, join
 from harness.commands._shared_options import BundleOption, opener_of
 from harness.commands.terminal import complain, output, print_lines
 from harness.errors import WRONG_REQUEST
+from harness.report import packets_text
+from harness.report.packets_text import Paint, TransmissionFormatter
 
 
 def packets_command(

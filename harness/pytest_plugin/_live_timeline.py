@@ -24,9 +24,9 @@ from harness.scenario.timeline import TimelineEntry
 from ucp.agent import HANDLERS
 
 HOLDABLE = ("message", "sender", "receiver", "block", "count")
-"""Keys of an entry in `fates` that select messages."""
-LOOK_EVERY_S = 5.0
 """Keys of an entry in `fates` that select the messages to hold back."""
+LOOK_EVERY_S = 5.0
+"""Mission seconds between two checks whether all agents have voted."""
 
 HANDLER_BRANCHES = {name: handler.branches for name, handler in HANDLERS.items()}
 

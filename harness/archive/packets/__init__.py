@@ -2,6 +2,5 @@
 
 `pcap` and `datagram` read frames, `capture_reader` reads one file, and `capture_files` reads all files of a mission.
 `transmissions` combines the occurrences of each datagram in all captures. `exchanges` finds the responses to each
-request, and counts losses. `selection` filters messages, `packets_text` writes text, and `packets_document` writes
-JSON.
+request, counts losses and filters messages. `packets_document` writes JSON.
 """

@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any, TypeVar
 
 from harness.archive.archive import HeldBlock, RecordedRun, RunArchive
-from harness.present.polars import pl
+from harness.report.export.polars_package import pl
 from ucp.trigger import MessageTrigger, Trigger
 
 BATCH = 20_000

@@ -7,15 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.archive.packets import packets_text
 from harness.archive.packets.block_names import BlockNames
 from harness.archive.packets.capture_files import read_captures
 from harness.archive.packets.exchanges import RequestAnswers, count_losses
 from harness.archive.packets.packets_document import document
-from harness.archive.packets.packets_text import TransmissionFormatter
 from harness.archive.packets.pcap import OUTBOUND, CaptureFile, Frame
 from harness.archive.packets.transmissions import join
 from harness.errors import HarnessError
+from harness.report import packets_text
+from harness.report.packets_text import TransmissionFormatter
 from netem.pcapng import PcapngFile, header
 from tests.fuzz.finding import require, sound
 from tests.fuzz.targets.home import came_home, sound_run

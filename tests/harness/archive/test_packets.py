@@ -18,9 +18,9 @@ from harness.archive.packets.exchanges import (
     count_losses,
     exchanges_about,
 )
-from harness.archive.packets.packets_text import TransmissionFormatter
 from harness.archive.packets.transmissions import Transmission, join
 from harness.errors import CaptureError
+from harness.report.packets_text import TransmissionFormatter
 from tests.harness.captures import INBOUND, OUTBOUND, Captures, CaptureScript, PcapNg, frame, pcap, wall_ns
 from tests.harness.mission import write_exports
 from tests.ucp.air import Air, uniform_latency
