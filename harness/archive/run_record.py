@@ -390,6 +390,18 @@ class RemoteRecord(_RecordModel):
     cut_off: list[CutOff] = []
     lost: int = 0
     """Number of datagrams of the agent that did not reach the lab, because the vehicle was cut off."""
+    incomplete: list[int] = []
+    """Numbers of the incarnations whose end is not on record, because the vehicle was cut off. The first incarnation
+    is 1. The last lines of these incarnations are missing in the trace.
+    """
+
+    @property
+    def lack(self) -> str | None:
+        """A phrase that names the incarnations whose end is not on record, or None if there are none."""
+        if not self.incomplete:
+            return None
+        numbers = ", ".join(map(str, self.incomplete))
+        return f"the end of incarnation {numbers} is not on record, because the vehicle was cut off"
 
     def clock_error_s(self, lasted_s: float) -> float:
         """Return the maximum difference between the mission times of the agent and of the harness, in seconds of wall

@@ -8,7 +8,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -358,6 +358,13 @@ class Evidence:
         """Return the record of an agent on another computer. Return None for any other agent."""
         return self.record.remote.get(str(agent_id)) if self.record else None
 
+    def send_failures(self, agent_id: int) -> int:
+        """Return the number of messages that the agent could not send. Messages that were lost between the computer of
+        a remote agent and the lab count, too.
+        """
+        recorded, remote = self.recorded(agent_id), self.remote(agent_id)
+        return (recorded.send_failures or 0 if recorded else 0) + (remote.lost if remote else 0)
+
     def clock_error_s(self, agent_id: int) -> float:
         """Return the maximum error of the agent's clock, in seconds of wall time, relative to the harness's clock."""
         remote = self.remote(agent_id)
@@ -431,8 +438,12 @@ class Evidence:
         return self.record is not None and self.record.channel is not None
 
     def agents_with_unknown_completed(self) -> set[int]:
-        """The agents whose completed blocks are unknown, because their traces contain undefined operations."""
+        """The agents whose completed blocks are unknown, because their traces contain undefined operations, or lack the
+        end of an incarnation.
+        """
         unknown = {agent_id for agent_id, words in self.unknown.items() if "operation" in words}
+        remotes = self.record.remote if self.record else {}
+        unknown |= {int(name) for name, remote in remotes.items() if remote.incomplete}
         return {agent for agent in unknown if agent not in self.exports or self.was_restarted(agent)}
 
     def completed_blocks(self) -> dict[str, int]:
@@ -464,7 +475,7 @@ def gather(archive: RunArchive) -> Evidence:
     injected = RogueTraffic().add(archive.injected(InjectedDatagram))
     return Evidence(
         archive.exports.by_agent,
-        archive.traces,
+        {agent_id: _marked(trace, archive.judged_record) for agent_id, trace in archive.traces.items()},
         archive.judged_record,
         problems,
         archive.before_final_reconcile,
@@ -480,6 +491,16 @@ def gather(archive: RunArchive) -> Evidence:
         channel=archive.channel(),
         report_progress=archive.report_progress,
     )
+
+
+def _marked(trace: Trace, record: JudgedRecord | None) -> Trace:
+    """Return the trace of a remote agent with a problem if the trace lacks the end of an incarnation. Return any other
+    trace as it is.
+    """
+    remote = record.remote.get(str(trace.header.agent_id)) if record else None
+    if remote is None or not remote.incomplete or trace.problem:
+        return trace
+    return replace(trace, problem=remote.lack)
 
 
 def check_variant(archive: RunArchive) -> None:

@@ -94,7 +94,7 @@ def figures(record: RunRecord) -> list[tuple[str, str]]:
 
 def cut_off(record: RunRecord) -> list[str]:
     """Return a sentence for each time when agents on other computers were cut off, because their connections were lost.
-    Agents of the same worker share a sentence.
+    Agents of the same worker share a sentence. Further sentences name the traces that are incomplete for this reason.
     """
     lines = []
     for computer, agents in _by_computer(record).items():
@@ -115,6 +115,11 @@ def cut_off(record: RunRecord) -> list[str]:
                 f"{agents_in_words(together)} {'was' if one else 'were'} cut off from {from_s:.0f} s {end}, because "
                 f"the connection to {'its' if one else 'their'} {computer} was lost"
             )
+    lines += [
+        f"the trace of agent {agent} is incomplete: {lack}"
+        for agent, remote in record.remote.items()
+        if (lack := remote.lack) is not None
+    ]
     return lines
 
 

@@ -85,8 +85,7 @@ def cross_examine(evidence: Evidence) -> RecordComparisons:
             short.setdefault(contradiction.finding.agent_id, contradiction.finding.detail)
     for agent_id in _agents_without_known_end(evidence):
         short.setdefault(agent_id, "the run did not end normally, so the expected end of the trace is unknown")
-    recorded = {agent_id: evidence.recorded(agent_id) for agent_id in evidence.traces}
-    unsent = {agent_id: agent.send_failures for agent_id, agent in recorded.items() if agent and agent.send_failures}
+    unsent = {agent_id: failures for agent_id in evidence.traces if (failures := evidence.send_failures(agent_id))}
     return RecordComparisons(contradictions, short, unsent)
 
 

@@ -89,7 +89,7 @@ def _not_sent(evidence: Evidence, agent_id: int) -> int:
             if run.t >= end_s - spread_s
             for message in run.sent
         )
-    return last + ((recorded.send_failures or 0) if recorded else 0)
+    return last + evidence.send_failures(agent_id)
 
 
 def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
@@ -102,8 +102,8 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
         return
     if record is None or record.engine != COUNTS_DATAGRAMS or record.mission_s is None:
         return
-    if set(record.roster) - set(evidence.traces):
-        return  # the messages of these agents are not on record
+    if set(record.roster) - set(evidence.traces) or any(remote.incomplete for remote in record.remote.values()):
+        return  # not all messages of these agents are on record, or not all losses of their messages
     sent = {agent_id: _sent_by(evidence, agent_id, record.mission_s) for agent_id in evidence.traces}
     for agent_id, trace in evidence.traces.items():
         counted = record.counters.receivers.get(str(agent_id)) if record.counters else None

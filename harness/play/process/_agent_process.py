@@ -107,15 +107,16 @@ class AgentProcess:
         now: Callable[[], float],
         *,
         controlled: Callable[[LabProgram], LabProgram] | None = None,
+        loss: Callable[[], str | None] = lambda: None,
     ) -> None:
         """Create the object without starting the process. `command` starts the agent with its mission file as last
         argument. `now` returns mission seconds. For a remote agent, `command` starts its stand-in, and `controlled`
-        returns the program to control in place of the stand-in.
+        returns the program to control in place of the stand-in. `loss` returns a phrase if its computer is lost.
         """
         self.agent_id = agent_id
         self._command = command
         self._now = now
-        self._controlled = controlled
+        self._controlled, self._loss = controlled, loss
         self.outcome = "not started"
         """The state of the agent as one or two words. After the run, `run.json` records this state, together with
         `detail`.
@@ -436,7 +437,13 @@ class AgentProcess:
         self.outcome, self.detail = "not supported", str(error)
         return error
 
-    def _failure(self, outcome: str, detail: str) -> AgentFailedError:
+    def _failure(self, outcome: str, detail: str) -> HarnessError:
+        """Return the error for an agent that failed. If the computer of a remote agent is lost, the agent is not at
+        fault.
+        """
+        if (loss := self._loss()) is not None:
+            self.outcome, self.detail = "not exported", loss
+            return MachineError(f"agent {self.agent_id} {loss}")
         self.outcome, self.detail = outcome, detail
         log = self._log.relative_to(self._rundir.path)
         return AgentFailedError(self.agent_id, outcome, f"{detail}; its log is {log}")

@@ -368,7 +368,8 @@ class ProgramRun:
     def _remote_agent(self, agent_id: int) -> AgentProcess:
         controlled = partial(self._remote.program, agent_id)
         command = self._remote.stand_in_command(agent_id)
-        return AgentProcess(agent_id, self.rundir, command, self.clock.now, controlled=controlled)
+        loss = partial(self._remote.loss, agent_id)
+        return AgentProcess(agent_id, self.rundir, command, self.clock.now, controlled=controlled, loss=loss)
 
     def _start_cut_off(self) -> None:
         with contextlib.suppress(RuntimeError):  # a failure is already ending the mission

@@ -52,6 +52,13 @@ class _RemoteVehicle:
     cuts: list[CutOff] = field(default_factory=list)
     left_behind: tuple[str, ...] = ()
     """Names of the processes that the last incarnation of the agent left running."""
+    is_connected: bool = False
+    """True if a far end plays the current incarnation."""
+    incarnations: int = 0
+    is_complete: bool = False
+    """True if the end of the current incarnation is on record."""
+    incomplete: list[int] = field(default_factory=list)
+    """Numbers of the incarnations whose end is not on record."""
     joins: int = 0
     joined: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -60,7 +67,7 @@ class _RemoteVehicle:
         """True if a far end of the agent is connected now. Its connection is either unused, or in use by a stand-in."""
         if self.held is not None:
             return self.held.is_connected
-        return self.stand_in is not None and not self.cut_off
+        return self.stand_in is not None and self.is_connected
 
 
 class RemoteAgents:
@@ -91,6 +98,15 @@ class RemoteAgents:
     def was_cut_off(self, agent_id: int) -> bool:
         """Return true if the connection to the agent was lost during the run."""
         return agent_id in self._vehicles and bool(self._vehicles[agent_id].cuts)
+
+    def loss(self, agent_id: int) -> str | None:
+        """Return a phrase if no far end plays the agent. The phrase completes a sentence that starts with "agent 7".
+        Return None if a far end plays the agent.
+        """
+        vehicle = self._vehicles[agent_id]
+        if vehicle.is_connected:
+            return None
+        return f"cannot go on, because the connection to its computer {vehicle.host} was lost"
 
     async def end(self) -> None:
         """Record that the mission ends, and accept no further far ends. Vehicles that are cut off now stay cut off."""
@@ -197,6 +213,7 @@ class RemoteAgents:
         vehicle.joins += 1
         if vehicle.stand_in is not None:
             far_end.hand_over(vehicle.stand_in, vehicle.offset_s)
+            vehicle.is_connected = True
         else:
             await far_end.keep()
             if vehicle.held is not None:
@@ -209,6 +226,8 @@ class RemoteAgents:
         vehicle.stand_in = stand_in
         vehicle.lost_before += vehicle.lost
         vehicle.lost, vehicle.left_behind = 0, ()
+        vehicle.incarnations += 1
+        vehicle.is_complete, vehicle.is_connected = False, vehicle.held is not None
         if vehicle.held is not None:
             vehicle.held.hand_over(stand_in, vehicle.offset_s)
             vehicle.held = None
@@ -218,14 +237,20 @@ class RemoteAgents:
         if not message and vehicle.stand_in is stand_in:
             vehicle.stand_in = None
             self._set_cut_off(vehicle, False)
+            if not vehicle.is_complete:
+                vehicle.incomplete.append(vehicle.incarnations)
+        if "gone" in message or "waits" in message:
+            vehicle.is_connected = False
         vehicle.offset_s = message.get("offset_s", vehicle.offset_s)
         vehicle.epoch_us = message.get("epoch_us", vehicle.epoch_us)
         if (measured := message.get("clock")) is not None:
             most_s = max(measured["delay_most_s"], vehicle.measured.get("delay_most_s", 0.0))
             vehicle.measured = {**measured, "delay_most_s": most_s}
-        vehicle.left_behind = tuple(message.get("left_behind", vehicle.left_behind))
+        if "left_behind" in message:
+            vehicle.left_behind, vehicle.is_complete = tuple(message["left_behind"]), True
         vehicle.lost = message.get("lost", vehicle.lost)
         if "cut_off" in message:
+            vehicle.is_connected = not message["cut_off"]
             self._set_cut_off(vehicle, message["cut_off"])
         if (line := message.get("lag")) is not None:
             self._rundir.append_lag(vehicle.agent_id, line)
@@ -272,6 +297,7 @@ class RemoteAgents:
                 epoch_us=vehicle.epoch_us,
                 cut_off=vehicle.cuts,
                 lost=vehicle.lost_before + vehicle.lost,
+                incomplete=vehicle.incomplete,
                 **vehicle.measured,
             )
             for vehicle in self._vehicles.values()

@@ -194,7 +194,7 @@ class FarWorker:
                 self._signal(int(message.document()["number"]))
             case Kind.BEGIN if self._incarnation is None:
                 self._start(self._begin(message.document()))
-            case Kind.RESUME:
+            case Kind.BEGIN | Kind.RESUME:
                 self._resume(message.document())
             case Kind.IDLE if self._incarnation is not None:
                 self._over.set()  # its stand-in is dead, or knows how the agent ended
@@ -205,8 +205,11 @@ class FarWorker:
 
     def _resume(self, state: dict[str, Any]) -> None:
         self._in_step = True
-        if self._incarnation is None or state["incarnation"] != self._incarnation:
+        if self._incarnation is None:
             self._send(Kind.EXIT, json.dumps({"gone": True}).encode())
+            return
+        if state["incarnation"] != self._incarnation:
+            self._over.set()  # the lab killed this incarnation while its vehicle was cut off
             return
         for kind, tail in self._tails.items():
             tail.position = int(state["positions"][kind.name])
@@ -346,7 +349,8 @@ class FarWorker:
                 await asyncio.wait_for(self._lag.wait(), END_LIMIT_S)
         assert self._network is not None
         self._loop.remove_reader(self._network.descriptor)
-        self._leave()
+        while self._leave():
+            pass
         own = {os.getpid(), *([self._lag.pid] if self._lag else [])}
         left = [] if status == -signal.SIGKILL else _other_processes(own)
         self._end({"status": status, "left_behind": left})
@@ -363,24 +367,30 @@ class FarWorker:
                 self._send_file(Kind.STORE, self._store)
             if self._bundle is not None:
                 self._send_file(Kind.BUNDLE, self._bundle)
-            self._send(Kind.EXIT, json.dumps(how).encode())
+            self._send(Kind.EXIT, json.dumps({**how, "datagrams": self._frames}).encode())
 
     # Datagrams and files
 
-    def _leave(self) -> None:
-        """Send the datagrams that the agent broadcast. The trace of the agent already contains their lines."""
+    def _leave(self) -> bool:
+        """Send the datagrams that the agent broadcast. The trace of the agent already contains their lines. Return true
+        if more frames may wait.
+        """
         assert self._network is not None
         datagrams: list[bytes] = []
-        with contextlib.suppress(OSError):  # no frame is left
+        more = True
+        try:
             for _ in range(FRAMES_PER_TURN):
                 if (data := self._network.read()) is not None:
                     datagrams.append(data)
+        except OSError:  # no frame is left
+            more = False
         self._frames += len(datagrams)
         silent = self._loop.time() - self._pinged_s > SILENT_S
         if datagrams and self._connection is not None and self._can_send() and not silent:  # else it is cut off
             lines = iter(self._tails[Kind.TRACE].read, b"")
             messages = [(Kind.TRACE, data) for data in lines] + [(Kind.DATAGRAM, data) for data in datagrams]
             self._connection.send_together(messages)
+        return more
 
     def _arrive(self, payload: bytes) -> None:
         """Deliver a datagram from the lab to the agent. The message starts with the address of the sender (4 bytes),

@@ -85,6 +85,10 @@ class StandIn:
         """Number of pongs on the current connection."""
         self._ponged_s = self._loop.time()
         self._begun = False
+        self._order: bytes | None = None
+        """The message with which the far end begins the incarnation. None if the far end has never joined."""
+        self._heard = False
+        """True if the far end has begun the incarnation."""
         self._offset_s: float | None = None
         """Seconds by which the clock of the other computer is ahead of the clock of this machine. The first incarnation
         of the agent determines the value. Later incarnations use the same value.
@@ -149,6 +153,7 @@ class StandIn:
         connection, state = taken
         self._offset_s = state["offset_s"] if self._offset_s is None else self._offset_s
         self._pongs = 0
+        self._begun = self._heard  # a far end that had to end an earlier incarnation first has not begun this one
         before, self._connection = self._connection, Connection(Channel.from_json(state), self._receive, self._ended)
         if before is not None:
             before.close()
@@ -162,6 +167,7 @@ class StandIn:
     def _ended(self, connection: Connection) -> None:
         if connection is self._connection:
             self._connection = None
+            self._begun = self._heard
             if self._begun:
                 self._cut()
             else:
@@ -181,6 +187,7 @@ class StandIn:
             self._tell({"clock": self._clock.to_json(), "lost": self._lost})
 
     def _receive(self, message: Message) -> None:
+        self._heard = self._heard or message.kind not in (Kind.PONG, Kind.EXIT)
         match message.kind:
             case Kind.PONG:
                 self._pong(message.payload)
@@ -213,7 +220,8 @@ class StandIn:
     def _pong(self, payload: bytes) -> None:
         sent = self._clock.receive(payload)
         self._ponged_s = self._loop.time()
-        self._lost = max(self._lost, sent - self._released)
+        if self._heard:
+            self._lost = sent - self._released
         self._pongs += 1
         assert self._connection is not None
         if self._pongs < PINGS_BEFORE_START:
@@ -227,9 +235,20 @@ class StandIn:
             self._return()
 
     def _begin(self, connection: Connection) -> None:
-        """Send the mission to the far end. The start of the mission is converted to the time of the far clock."""
         self._begun = True
-        order: dict[str, Any] = {"incarnation": self._incarnation, **asdict(self._task)}
+        if self._order is None:
+            self._order = self._write_order()
+        if self._bundle is not None:
+            if not connection.is_encrypted:
+                self._end(FAILED, "the connection is not encrypted, so the keys of the mission stay in the lab")
+                return
+            # Later incarnations must know that an agent has used the keys, also if its own note never arrives.
+            _write_bundle(self._bundle, {"started_us": 0, **read_json(self._bundle, MAX_BUNDLE_BYTES)})
+        connection.send(Kind.BEGIN, self._order)
+
+    def _write_order(self) -> bytes:
+        """Return the message with the mission. The start of the mission is converted to the time of the far clock."""
+        order: dict[str, Any] = {"incarnation": self._incarnation, "positions": self._positions, **asdict(self._task)}
         try:
             mission = parse_json(self._mission)
         except ValueError:
@@ -242,19 +261,14 @@ class StandIn:
                 # The far end names the disk after its path here, because a reboot names the same path.
                 order["store"] = hashlib.sha256(str(self._store).encode()).hexdigest()[:16]
             if (bundle := self._bundle_path(mission)) is not None:
-                if not connection.is_encrypted:
-                    self._end(FAILED, "the connection is not encrypted, so the keys of the mission stay in the lab")
-                    return
                 order["bundle"] = base64.b64encode(read_plain_file(bundle, MAX_BUNDLE_BYTES)).decode("ascii")
                 self._bundle = bundle
-                # Later incarnations must know that an agent has used the keys, also if its own note never arrives.
-                _write_bundle(bundle, {"started_us": 0, **read_json(bundle, MAX_BUNDLE_BYTES)})
             order["mission"] = mission
         else:
             order["text"] = base64.b64encode(self._mission).decode("ascii")
         most_bytes = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
         order["max_file_bytes"] = None if most_bytes < 0 else most_bytes
-        connection.send(Kind.BEGIN, json.dumps(order).encode())
+        return json.dumps(order).encode()
 
     def _bundle_path(self, mission: dict[str, Any]) -> Path | None:
         """Return the file with the agent's keys. Return None if there is no such file."""
@@ -434,9 +448,6 @@ class StandIn:
             document["path"] = str(self._directory / f"{self._agent_id}.chain.json")
         else:
             self._status = document
-            failures = document.get("send_failures")
-            if type(failures) is int:
-                document["send_failures"] = failures + self._lost
             document["trace_problem"] = document.get("trace_problem") or self._trace_problem
         return json.dumps(document).encode() + b"\n"
 
@@ -444,6 +455,8 @@ class StandIn:
         """Return an answer to a request while the vehicle is cut off."""
         if command == "status" and self._status is not None:
             answer = self._status
+        elif command == "status":
+            return b""  # the harness asks again
         elif command == "stop_events":
             self._stop_events = True  # sent when the vehicle is back
             answer = {"ok": True}
@@ -489,10 +502,12 @@ class StandIn:
 
     def _exit(self, how: dict[str, Any]) -> None:
         if how.get("gone"):
+            self._tell({"gone": True})
             self._end(FAILED, "the far computer has started anew, and the agent of this incarnation is gone")
             return
         if self._connection is not None:
             self._connection.send(Kind.IDLE)  # the far end may end
+        self._lost = int(how["datagrams"]) - self._released
         self._tell({"left_behind": how["left_behind"]})
         self._end(int(how["status"]))
 

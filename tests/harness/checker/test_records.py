@@ -6,6 +6,8 @@ import base64
 import json
 import os
 import shutil
+import socket
+import struct
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +21,7 @@ from harness.archive.archive import RunArchive
 from harness.checker import Result, check, gather
 from harness.play.progress import SilentProgress
 from harness.run.run import run
+from netem import addresses
 from tests.harness.virtual import scenario
 from ucp.block import next_chain_hash
 
@@ -264,6 +267,25 @@ def test_clock_of_another_computer_is_compared_with_run_json(directory: Path, re
     assert verdict == "agree" or "8 for the clock of its computer" in records.evidence[0].detail
 
 
+@pytest.mark.parametrize("incomplete", [[1], []])
+def test_missing_end_of_a_remote_incarnation_accuses_no_agent(directory: Path, incomplete: list[int]) -> None:
+    def leave_out_the_end(lines: list[Document]) -> None:
+        boot = next(number for number, line in enumerate(lines) if number and "schema" in line)
+        del lines[boot - 10 : boot]
+
+    edit_lines(trace(directory, 3), leave_out_the_end)
+    remote = {"3": {"host": "192.168.7.2", "epoch_us": 0, "incomplete": incomplete}}
+    edit(directory / "run.json", lambda run: run.update(remote=remote))
+    result = judged(directory)
+    if not incomplete:
+        assert result.judgements["records"].verdict == "contradict"
+        return
+    assert not result.bad, result.judgements[result.bad[0]]
+    unknown = {key for key, judgement in result.judgements.items() if judgement.verdict == "not applicable"}
+    assert unknown == {*"1235", "steps", "records"}
+    assert "the end of incarnation 1 is not on record" in result.judgements["5"].reason
+
+
 def test_trace_of_a_newer_version_is_an_error(directory: Path) -> None:
     edit_lines(trace(directory, 2), lambda lines: lines[0].update(schema="ucp-trace/9"))
     (error,) = judged(directory).errors
@@ -302,6 +324,31 @@ def test_captures_show_messages_that_a_trace_lacks(tmp_path: Path) -> None:
 
     edit_lines(trace(directory, 1), leave_out_a_vote)
     assert "the capture of its vehicle has a sent message that is missing in its trace" in details(judged(directory))
+
+
+def test_messages_lost_before_the_lab_are_not_missing_in_a_capture(tmp_path: Path) -> None:
+    asked = scenario(agents=3, duration_s=200, capture=True, events={"source": "random", "mean_s": 5})
+    directory = run(asked, 1, tmp_path / "run", SilentProgress(), backend="sim").directory
+    (capture,) = (directory / "capture").glob("*2*")
+    capture.write_bytes(without_packets_of(addresses.address(2), 4, capture.read_bytes()))
+    for lost, verdict in ((3, "contradict"), (4, "agree")):
+        remote = {"2": {"host": "192.168.7.2", "epoch_us": 0, "lost": lost}}
+        edit(directory / "run.json", lambda record, remote=remote: record.update(remote=remote))
+        assert judged(directory).beside["records"].verdict == verdict
+
+
+def without_packets_of(address: str, number: int, content: bytes) -> bytes:
+    """Return a capture (pcapng) without the first packets of this sender."""
+    kept, position = b"", 0
+    while position < len(content):
+        (size,) = struct.unpack_from("<I", content, position + 4)
+        block = content[position : position + size]
+        position += size
+        if number and block[0] == 6 and socket.inet_aton(address) == block[28 + 26 : 28 + 30]:
+            number -= 1
+        else:
+            kept += block
+    return kept
 
 
 LISTS = st.sampled_from(["take one out", "double one", "swap two"])

@@ -91,6 +91,7 @@ def test_remote_agent_is_paused_rebooted_and_killed_as_any_agent(computers: TwoC
     assert (agent["restarts"], agent["reboots"], agent["outcome"]) == (1, 1, "exported")
     assert agent["command"][-2:] == ["-m", "ucp.node"]
     assert (remote["host"], remote["cut_off"], remote["lost"]) == (FAR, [], 0)
+    assert remote["incomplete"] == []
     assert remote["uncertainty_s"] < 1
     assert abs(remote["offset_s"]) <= remote["uncertainty_s"] + 0.01  # both computers have one clock
     assert "2" in record["datagrams"]
@@ -127,6 +128,57 @@ def test_lost_connection_cuts_the_vehicle_off_until_it_returns(computers: TwoCom
     assert record["remote"]["2"]["joins"] > 1
     assert f"agent 2 was cut off from {first['from_s']:.0f} s to {first['until_s']:.0f} s" in output
     assert "2" not in record["datagrams"]  # its stand-in read datagrams that the remote agent did not get
+
+
+def agents_of(computers: TwoComputers) -> list[int]:
+    """Return the processes of agents that run on the far computer."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                words = (entry / "cmdline").read_bytes().split(b"\0")
+                here = (entry / "cwd").resolve().is_relative_to(computers.directory)
+            except OSError:
+                continue
+            if here and b"ucp.node" in words and b"join" not in words and b"2.mission.json" in words:
+                found.append(int(entry.name))
+    return found
+
+
+@pytest.mark.parametrize("fault", ["kill", "reboot"])
+def test_end_of_an_incarnation_that_is_cut_off_is_missing(computers: TwoComputers, fault: str) -> None:
+    """Kill or reboot the vehicle while the connection is lost. The far agent continues until the connection is back.
+
+    The connection returns after the restart of the rebooted agent.
+    """
+    trace = computers.directory / "run/agents/2.trace.jsonl"
+    changes = computers.directory / "run/network.jsonl"
+    struck: dict[str, Any] = {"kill": {"kill": [2]}, "reboot": {"reboot": [2], "down_s": 10, "disk": "kept"}}[fault]
+    before: list[int] = []
+
+    def disturb() -> None:
+        wait_until(lambda: trace.exists() and trace.read_text().count("\n") > 3, "the agent runs")
+        before.extend(agents_of(computers))
+        computers.cut()
+        wait_until(lambda: f'"what":"{fault}"' in changes.read_text(), "the fault")
+        if fault == "reboot":
+            wait_until((computers.directory / "run/agents/2-2/2.mission.json").exists, "the restart")
+        assert agents_of(computers) == before
+        computers.mend()
+        wait_until(lambda: agents_of(computers) != before, "the far end has ended the agent")
+
+    path = scenario(computers.directory, duration_s=220, capture=True, timeline=[{"at_s": 100, **struck}])
+    record, output = play(computers, path, disturb)
+    assert len(before) == 1
+    found = verdicts(record)
+    assert record["status"] == 0, output
+    assert {key for key, verdict in found.items() if verdict == "not applicable"} >= {*"123", "steps", "records"}
+    assert (found["4"], found["6"], found["liveness"]) == ("holds", "holds", "finished"), output
+    assert found["5"] == ("holds" if fault == "reboot" else "not applicable")
+    assert record["remote"]["2"]["incomplete"] == [1]
+    assert record["agents"]["2"]["outcome"] == ("exported" if fault == "reboot" else "killed")
+    assert "the trace of agent 2 is incomplete: the end of incarnation 1 is not on record" in output
+    assert left_behind(computers) == []
 
 
 RECORD = """
@@ -173,7 +225,8 @@ def test_far_computer_that_stays_away_is_named(computers: TwoComputers) -> None:
     assert "until the end, because the connection to its computer 192.168.7.2 was lost" in output
     record = json.loads((computers.directory / "run/run.json").read_text())
     assert "violated" not in verdicts(record).values()
-    assert verdicts(record)["6"] == "not applicable"
+    assert verdicts(record)["steps"] == verdicts(record)["6"] == "not applicable"
+    assert record["remote"]["2"]["incomplete"] == [1]
     wait_until(lambda: left_behind(computers) == [], "nothing is left on the far computer")
 
 

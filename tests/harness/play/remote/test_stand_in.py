@@ -1,0 +1,152 @@
+"""Test the stand-in of a remote agent without a lab. The test plays the harness and the far computer."""
+
+import asyncio
+import json
+import signal
+import socket
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from harness.archive.directory import RunDirectory
+from harness.errors import AgentFailedError, MachineError
+from harness.play.process._agent_process import AgentProcess
+from harness.play.remote._far_clock import pong
+from harness.play.remote._stand_in_task import StandInTask
+from harness.play.remote._wire import Channel, Kind, Message, hand_over
+from harness.play.remote.stand_in import StandIn
+
+DEADLINE_S = 10.0
+MISSION = b'{"epoch_us": 1000000}'
+
+
+class FarEnd:
+    """One connection to the stand-in, with the other end in the hands of the test."""
+
+    def __init__(self, harness: socket.socket) -> None:
+        self._own, other = socket.socketpair()
+        self._own.setblocking(False)
+        other.setblocking(False)
+        self._channel = Channel(b"a" * 32, b"b" * 32)
+        self._messages: list[Message] = []
+        self.datagrams = 0
+        hand_over(harness, other, {**Channel(b"b" * 32, b"a" * 32).to_json(), "offset_s": None})
+
+    def send(self, kind: Kind, payload: bytes = b"") -> None:
+        self._own.sendall(self._channel.encode(kind, payload))
+
+    async def receive(self, kind: Kind) -> dict[str, Any]:
+        """Answer pings until a message of this kind arrives, and return its document."""
+        loop = asyncio.get_running_loop()
+        while True:
+            while self._messages:
+                message = self._messages.pop(0)
+                if message.kind is kind:
+                    return message.document()
+                assert message.kind is Kind.PING
+                self.send(Kind.PONG, pong(message.payload, self.datagrams))
+            self._messages += self._channel.decode(await loop.sock_recv(self._own, 65536))
+
+    def close(self) -> None:
+        self._own.close()
+
+
+@asynccontextmanager
+async def stand_in(directory: Path) -> AsyncIterator[tuple[socket.socket, "asyncio.Task[int]"]]:
+    """Run a stand-in. Return the socket of the harness, and the task that returns the exit status."""
+    harness, inside = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with harness, inside:
+        inside.setblocking(False)
+        harness.setblocking(False)
+        task = StandInTask(2, 2, 2, 4200, 1.0, measures_lag=False)
+        running = asyncio.create_task(StandIn(inside, task, MISSION, directory).run())
+        async with asyncio.timeout(DEADLINE_S):
+            yield harness, running
+        running.cancel()
+
+
+def reported(harness: socket.socket) -> list[dict[str, Any]]:
+    """Return the messages that the harness has received from the stand-in."""
+    messages = []
+    while True:
+        try:
+            messages.append(json.loads(harness.recv(4096)))
+        except BlockingIOError:
+            return messages
+
+
+def play(test: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    asyncio.run(test())
+
+
+def test_datagrams_lost_after_the_last_pong_are_counted(tmp_path: Path) -> None:
+    async def lose() -> None:
+        async with stand_in(tmp_path) as (harness, running):
+            far = FarEnd(harness)
+            await far.receive(Kind.BEGIN)
+            far.send(Kind.TRACE, b"{}\n")
+            far.send(Kind.EXIT, json.dumps({"status": -signal.SIGKILL, "left_behind": [], "datagrams": 3}).encode())
+            assert await running == -signal.SIGKILL
+            assert reported(harness)[-1]["lost"] == 3
+
+    play(lose)
+
+
+def test_datagrams_of_an_earlier_incarnation_are_not_counted(tmp_path: Path) -> None:
+    async def lose() -> None:
+        async with stand_in(tmp_path) as (harness, running):
+            far = FarEnd(harness)
+            far.datagrams = 50
+            await far.receive(Kind.BEGIN)
+            far.close()
+            far = FarEnd(harness)
+            await far.receive(Kind.BEGIN)
+            far.send(Kind.EXIT, json.dumps({"status": 0, "left_behind": [], "datagrams": 0}).encode())
+            assert await running == 0
+            assert {message.get("lost", 0) for message in reported(harness)} == {0}
+
+    play(lose)
+
+
+def test_far_end_that_ends_an_earlier_incarnation_begins_again(tmp_path: Path) -> None:
+    """The far end plays an incarnation that the lab killed. It ends this incarnation, and connects again."""
+
+    async def begin() -> None:
+        async with stand_in(tmp_path) as (harness, _):
+            far = FarEnd(harness)
+            first = await far.receive(Kind.BEGIN)
+            far.close()
+            far = FarEnd(harness)
+            assert await far.receive(Kind.BEGIN) == first
+
+    play(begin)
+
+
+def test_far_computer_that_lost_its_agent_is_reported(tmp_path: Path) -> None:
+    async def resume() -> None:
+        async with stand_in(tmp_path) as (harness, running):
+            far = FarEnd(harness)
+            await far.receive(Kind.BEGIN)
+            far.send(Kind.TRACE, b"{}\n")
+            while not (tmp_path / "2.trace.jsonl").read_bytes():
+                await asyncio.sleep(0.01)
+            far.close()
+            far = FarEnd(harness)
+            assert (await far.receive(Kind.RESUME))["positions"]["TRACE"] == 3
+            far.send(Kind.EXIT, b'{"gone": true}')
+            assert await running == 1
+            assert {"gone": True} in reported(harness)
+
+    play(resume)
+
+
+@pytest.mark.parametrize(("loss", "error"), [(None, AgentFailedError), ("cannot go on", MachineError)])
+def test_agent_on_a_lost_computer_has_not_failed(tmp_path: Path, loss: str | None, error: type[Exception]) -> None:
+    rundir = RunDirectory(tmp_path / "run")
+    agent = AgentProcess(2, rundir, ["stand-in"], lambda: 0.0, loss=lambda: loss)
+    agent._begin_incarnation()
+    assert isinstance(agent._failure("hung", "did not answer"), error)
+    assert agent.outcome == ("hung" if loss is None else "not exported")
