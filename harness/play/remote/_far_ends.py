@@ -246,16 +246,20 @@ class FarEnds:
             loop.add_reader(stand_in, self._hear, number, stand_in)
 
     def _hear(self, number: int, stand_in: socket.socket) -> None:
-        """Read a message of a stand-in."""
-        try:
-            data = stand_in.recv(MAX_STAND_IN_BYTES)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if not data:
-            self._forget(stand_in)
-        self._host.hear(number, stand_in, json.loads(data) if data else {})
+        """Read all messages of a stand-in that have arrived. It sends them before the answer of its agent, so the host
+        knows them before it reads this answer.
+        """
+        data = b"-"
+        while data:
+            try:
+                data = stand_in.recv(MAX_STAND_IN_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if not data:
+                self._forget(stand_in)
+            self._host.hear(number, stand_in, json.loads(data) if data else {})
 
     def _forget(self, stand_in: socket.socket) -> None:
         self._stand_ins.discard(stand_in)

@@ -15,8 +15,10 @@ from harness.archive.directory import RunDirectory
 from harness.errors import AgentFailedError, MachineError
 from harness.play.process._agent_process import AgentProcess
 from harness.play.remote._far_clock import pong
+from harness.play.remote._far_ends import FarEnds
 from harness.play.remote._stand_in_task import StandInTask
 from harness.play.remote._wire import Channel, Kind, Message, hand_over
+from harness.play.remote.agent_pool import AgentPool, RemoteIncarnation
 from harness.play.remote.stand_in import StandIn
 
 DEADLINE_S = 10.0
@@ -141,6 +143,23 @@ def test_far_computer_that_lost_its_agent_is_reported(tmp_path: Path) -> None:
             assert {"gone": True} in reported(harness)
 
     play(resume)
+
+
+def test_harness_reads_all_messages_of_a_stand_in_at_once(tmp_path: Path) -> None:
+    """A busy harness finds the start of the mission and the answer to its request at the same time."""
+
+    async def hear() -> None:
+        pool = AgentPool(2, "127.0.0.1:0", b"s" * 32)
+        incarnation = RemoteIncarnation(pool, 2, 2, 4200, 1.0)
+        inside, outside = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with inside, outside:
+            inside.setblocking(False)
+            for message in ({"lost": 0}, {"offset_s": 1.5}, {"epoch_us": 7}):
+                outside.send(json.dumps(message).encode())
+            FarEnds(pool, "test")._hear(0, inside)
+        assert incarnation.epoch_us == 7
+
+    play(hear)
 
 
 @pytest.mark.parametrize(("loss", "error"), [(None, AgentFailedError), ("cannot go on", MachineError)])
