@@ -182,7 +182,6 @@ _COUNTS_PER_DB = 1.9
 _MIN_SAMPLES, _MIN_MINUTES, _MIN_RATIO = 30, 4, 3.0
 _MIN_DISTANCE_M = 10.0
 _PLAUSIBLE = (1.0, 6.0)
-_METRES_PER_DEGREE = 111_195.0
 
 Sample = tuple[float, float, int]
 """A signal strength measurement: ln(distance), signal strength in dB, and the index of the minute in which it was

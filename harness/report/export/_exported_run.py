@@ -67,15 +67,15 @@ if TYPE_CHECKING:
 
 
 NAME = "telemetry.tlog"
-MAX_BYTES = 1024 * 1024 * 1024
-MAX_FILES = 1000
+MAX_TELEMETRY_BYTES = 1024 * 1024 * 1024
+MAX_TELEMETRY_FILES = 1000
 _LIFE = re.compile(r"([1-9]\d{0,4})(?:-([1-9]\d{0,3}))?")
 
 
 def telemetry_logs(directory: Path) -> list[tuple[int, Path]]:
     """Return the vehicle and the path of each telemetry log. A restarted vehicle has several logs."""
     logs = []
-    for path in islice((directory / "vehicles").glob(f"*/{NAME}"), MAX_FILES):
+    for path in islice((directory / "vehicles").glob(f"*/{NAME}"), MAX_TELEMETRY_FILES):
         if named := _LIFE.fullmatch(path.parent.name):
             logs.append((int(named[1]), int(named[2] or 1), path))
     return [(vehicle, path) for vehicle, _, path in sorted(logs)]
@@ -88,9 +88,9 @@ def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[s
         problems.append(f"{path}: cannot be read: it is not a file")
         return
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if path.stat().st_size > MAX_TELEMETRY_BYTES:
             problems.append(
-                f"{path}: larger than {MAX_BYTES // 1024**2} MiB, which is too large for a log of a "
+                f"{path}: larger than {MAX_TELEMETRY_BYTES // 1024**2} MiB, which is too large for a log of a "
                 "flight; it is left out"
             )
             return
@@ -115,9 +115,9 @@ def read_telemetry(vehicle: int, path: Path, time: MissionTime, problems: list[s
         problems.append(f"{path}: {untimed} messages with an impossible time are left out")
 
 
-MAX_BYTES = 32 * 1024 * 1024
+MAX_LOG_BYTES = 32 * 1024 * 1024
 MAX_LINE_BYTES = 64 * 1024
-MAX_FILES = 3000
+MAX_LOG_FILES = 3000
 _ZONE_STEP_S = 15 * 60
 _FURTHEST_ZONE_S = 14 * 3600
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(?:[.,](\d{1,6}))?\s*")
@@ -130,7 +130,7 @@ def log_files(directory: Path) -> Iterator[tuple[str, Path]]:
     and the vehicles.
     """
     files = chain(directory.glob("*.log"), directory.glob("agents/**/*.log"), directory.glob("vehicles/*/output.log"))
-    for path in sorted(islice(files, MAX_FILES)):
+    for path in sorted(islice(files, MAX_LOG_FILES)):
         yield str(path.relative_to(directory)).encode("utf-8", "replace").decode(), path
 
 
@@ -138,7 +138,7 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
     """Yield the lines of a log file. If a part cannot be read, add a sentence to `problems`."""
     at_ns, zone_s = time.at(0.0), None
     try:
-        with BoundedFile(path, MAX_BYTES) as file:
+        with BoundedFile(path, MAX_LOG_BYTES) as file:
             while line := file.readline(MAX_LINE_BYTES):
                 text = line.decode("utf-8", "replace").rstrip()
                 if timed := _TIME.match(text):
