@@ -1,5 +1,13 @@
-"""Test that a replay of correct agents never finds a difference: in virtual time, with processes, and in containers."""
+"""Test that a replay of correct agents never finds a difference: in virtual time, with processes, and in containers.
 
+Test the replay of damaged records: it plays the remaining parts, and missing parts are no deviations.
+"""
+
+import base64
+import gzip
+import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,7 +19,8 @@ from hypothesis import strategies as st
 from harness.field.replay import RecordPlayer, open_record
 from harness.play.progress import SilentProgress
 from harness.run.run import run
-from tests.harness.field.flights import flown
+from tests.harness.command import harness, sentences
+from tests.harness.field.flights import flown, trace_of
 from tests.harness.virtual import scenario
 
 READINGS: list[dict[str, Any]] = [
@@ -106,3 +115,185 @@ def test_replay_finds_no_difference_with_processes(tmp_path: Path) -> None:
 def test_replay_finds_no_difference_in_containers(tmp_path: Path) -> None:
     mission = {**MISSION, "docker": {"image_from_host": True}}
     assert_no_difference(run(scenario(**mission), 1, tmp_path / "run", SilentProgress(), "docker").directory)
+
+
+@pytest.fixture(scope="module")
+def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return flown(tmp_path_factory.mktemp("right") / "run", agents=4, duration_s=900)
+
+
+@pytest.fixture
+def traces_only(run_directory: Path, tmp_path: Path) -> Path:
+    """Copy the traces of the run, without its other files."""
+    directory = tmp_path / "home"
+    directory.mkdir()
+    for agent in (1, 2, 3, 4):
+        shutil.copy(trace_of(run_directory, agent), directory)
+    return directory
+
+
+def change(path: Path, edit: Callable[[list[str]], Any]) -> None:
+    lines = path.read_text().splitlines(keepends=True)
+    edit(lines)
+    path.write_text("".join(lines))
+
+
+def damage(*numbers: int) -> Callable[[list[str]], None]:
+    def edit(lines: list[str]) -> None:
+        for number in numbers:
+            lines[number] = lines[number][: len(lines[number]) // 2] + "\n"
+
+    return edit
+
+
+def remove(first: int, last: int) -> Callable[[list[str]], None]:
+    def edit(lines: list[str]) -> None:
+        del lines[first:last]
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        damage(40),
+        damage(30, 31, 32, 60),
+        damage(0),
+        damage(0, 1),
+        damage(1),
+        remove(0, 1),
+        remove(0, 30),
+        remove(40, 60),
+    ],
+    ids=["a line", "lines", "header", "beginning", "first line", "no header", "no beginning", "lines without a sign"],
+)
+def test_missing_lines_are_no_difference_and_the_rest_is_played(
+    traces_only: Path, edit: Callable[[list[str]], None]
+) -> None:
+    change(traces_only / "2.trace.jsonl", edit)
+    ended = harness("replay", traces_only, "--agent", 2, "--json")
+    (document,) = json.loads(ended.stdout)["records"]
+    assert (ended.returncode, document["verdict"], document["differences"]) == (0, "as specified", [])
+    assert document["steps"] > 30
+    assert document["unjudged"] == 0 or document["unjudged_because"]
+    sentences(ended.stderr)
+
+
+def test_difference_after_a_gap_is_found(traces_only: Path) -> None:
+    record = open_record(traces_only / "2.trace.jsonl")
+    positions = [
+        number for number, entry in enumerate(record.entries) if getattr(entry.content, "branch", "") == "approve"
+    ]
+    line = record.entries[positions[-1]].line
+
+    def disapprove(lines: list[str]) -> None:
+        lines[line - 1] = lines[line - 1].replace('"branch":"approve"', '"branch":"disapprove"')
+        damage(30)(lines)
+
+    change(traces_only / "2.trace.jsonl", disapprove)
+    found = RecordPlayer(open_record(traces_only, 2)).to_end()
+    assert found.unjudged and found.lost
+    assert [(deviation.line, deviation.handler) for deviation in found.deviations] == [
+        (line, "receive_request_add_block")
+    ]
+
+
+def test_compressed_duplicate_and_unrelated_files_change_nothing(traces_only: Path) -> None:
+    whole = RecordPlayer(open_record(traces_only, 2)).to_end().steps
+    content = (traces_only / "2.trace.jsonl").read_bytes()
+    (traces_only / "2.trace.jsonl").unlink()
+    (traces_only / "two.gz").write_bytes(gzip.compress(content))
+    (traces_only / "copy of two.jsonl").write_bytes(content)
+    (traces_only / "holiday.jpg").write_bytes(b"\xff\xd8\xff\xe0 no trace")
+    found = RecordPlayer(open_record(traces_only, 2)).to_end()
+    assert (found.steps, found.deviations) == (whole, [])
+    assert RecordPlayer(open_record(traces_only / "two.gz")).to_end().steps == whole
+
+
+def test_truncated_record_is_played_up_to_its_end(traces_only: Path) -> None:
+    path = traces_only / "2.trace.jsonl"
+    path.write_bytes(path.read_bytes()[:20_000])
+    ended = harness("replay", path)
+    assert ended.returncode == 0
+    (said,) = sentences(ended.stderr)
+    assert "truncated" in said
+
+
+def test_unusable_files_give_status_2(tmp_path: Path) -> None:
+    (tmp_path / "1.trace.jsonl").write_bytes(bytes(range(256)) * 50)
+    for path in (tmp_path, tmp_path / "1.trace.jsonl", tmp_path / "none"):
+        ended = harness("replay", path)
+        assert ended.returncode == 2
+        assert len(sentences(ended.stderr)) == 1
+
+
+def test_trace_of_version_1_cannot_be_played(traces_only: Path) -> None:
+    change(
+        traces_only / "2.trace.jsonl",
+        lambda lines: lines.__setitem__(0, lines[0].replace("ucp-trace/2", "ucp-trace/1")),
+    )
+    ended = harness("replay", traces_only / "2.trace.jsonl")
+    assert ended.returncode == 2
+    assert "lacks received messages" in sentences(ended.stderr)[-1]
+
+
+def test_unplayable_record_does_not_prevent_the_others(traces_only: Path) -> None:
+    change(
+        traces_only / "2.trace.jsonl",
+        lambda lines: lines.__setitem__(0, lines[0].replace("ucp-trace/2", "ucp-trace/1")),
+    )
+    ended = harness("replay", traces_only)
+    assert ended.returncode == 0
+    assert ended.stdout.count("✔ no difference") == 3
+    assert any("lacks received messages" in said for said in sentences(ended.stderr))
+
+
+@pytest.mark.parametrize("by_s", [30.0, -30.0, 5000.0])
+def test_changed_clock_causes_no_deviation(by_s: float, traces_only: Path) -> None:
+    """The clock of the agent was set during a vote. The timer expires correctly, although the recorded times contradict
+    this.
+    """
+    path = traces_only / "2.trace.jsonl"
+    lines = path.read_text().splitlines()
+    votes = [number for number, line in enumerate(lines) if '"branch":"proposed"' in line]
+    for number in range(votes[len(votes) // 2] + 1, len(lines)):
+        entry = json.loads(lines[number])
+        entry["t"] = round(entry["t"] + by_s, 6)
+        lines[number] = json.dumps(entry, separators=(",", ":"))
+    path.write_text("\n".join(lines) + "\n")
+    found = RecordPlayer(open_record(traces_only, 2)).to_end()
+    assert found.deviations == []
+    assert found.unjudged
+    assert "clock was set" in found.lost[0]
+
+
+def test_control_characters_of_a_record_are_not_printed(traces_only: Path) -> None:
+    evil = "\x1b]0;title\x07\x1b[2J[bold]"
+
+    def swear(lines: list[str]) -> None:
+        entry = json.loads(lines[20])
+        entry["branch"], entry["trigger"] = evil, {"message": evil, "from": 1, "seq": 2}
+        lines[20] = json.dumps(entry) + "\n"
+
+    change(traces_only / "2.trace.jsonl", swear)
+    commands = "goto 21\ns\ncompare\nl\no\n"
+    ended = harness("replay", traces_only, "--agent", 2, "--step", input=commands)
+    assert ended.returncode == 0, "what nobody understands is no accusation"
+    assert "[bold]" in ended.stdout
+    assert not any(character in ended.stdout + ended.stderr for character in "\x1b\x07")
+
+
+def test_irregular_sequence_numbers_are_no_missing_lines(traces_only: Path) -> None:
+    path = traces_only / "2.trace.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for line in lines:
+        for sent in line.get("sent", ()):
+            sequence = 2 * sent["seq"]
+            datagram = bytearray(base64.b64decode(sent["datagram"]))
+            datagram[8:12] = sequence.to_bytes(4, "big")
+            sent |= {"seq": sequence, "datagram": base64.b64encode(datagram).decode()}
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    found = RecordPlayer(open_record(traces_only, 2)).to_end()
+    assert found.deviations
+    assert found.unjudged == 0
+    assert "with sequence number" in found.deviations[0].difference(str)

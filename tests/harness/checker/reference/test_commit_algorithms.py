@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.harness.checker.reference.agent_states import (
+from tests.harness.checker.reference.driver import (
     OTHER_HASH,
     agent_with_chain,
     block_of,

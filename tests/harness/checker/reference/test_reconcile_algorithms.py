@@ -5,8 +5,10 @@ from typing import Any
 import pytest
 
 from harness.checker.reference.state import Settings
-from tests.harness.checker.reference.agent_states import (
+from tests.harness.checker.reference.driver import (
     OTHER_HASH,
+    Agent,
+    Step,
     agent_in_phase_2,
     agent_in_phase_3,
     agent_in_phase_3_with_stack,
@@ -23,7 +25,6 @@ from tests.harness.checker.reference.agent_states import (
     trace,
     vote,
 )
-from tests.harness.checker.reference.driver import Agent, Step
 from ucp.block import next_chain_hash
 from ucp.messages import (
     BlockResponse,

@@ -8,9 +8,10 @@ import pytest
 
 from harness.checker.reference.algorithms import HANDLERS
 from harness.checker.reference.state import ReferenceState, Settings
-from tests.harness.checker.reference.agent_states import (
+from tests.harness.checker.reference.driver import (
     OTHER_HASH,
     ROSTER,
+    Agent,
     block_of,
     complete,
     messages,
@@ -18,7 +19,6 @@ from tests.harness.checker.reference.agent_states import (
     top,
     trace,
 )
-from tests.harness.checker.reference.driver import Agent
 from ucp.events import LoggableEvent
 from ucp.messages import (
     BlockResponse,

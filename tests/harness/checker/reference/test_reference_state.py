@@ -6,7 +6,7 @@ import pytest
 
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_MESSAGE, ON_TIMER
 from harness.checker.reference.state import Chain, ReferenceState, Settings, Timer
-from tests.harness.checker.reference.agent_states import OTHER_HASH, block_of, complete, new_agent
+from tests.harness.checker.reference.driver import OTHER_HASH, block_of, complete, new_agent
 from ucp.block import Block, InceptionBlock
 from ucp.events import LoggableEvent
 

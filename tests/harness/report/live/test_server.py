@@ -1,7 +1,14 @@
-"""Test the web server of the live page: the control of access, and slow or closed browsers."""
+"""Test the web server of the live page: the control of access, and slow or closed browsers.
+
+Test that a web server which fails, hangs or is slow does not affect the run.
+
+Test the error messages of `ucp-harness watch` and `run --watch`.
+"""
 
 import asyncio
 import json
+import socket
+import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -12,9 +19,14 @@ import aiohttp
 import pytest
 
 from harness.errors import MachineError
+from harness.play.interventions import Interventions
 from harness.report.live import server as servers
+from harness.report.live import server_process as module
 from harness.report.live.change_log import ChangeLog
 from harness.report.live.server import LivePageServer
+from harness.report.live.server_process import live_page, require_packages
+from harness.scenario import Scenario
+from tests.harness.command import harness, sentences
 
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 
@@ -201,3 +213,73 @@ def test_server_listens_on_the_loopback_address_only(tmp_path: Path) -> None:
             assert not any(f":{port} " in line for line in Path("/proc/net/tcp6").read_text().splitlines()[1:])
 
     asyncio.run(visit())
+
+
+HAND = Interventions(Scenario(name="watched"), virtual_time=True)
+MUCH = "head -c 300000 /dev/zero | tr '\\0' 'x' >&2; echo >&2"
+"""Code that writes more bytes to standard error than a pipe holds."""
+
+
+@pytest.fixture
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the path of a program that runs in place of the server. A test writes this program."""
+    program = tmp_path / "server"
+    program.touch(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    return program
+
+
+def test_dead_server_with_much_output_is_reported_after_the_run(server: Path, tmp_path: Path) -> None:
+    server.write_text(f"#!/bin/sh\n{MUCH}\necho http://here/\n{MUCH}\necho 'no more memory' >&2\nkill -9 $$\n")
+    with live_page(tmp_path, 0, HAND) as page:
+        assert page.address == "http://here/"
+        assert not page.run_is_over()
+        assert page.problem == "the server of the page ended by itself with SIGKILL (no more memory); the run continued"
+
+
+def test_hung_server_ends_with_the_run(server: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "LAST_LOOK_S", 0.1)
+    monkeypatch.setattr(module, "ENDING_S", 0.1)
+    server.write_text("#!/bin/sh\ntrap '' TERM\necho http://here/\nexec sleep 1000\n")
+    with live_page(tmp_path, 0, HAND) as page:
+        for _ in range(module.MAX_OUTGOING):  # more than a pipe holds
+            page._send(["t", 100.0])
+        assert not page.run_is_over()
+        assert page.problem == "the page hung: its server did not answer within 0.1 s after the run"
+
+
+def test_server_that_cannot_start_gives_the_reason(server: Path, tmp_path: Path) -> None:
+    server.write_text(f"#!/bin/sh\n{MUCH}\necho 'port 80 of 127.0.0.1 cannot be had' >&2\nexit 3\n")
+    with pytest.raises(MachineError, match=r"port 80 of 127\.0\.0\.1 cannot be had"), live_page(tmp_path, 0, HAND):
+        pass
+
+
+def test_directory_without_a_run_is_refused(tmp_path: Path) -> None:
+    done = harness("watch", tmp_path)
+    assert done.returncode == 2
+    assert len(sentences(done.stderr)) == 1
+    assert "neither a run directory" in done.stderr
+
+
+def test_used_port_is_reported_before_the_run_begins(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        done = harness("run", "perfect", "--backend", "sim", "--watch", "--watch-port", port, "--out", tmp_path / "run")
+    assert done.returncode == 3
+    assert sentences(done.stderr) == [
+        f"port {port} of 127.0.0.1 is not available: Address already in use; choose another port, or 0 for a free one"
+    ]
+    assert not (tmp_path / "run").exists()
+
+
+def test_missing_package_is_reported_with_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "aiohttp", None)
+    with pytest.raises(MachineError, match=r"pip install 'ucp-harness\[watch\]'"):
+        require_packages()
+
+
+def test_run_without_open_pages_ends_normally(tmp_path: Path) -> None:
+    done = harness("run", "perfect", "--backend", "sim", "--speedup", 1000, "--watch", "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    assert "watch it at http://127.0.0.1:" in done.stdout
+    assert (tmp_path / "run" / "report.html").is_file()

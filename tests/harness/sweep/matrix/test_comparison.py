@@ -1,4 +1,7 @@
-"""Test `--against`: which figures count as worse than an earlier night, and which nights can be compared."""
+"""Test `--against`: which figures count as worse than an earlier night, and which nights can be compared.
+
+Test the comparison of a protocol variant with the original protocol. Both use the same seeds.
+"""
 
 import json
 from pathlib import Path
@@ -16,6 +19,8 @@ from harness.sweep.matrix._comparison import compare
 from harness.sweep.matrix._estimate import BY_NAME, Estimate
 from harness.sweep.matrix.matrix_run import compare_with
 from harness.sweep.matrix.nights import keep, load_baseline
+from tests.harness.command import harness
+from tests.harness.run.test_variant import CORE, HEAD, REFERENCE, write_variant
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
 WORSE = {
@@ -245,3 +250,53 @@ def test_an_interrupted_night_is_no_baseline(tmp_path: Path) -> None:
 def test_one_seed_has_no_intervals_to_compare(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="which need several seeds: give the matrix more `seeds`"):
         load_baseline(night(tmp_path / "before", seeds=1), matrix(seeds=1))
+
+
+MATRIX = """
+name: Ties
+scenario: {agents: 4, duration_s: 600, events: {source: random, mean_s: 30}, vehicles: {kind: none}}
+loss: [0, 0.3]
+seeds: 4
+"""
+
+
+@pytest.fixture
+def variants_matrix(tmp_path: Path) -> Path:
+    path = tmp_path / "matrix.yaml"
+    path.write_text(MATRIX)
+    return path
+
+
+def compared(variants_matrix: Path, variant: Path, out: Path) -> dict[float, dict[str, Any]]:
+    """Return the row with each label, for each loss rate."""
+    done = harness("matrix", variants_matrix, "--variant", variant, "--out", out, "--jobs", 1, "--json")
+    assert done.returncode == 0, done.stderr
+    cells = json.loads(done.stdout)["cells"]
+    return {cell["loss"]: {row["label"]: row for row in cell["rows"]} for cell in cells}
+
+
+def test_variant_is_compared_with_the_original_seed_by_seed(variants_matrix: Path, tmp_path: Path) -> None:
+    variant = write_variant(tmp_path, HEAD + CORE + REFERENCE)
+    rows = compared(variants_matrix, variant, tmp_path / "out")
+    assert rows[0]["messages"]["differing_seeds"] == [], "without losses there is no tie"
+    assert rows[0.3]["messages"]["differing_seeds"], "with losses there is one"
+    assert rows[0.3]["runs with a step that deviates"]["variant"] == 0
+    page = (tmp_path / "out" / "comparison.md").read_text()
+    assert page.startswith("# pops (Algorithm 11) beside the original\n")
+    assert "| runs with a livelock | 4 |" in page
+    (beside,) = [path for path in (tmp_path / "out").iterdir() if path.name.startswith("pops-")]
+    assert json.loads((beside / "matrix.json").read_text())["versions"]["variant"].startswith("pops ")
+    assert "variant" not in json.loads((tmp_path / "out" / "original" / "matrix.json").read_text())["versions"]
+
+
+def test_variant_that_changes_nothing_has_no_difference(variants_matrix: Path, tmp_path: Path) -> None:
+    same = HEAD + CORE.replace("yes <= no", "yes < no") + REFERENCE.replace("yes > no", "yes >= no")
+    rows = compared(variants_matrix, write_variant(tmp_path, same), tmp_path / "out")
+    assert [row["differing_seeds"] for cell in rows.values() for row in cell.values()] == [[]] * 22
+
+
+def test_variant_excludes_other_comparisons(variants_matrix: Path, tmp_path: Path) -> None:
+    variant = write_variant(tmp_path, HEAD + CORE + REFERENCE)
+    done = harness("matrix", variants_matrix, "--variant", variant, "--nights", tmp_path / "nights")
+    assert done.returncode == 2
+    assert "--variant excludes" in " ".join(done.stderr.split())

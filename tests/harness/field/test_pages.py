@@ -1,10 +1,19 @@
-"""Test that the examples in docs/how-to/import-other-logs.md work as described."""
+"""Test that the examples in docs/how-to/import-other-logs.md work as described.
+
+Test that the commands in docs/how-to/find-a-field-bug.md print the output on the page.
+
+Test that the table in docs/appendix/wrong-agents-field.md is complete and correct.
+"""
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 
+from docs.generate.wrong_agents import at_the_desk
+from docs.generate.wrong_agents.at_the_desk import AtTheDesk, Named, row
+from docs.generate.wrong_agents.trials_page import rows_of
 from harness.archive.packets.capture_files import capture_files, read_captures
 from harness.errors import FieldError
 from harness.field.adapters import import_records
@@ -12,6 +21,8 @@ from harness.field.adapters.adapter import load_adapter
 from harness.field.adapters.csv_adapter import CsvAdapter
 from tests.harness.command import harness, sentences
 from tests.harness.field.flights import flown, trace_of
+from tests.pages import play
+from ucp.quirks import QUIRKS
 
 PAGE = (Path(__file__).parents[3] / "docs/how-to/import-other-logs.md").read_text()
 TEXTS = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
@@ -75,3 +86,39 @@ def test_failing_adapter_keeps_earlier_observations(swarmlog: Path, tmp_path: Pa
     assert record.flights[0].agents[7].capture
     (left_out,) = record.left_out
     assert "reading failed after line 4: ValueError: not enough values to unpack" in left_out.sentence
+
+
+ROOT = Path(__file__).parents[3]
+FIELD_BUGS_PAGE = ROOT / "docs/how-to/find-a-field-bug.md"
+
+
+def test_commands_print_the_output_on_the_page(tmp_path: Path) -> None:
+    for directory in ("ucp", "docs"):
+        shutil.copytree(ROOT / directory, tmp_path / directory, ignore=shutil.ignore_patterns("__pycache__"))
+    assert play(FIELD_BUGS_PAGE, tmp_path, columns=150) > 12
+
+
+def test_code_lines_on_the_page_are_current() -> None:
+    code = (ROOT / "ucp/quirks/_reconcile_quirks.py").read_text().splitlines()
+    assert code[164].strip() == "raise NameError"
+    assert code[189].strip() == "core.start(core.phase_three_timer, 0.0)"
+
+
+ROWS = rows_of(at_the_desk.PAGE.read_text(encoding="utf-8"))
+
+
+def test_each_quirk_has_a_row() -> None:
+    assert list(ROWS) == list(QUIRKS), "write it again: python -m docs.generate.wrong_agents.at_the_desk"
+
+
+def test_replay_finds_each_wrong_agent() -> None:
+    assert not [quirk for quirk, line in ROWS.items() if "no difference" in line]
+
+
+def test_row_has_the_first_difference_and_counts_correct_handlers() -> None:
+    late = Named(120.0, "vote_timer_expiration", "it sent nothing; it should have sent Commit Block about block 2.1")
+    early = Named(60.0, "receive_commit_block", "it took the branch 'a|b'")
+    assert row("hide_commits", AtTheDesk(2, 5, (late, early))) == (
+        "| `hide_commits` | 5 | `receive_commit_block` | 1 of 2 | 1.0 | 2 | `it took the branch 'a\\|b'` |\n"
+    )
+    assert "no difference" in row("hide_commits", AtTheDesk(8, 5, ()))
