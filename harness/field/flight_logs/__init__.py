@@ -90,7 +90,7 @@ def read_flight_log(path: Path) -> FlightLog:
                     f"{path}: not a flight log, because it has no messages of DataFlash or MAVLink; give a .bin "
                     "or .tlog file"
                 )
-            log = _dataflash(path, file) if kind == "DataFlash" else _telemetry(path, file)
+            log = (_read_dataflash if kind == "DataFlash" else _read_telemetry)(path, file)
             if file.problem:
                 log.problems.append(file.problem)
             return log
@@ -98,7 +98,7 @@ def read_flight_log(path: Path) -> FlightLog:
         raise FieldError(f"{path}: cannot be read: {error.strerror}; give a .bin or .tlog file") from None
 
 
-def _dataflash(path: Path, file: BoundedFile) -> FlightLog:
+def _read_dataflash(path: Path, file: BoundedFile) -> FlightLog:
     reader = DataFlashReader()
     reader.read(file)
     vehicle = _vehicle_log(reader.vehicle, reader.vehicle_id, reader.mav_type)
@@ -112,7 +112,7 @@ def _dataflash(path: Path, file: BoundedFile) -> FlightLog:
     return FlightLog(path, "DataFlash", [vehicle], reader.vehicle.records_of(RadioStatus), reader.clock.jumps, problems)
 
 
-def _telemetry(path: Path, file: BoundedFile) -> FlightLog:
+def _read_telemetry(path: Path, file: BoundedFile) -> FlightLog:
     from harness.field.flight_logs._telemetry import TelemetryReader
 
     reader = TelemetryReader()
