@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from harness.archive.bounded_file import JsonLines, Record
-from harness.archive.channel_journal import CHANNEL_FILE, ChannelLine
 from harness.archive.connectivity import NETWORK_FILE, Connectivity, Link, read_connectivity, read_link_losses
 from harness.archive.directory import PUBLIC_KEYS_FILE, ROGUE_FILE
 from harness.archive.exports import (
@@ -29,8 +28,8 @@ from harness.archive.exports import (
     read_exports,
 )
 from harness.archive.history import has_possible_time
-from harness.archive.lag import LAG_FILE, LagLine, MeasuredLag
 from harness.archive.record_file import RecordFile, read_record
+from harness.archive.run_journals import CHANNEL_FILE, LAG_FILE, ChannelLine, LagLine, MeasuredLag
 from harness.archive.run_record import AgentRecord, JudgedRecord, RunRecord
 from harness.archive.trace_files import MAX_TRACE_BYTES, is_packed, trace_file, trace_files
 from harness.archive.traces import (

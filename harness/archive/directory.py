@@ -11,7 +11,7 @@ replay.yaml         the scenario with the changes that the user made by hand (ha
 channel.jsonl       each message on a shared channel, and the vehicles that lost it; channel.log is the output of the
                     process that simulates the channel
 rogue.jsonl         datagrams that the rogue node sent, if the timeline injects any; rogue.log is its output
-lag.jsonl           delays of programs that the machine woke late, and the load of each agent (harness.archive.lag)
+lag.jsonl           delays of programs that the machine woke late, and the load of each agent
 lab.log             output of the lab
 report.html  report.md  junit.xml  chains.svg
 
@@ -27,11 +27,10 @@ from heapq import nlargest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.archive.channel_journal import CHANNEL_FILE
 from harness.archive.connectivity import NETWORK_FILE
 from harness.archive.exports import BEFORE_FINAL_RECONCILE, RUN_FILE, SUFFIX, export_paths
-from harness.archive.lag import LAG_FILE
 from harness.archive.record_file import read_record
+from harness.archive.run_journals import CHANNEL_FILE, LAG_FILE
 from harness.archive.run_record import RunRecord
 from harness.archive.trace_files import SUFFIX as TRACE_SUFFIX
 from harness.archive.trace_files import open_trace

@@ -5,7 +5,7 @@ collects the judgements. `survival.py` reports the blocks that were lost togethe
 loss of further vehicles would destroy.
 """
 
-from harness.checker._verdict import Result, check
+from harness.checker._verdict import Result, check, stored_differences
 from harness.checker.evidence import Evidence, gather
 
-__all__ = ["Evidence", "Result", "check", "gather"]
+__all__ = ["Evidence", "Result", "check", "gather", "stored_differences"]

@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import BaseModel, ConfigDict
 
 from harness.archive.archive import ReportProgress, RunArchive
-from harness.archive.channel_journal import ChannelLine
 from harness.archive.connectivity import Link
 from harness.archive.exports import Export, name_blocks
-from harness.archive.lag import MeasuredLag
 from harness.archive.packets.capture_files import DIRECTORY, Captures, capture_files, read_captures
+from harness.archive.run_journals import ChannelLine, MeasuredLag
 from harness.archive.run_record import AgentRecord, Counters, JudgedRecord, RemoteRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, UnknownNames, first_unknown, unknown_names

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from statistics import quantiles
 
-from harness.archive.lag import MeasuredLag
+from harness.archive.run_journals import MeasuredLag
 from harness.archive.traces import Trace
 
 ENOUGH = 20

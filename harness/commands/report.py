@@ -17,7 +17,7 @@ from rich.text import Text
 
 from harness import checker, report
 from harness.archive.archive import RunArchive
-from harness.checker import stored_verdict
+from harness.checker import stored_differences
 from harness.checker.survival import survival
 from harness.commands._shared_options import KeysOption, trusted_keys
 from harness.commands.terminal import (
@@ -85,7 +85,7 @@ def check_command(
 
             evidence = field_evidence(evidence, ingest_files(directories).largest())
         result, survived = checker.check(evidence), survival(evidence)
-    stored = [*stored_verdict.differences(archive.record, result, survived)]
+    stored = [*stored_differences(archive.record, result, survived)]
     differing = differing_versions(archive.record.versions, versions()) if archive.record.versions else []
     if as_json:
         used_programs = [program.to_json() for program in programs(archive.record)]

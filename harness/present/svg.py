@@ -17,6 +17,7 @@ FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', 'DejaVu 
 INK, QUIET, RULE, GROUND = "#1c2126", "#57616b", "#d9dee2", "#ffffff"
 COLOURS = ("#0072b2", "#a83900", "#00785a", "#8a3f74")
 """Colours of the lines in a chart: hues of Okabe and Ito, dark enough for text on a white background."""
+MOST_LOG_TICKS = 6
 CLASSES = ("first", "second", "third", "fourth")
 DASHES = ("", "6 3", "2 3", "9 3 2 3")
 TITLE_LENGTH = 80
@@ -82,8 +83,8 @@ def share_axis(place: tuple[float, float]) -> Axis:
     return Axis(0.0, 1.0, *place, [0.0, 0.25, 0.5, 0.75, 1.0])
 
 
-def log_axis(first: float, last: float, place: tuple[float, float], most: int = 6) -> Axis:
-    """Return a logarithmic axis that covers `first` to `last`, with at most `most` ticks.
+def log_axis(first: float, last: float, place: tuple[float, float]) -> Axis:
+    """Return a logarithmic axis that covers `first` to `last`, with at most `MOST_LOG_TICKS` ticks.
 
     The ticks are powers of ten, with further values between them if there is room.
     """
@@ -93,7 +94,7 @@ def log_axis(first: float, last: float, place: tuple[float, float], most: int = 
         low = max((tick for tick in ticks if tick <= first * (1 + 1e-9)), default=first)
         high = min((tick for tick in ticks if tick >= last * (1 - 1e-9) and tick > low), default=last)
         inside = [tick for tick in ticks if low <= tick <= high]
-        if len(inside) <= most:
+        if len(inside) <= MOST_LOG_TICKS:
             break
     return Axis(low, high, *place, inside, log=True)
 

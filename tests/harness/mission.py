@@ -65,4 +65,4 @@ def edit_lines(path: Path, change: Any) -> None:
     """Let `change` edit the list of documents in a JSON Lines file in place."""
     documents = [json.loads(line) for line in path.read_text().splitlines()]
     change(documents)
-    path.write_text("".join(json.dumps(document) + "\n" for document in documents))
+    path.write_text("".join(json.dumps(document, separators=(",", ":")) + "\n" for document in documents))

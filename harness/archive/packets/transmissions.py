@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from harness.archive.bounded_file import JsonLines
-from harness.archive.channel_journal import CHANNEL_FILE, ChannelLine
 from harness.archive.packets.capture_files import CaptureClock, Captures
 from harness.archive.packets.capture_reader import Capture, Datagram, ListenerName, MessageSummary
 from harness.archive.packets.pcap import OUTBOUND
+from harness.archive.run_journals import CHANNEL_FILE, ChannelLine
 
 Origin = Literal["captured", "inferred", "forged"]
 """The origin of a transmission. `captured` means that the capture of its sender contains it. `inferred` means that its

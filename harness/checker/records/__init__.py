@@ -14,7 +14,6 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.records import (
     _captures_vs_traces,
-    _conditions_vs_network,
     _counters,
     _datagrams_vs_traces,
     _export_vs_trace,
@@ -37,7 +36,7 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
     _counters.compare_completed_blocks,
     _heard_vs_sent.compare,
     _handled_vs_faults.compare,
-    _conditions_vs_network.compare,
+    _scenario_vs_record.compare_conditions,
     _scenario_vs_record.compare,
     _times.compare,
     _export_vs_trace.compare,

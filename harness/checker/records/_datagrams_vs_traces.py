@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterator
 from math import inf
 
-from harness.archive.channel_journal import ChannelLine
+from harness.archive.run_journals import ChannelLine
 from harness.archive.run_record import ChannelRecord, DatagramsRead
 from harness.archive.traces import Trace
 from harness.checker.evidence import Evidence

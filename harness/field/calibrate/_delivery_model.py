@@ -131,7 +131,7 @@ class _TransmissionCluster(NamedTuple):
     link: Hashable
 
 
-def fit(attempts: Sequence[TransmissionAttempt], *, with_load: bool = True) -> FittedModel | None:
+def fit(attempts: Sequence[TransmissionAttempt]) -> FittedModel | None:
     """Fit the model to transmissions. Return None if the transmissions do not determine the range and the spread.
 
     This is the case if all or no messages arrived, or if the distances hardly differ.
@@ -143,7 +143,7 @@ def fit(attempts: Sequence[TransmissionAttempt], *, with_load: bool = True) -> F
         return None
     if max(row.log_m for row in rows) - min(row.log_m for row in rows) < math.log(1.2):
         return None
-    free = [0, 1, 2, *([3] if with_load and len({row.others for row in rows}) > 1 else [])]
+    free = [0, 1, 2, *([3] if len({row.others for row in rows}) > 1 else [])]
     values, likelihood = max((_maximise(cells, start, free) for start in _starts(rows, free)), key=itemgetter(1))
     if not _LOWEST[0] < values[0] < _HIGHEST[0] - 1 or values[1] > _HIGHEST[1] - 0.01:
         return None

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from harness.archive.channel_journal import CHANNEL_FILE
 from harness.archive.directory import RunDirectory
+from harness.archive.run_journals import CHANNEL_FILE
 from harness.archive.run_record import ChannelRecord
 from harness.errors import MachineError
 from harness.play.agent_control import AgentRefusedError, AgentSilentError

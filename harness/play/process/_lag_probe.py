@@ -1,7 +1,7 @@
 """Measure how late this machine wakes up programs, and how long each agent waits for a processor.
 
 The harness runs this program during a mission. It writes JSON lines to the file in its first argument, and ends when
-its standard input ends. `harness.archive.lag` describes a line.
+its standard input ends. `harness.archive.run_journals` describes a line.
 
 A timer of an agent expires late for two reasons:
 

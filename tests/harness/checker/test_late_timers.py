@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from harness.archive.archive import RunArchive
-from harness.archive.lag import LAG_FILE, LagLine, MeasuredLag
+from harness.archive.run_journals import LAG_FILE, LagLine, MeasuredLag
 from harness.archive.traces import Trace, TraceHeader
 from harness.checker import check, gather
 from harness.checker.judgement import Judgement

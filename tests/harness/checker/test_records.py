@@ -9,7 +9,6 @@ import shutil
 import socket
 import struct
 import tracemalloc
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from harness.checker import Result, check, gather
 from harness.play.progress import SilentProgress
 from harness.run.run import run
 from netem import addresses
+from tests.harness.mission import edit, edit_lines
 from tests.harness.virtual import scenario
 from ucp.block import next_chain_hash
 
@@ -54,18 +54,6 @@ def directory(whole: Path, tmp_path: Path) -> Path:
 
 def judged(directory: Path) -> Result:
     return check(gather(RunArchive(directory)))
-
-
-def edit(path: Path, change: Callable[[Document], None]) -> None:
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document))
-
-
-def edit_lines(path: Path, change: Callable[[list[Document]], Any]) -> None:
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    change(lines)
-    path.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
 
 
 def trace(directory: Path, agent: int) -> Path:

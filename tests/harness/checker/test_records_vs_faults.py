@@ -24,6 +24,7 @@ from harness.checker.records import _losses
 from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import simulate
+from tests.harness.mission import edit, edit_lines
 from tests.harness.virtual import scenario
 from ucp.trigger import MessageTrigger
 
@@ -63,18 +64,6 @@ def found(directory: Path) -> str:
     judgement = check(gather(RunArchive(directory))).beside["records"]
     assert judgement.verdict == "contradict"
     return "\n".join(finding.detail for finding in judgement.evidence)
-
-
-def edit(path: Path, change: Callable[[Document], Any]) -> None:
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document))
-
-
-def edit_lines(path: Path, change: Callable[[list[Document]], Any]) -> None:
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    change(lines)
-    path.write_text("".join(json.dumps(line, separators=(",", ":")) + "\n" for line in lines))
 
 
 def edit_scenario(change: Callable[[Document], Any]) -> Edit:

@@ -26,6 +26,7 @@ from harness.run import provenance
 from harness.run.code_state import ROOT
 from harness.run.run import run
 from tests.harness.command import harness, sentences
+from tests.harness.mission import edit
 from tests.harness.virtual import scenario
 
 
@@ -41,12 +42,6 @@ def directory(stored: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def edit(directory: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    record = json.loads((directory / "run.json").read_text())
-    change(record)
-    (directory / "run.json").write_text(json.dumps(record))
-
-
 EDITS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda record: record["characteristics"]["3"].update(verdict="violated"), "'violated' for characteristic 3"),
     (lambda record: record["steps"].update(verdict="deviates"), "'deviates' for `every step`"),
@@ -59,7 +54,7 @@ EDITS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
 def test_check_reports_another_stored_verdict(
     directory: Path, change: Callable[[dict[str, Any]], Any], expected: str
 ) -> None:
-    edit(directory, change)
+    edit(directory / "run.json", change)
     assert expected in harness("check", directory).stderr
 
 
@@ -88,7 +83,7 @@ def test_run_edited_after_its_end_is_status_1(tmp_path: Path) -> None:
     assert played.returncode == 0, played.stdout + played.stderr
     assert command("check", tmp_path / "run").returncode == 0
 
-    edit(tmp_path / "run", EDITS[0][0])
+    edit(tmp_path / "run" / "run.json", EDITS[0][0])
     checked = command("check", tmp_path / "run")
     assert checked.returncode == 1
     assert "run.json has 'violated' for characteristic 3, but its files give 'holds'" in checked.stderr
@@ -103,7 +98,7 @@ def test_unaltered_run_has_its_stored_verdict(directory: Path) -> None:
 
 
 def test_check_and_diff_name_differing_versions(directory: Path, stored: Path) -> None:
-    edit(directory, lambda record: record["versions"].update(reference="0123456789ab"))
+    edit(directory / "run.json", lambda record: record["versions"].update(reference="0123456789ab"))
     assert "differ in reference 0123456789ab and" in harness("check", directory).stdout
     assert "versions of A and B: reference" in harness("diff", stored, directory).stdout
 

@@ -12,6 +12,7 @@ from harness.errors import RunDirectoryError
 from harness.field.depot.mission_comparison import MissionComparison, compare
 from harness.field.depot.mission_files import Manifest, MissionFileError, MissionPlan, write
 from tests.harness.command import harness, sentences
+from tests.harness.mission import edit
 from tests.harness.virtual import scenario
 from ucp.agent import Agent
 from ucp.block import InceptionBlock
@@ -29,13 +30,6 @@ DATA = b"the second field test"
 def directory(tmp_path: Path) -> Path:
     write(MissionPlan(scenario(agents=ROSTER, name="field"), DATA), tmp_path / "mission")
     return tmp_path / "mission"
-
-
-def edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document))
-    return path
 
 
 def sentences_of(comparison: MissionComparison) -> list[str]:
@@ -193,8 +187,10 @@ def test_each_difference_names_file_and_key(
     directory: Path, change: Callable[[dict[str, Any]], Any], key: str | None, words: str
 ) -> None:
     for manifest in (True, False):
-        path = edit(directory / "122.mission.json", change if manifest else lambda document: None)
-        if not manifest:
+        path = directory / "122.mission.json"
+        if manifest:
+            edit(path, change)
+        else:
             (directory / "manifest.json").unlink()
         comparison = compare([directory])
         if key is None:
@@ -209,7 +205,8 @@ def test_each_difference_names_file_and_key(
 
 def test_shared_seed_is_reported(directory: Path) -> None:
     seed = load_mission(directory / "10.mission.json").seed
-    path = edit(directory / "28.mission.json", lambda document: document.update(seed=seed))
+    path = directory / "28.mission.json"
+    edit(path, lambda document: document.update(seed=seed))
     (difference,) = compare([directory]).differences
     assert (difference.file, difference.key) == (path, "seed")
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from harness.archive.directory import RunDirectory
-from harness.archive.lag import LagLine, MeasuredLag
+from harness.archive.run_journals import LagLine, MeasuredLag
 from harness.errors import HarnessError, ScenarioError
 from harness.play.backends import BACKENDS
 from harness.play.remote._remote_agents import RemoteAgents

@@ -1,5 +1,4 @@
-"""Create runs to export: a simulated run without telemetry, and a telemetry log for it. All tests share one run.
-"""
+"""Create runs to export: a simulated run without telemetry, and a telemetry log for it. All tests share one run."""
 
 from pathlib import Path
 from typing import Any

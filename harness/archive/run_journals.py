@@ -1,7 +1,8 @@
-"""Read `lag.jsonl`. It contains the measured delays with which the machine woke programs during a run, and the load of
-each agent's processes.
+"""Define the lines of `lag.jsonl` and `channel.jsonl`.
 
-`harness/play/process/_lag_probe.py` writes this file.
+`lag.jsonl` contains the measured delays with which the machine woke programs during a run, and the load of each agent's
+processes. `harness/play/process/_lag_probe.py` writes this file. `channel.jsonl` is the log of a shared radio channel.
+Each line describes a message that a radio sent or dropped.
 """
 
 from bisect import bisect_left
@@ -60,3 +61,23 @@ class MeasuredLag:
         if any(agent not in line.busy_s for line in lines):
             return None
         return sum(line.machine_s + line.busy_s[agent] for line in lines)
+
+
+CHANNEL_FILE = "channel.jsonl"
+
+Reason = Annotated[str, Field(max_length=20)]
+
+
+class ChannelLine(BaseModel):
+    """One message on the shared channel: its receivers and losses. `sequence` is the sequence number of the message, or
+    None for a datagram that is not a message of the vehicle's agent.
+    """
+
+    model_config = ConfigDict(strict=True, defer_build=True)
+
+    sender: int
+    sequence: int | None
+    lost: dict[Reason, list[int]] = {}
+    """Reason -> vehicles that lost the message."""
+    dropped: Reason | None = None
+    """The reason why the radio did not send the message. None if it was sent."""
