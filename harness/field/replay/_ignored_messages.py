@@ -9,6 +9,7 @@ had an effect count, because simulated agents do not receive others.
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from typing import Protocol
 
 from harness.checker.recorded_inputs import decoded
@@ -22,6 +23,10 @@ from ucp.trigger import MessageTrigger
 MAX_PLACES = 3
 """Maximum number of places at which messages may lack a trace line. If there are more such places, lost lines and a
 full socket are no sufficient explanation.
+"""
+MAX_CLOCK_STEP_S = 1.0
+"""Maximum change of the difference between the clocks of trace and capture from one common message to the next, in
+mission seconds. After a larger change, the position of a message between the two is not known.
 """
 MAX_TRIED = 200
 """Maximum number of messages without a line for which the effect is computed."""
@@ -71,19 +76,39 @@ def _without_line(record: RecordedTrace) -> Iterator[tuple[int, CapturedDatagram
     """Yield the messages that arrived at the agent but that its trace does not contain. Yield each message with the
     position of the trace entry that follows the arrival. Messages before the first entry or after the last entry of an
     incarnation are skipped.
+
+    The messages in both trace and capture show the difference between the clocks of the two files. A message during
+    which one clock was set is skipped, because its position in the trace is not known.
     """
-    known = {(run.sender, run.sequence) for entry in record.entries if (run := _received(entry)) is not None}
+    arrivals = record.arrivals or []
     times = [entry.content.t for entry in record.entries]
+    lines: dict[tuple[int, int], list[int]] = {}
+    for position, entry in enumerate(record.entries):
+        if (trigger := _received(entry)) is not None:
+            lines.setdefault((trigger.sender, trigger.sequence), []).append(position)
+    with_line: list[tuple[float, int]] = []
+    for seen in arrivals:  # a restarted sender uses its sequence numbers again
+        if candidates := lines.get((seen.sender, seen.sequence)):
+            nearest = min((abs(times[position] - seen.at_s), position) for position in candidates)[1]
+            with_line.append((seen.at_s, nearest))
+    captured = [at_s for at_s, _ in with_line]
     tried = 0
-    for sighting in record.arrivals or ():
-        if (sighting.sender, sighting.sequence) in known or sighting.sender not in record.header.roster:
+    for sighting in arrivals:
+        if (sighting.sender, sighting.sequence) in lines or sighting.sender not in record.header.roster:
             continue
-        position = bisect_right(times, sighting.at_s)
+        later = bisect_right(captured, sighting.at_s)
+        around = [(times[line] - at_s, line) for at_s, line in with_line[max(later - 1, 0) : later + 1]]
+        offsets = [offset_s for offset_s, _ in around] or [0.0]
+        start = around[0][1] if later else 0
+        end = around[-1][1] if later < len(with_line) else len(times)
+        if max(offsets) - min(offsets) > MAX_CLOCK_STEP_S or start > end:
+            continue
+        position = bisect_right(times, sighting.at_s + offsets[0], start, end)
         if not 0 < position < len(times) or tried == MAX_TRIED:
             continue
         if record.entries[position - 1].incarnation == record.entries[position].incarnation:
             tried += 1
-            yield position, sighting
+            yield position, replace(sighting, at_s=sighting.at_s + offsets[0])
 
 
 def _received(entry: RecordEntry) -> MessageTrigger | None:

@@ -6,10 +6,12 @@ import dataclasses
 import json
 import re
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
 
+from benchmarks import field_damage
 from benchmarks.field_damage import bring_home
 from harness.field.replay import RecordPlayer, ReplayResult, open_record
 from harness.play.progress import SilentProgress
@@ -161,3 +163,13 @@ def test_silently_ignored_messages_are_found_in_a_capture(monkeypatch: pytest.Mo
     for capture in (tmp_path / "home").glob("*.pcapng"):
         capture.unlink()
     assert RecordPlayer(open_record(tmp_path / "home", 2)).to_end().deviations == []
+
+
+def test_clock_set_back_is_no_ignored_message(tmp_path: Path) -> None:
+    """Messages without an effect have no line in a simulated trace. If the clock of the trace is wrong, they must not
+    count as ignored.
+    """
+    flight, home = field_damage.scenario(9, "sim"), tmp_path / "home"
+    bring_home(flight, 9, "sim", tmp_path / "run", home)
+    field_damage.set_clock_back(home, Random("9 clock set back"))
+    assert RecordPlayer(open_record(home, 1)).to_end().deviations == []
