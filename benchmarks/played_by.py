@@ -73,7 +73,8 @@ def shell(seed: int) -> int:
     """
     with TemporaryDirectory() as directory:
         command = [sys.executable, "-m", "harness.cli", "run", "loss_15", "--backend", "sim", "--seed", str(seed)]
-        subprocess.run([*command, "--out", f"{directory}/run"], stdout=subprocess.DEVNULL, check=True)
+        # `-m` finds modules in the working directory first, and another revision may be there
+        subprocess.run([*command, "--out", f"{directory}/run"], stdout=subprocess.DEVNULL, cwd=directory, check=True)
     return 1
 
 
