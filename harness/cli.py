@@ -17,6 +17,7 @@ Exit statuses, of which `docs/reference/commands.md` has a table:
 
 # ruff: noqa: E402  (an interrupt during the imports must be quiet)
 
+import gc
 import os
 import signal
 import sys
@@ -37,8 +38,12 @@ def _interrupts_are_quiet(quiet: bool) -> None:
         signal.signal(signal.SIGINT, handlers[0])
 
 
-if __name__ == "__main__" or os.path.basename(sys.argv[0]) == "ucp-harness":  # noqa: PTH119  (pathlib takes 10 ms)
+_IS_PROGRAM = __name__ == "__main__" or os.path.basename(sys.argv[0]) == "ucp-harness"  # noqa: PTH119  (slow)
+"""True if this process is the program `ucp-harness`. False if another program imports this module."""
+
+if _IS_PROGRAM:
     _interrupts_are_quiet(True)
+    gc.disable()  # until the module of the command is imported
 
 import errno
 import io
@@ -51,7 +56,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from harness.errors import WRONG_REQUEST, HarnessError, InterruptedRunError, MachineError
-from harness.gc_pause import gc_paused
+from harness.gc_pause import gc_paused, resume_collection
 
 MAX_NAME = 200
 """Maximum number of characters of a file name in an error."""
@@ -210,6 +215,8 @@ class LazyCommandGroup(TyperGroup):
         if args and args[0] in COMMANDS:
             self.add_command(load_command(args[0]), args[0])
             _interrupts_are_quiet(False)
+            if _IS_PROGRAM:
+                resume_collection()
         elif args and args[0] in OLD_NAMES and not ctx.resilient_parsing:
             raise OldCommandNameError(f"`{args[0]}` is now {OLD_NAMES[args[0]]}: run that")
         return super().resolve_command(ctx, args)

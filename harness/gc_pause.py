@@ -19,6 +19,11 @@ def gc_paused() -> Iterator[None]:
         yield
     finally:
         if collects:
-            gc.freeze()
-            gc.unfreeze()  # new objects count as old now, so that the collector does not scan them at once
-            gc.enable()
+            resume_collection()
+
+
+def resume_collection() -> None:
+    """Start the garbage collection of cycles again."""
+    gc.freeze()
+    gc.unfreeze()  # new objects count as old now, so that the collector does not scan them at once
+    gc.enable()

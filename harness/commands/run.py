@@ -21,7 +21,6 @@ from harness.play import progress
 from harness.play.backends import BACKENDS
 from harness.play.interventions import Interventions
 from harness.play.machine.uml_kernel import OUT, UmlKernel, run_inside
-from harness.play.remote.join import join_commands
 from harness.play.trace_space import space_sentence
 from harness.report.facts import cut_off, gaps
 from harness.report.live.server_process import live_page
@@ -173,8 +172,11 @@ def run_command(
     console.print(f"{request.name}, seed {chosen_seed}, into {directory}", highlight=False, soft_wrap=True)
     if wrong := ", ".join(quirks_in_words(request.quirks)):
         console.print(f"deliberate mistakes: {wrong}", style="dim", highlight=False)
-    for command in join_commands(request):
-        console.print(f"on its computer: {command}", highlight=False, soft_wrap=True)
+    if request.remote is not None:
+        from harness.play.remote.join import join_commands
+
+        for command in join_commands(request):
+            console.print(f"on its computer: {command}", highlight=False, soft_wrap=True)
     if remark := BACKENDS[backend].remark(request):
         console.print(remark, style="dim")
     virtual = BACKENDS[backend].virtual_time

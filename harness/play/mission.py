@@ -59,7 +59,7 @@ class RunOutcome:
     ground_station: GroundStationRecord | None = None
     remote: dict[str, RemoteRecord] = field(default_factory=dict)
     unmatched_fates: list[str] = field(default_factory=list)
-    traces: dict[int, Trace] | None = None
+    traces: dict[int, Trace] | None = field(default=None, repr=False)  # asyncio builds the text of a result
     """The trace of each agent, with the same content as the files in the run directory. The value is None if the traces
     are only in files.
     """

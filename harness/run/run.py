@@ -34,7 +34,6 @@ from harness.gc_pause import gc_paused
 from harness.play import mission
 from harness.play.backend import Backend
 from harness.play.backends import BACKENDS, in_virtual_time
-from harness.play.hosts.hosts_backend import HostsBackend
 from harness.play.interventions import Interventions
 from harness.play.mission import RunOutcome
 from harness.play.progress import ProgressDisplay, SilentProgress
@@ -120,7 +119,11 @@ def run(
     """
     progress = progress or SilentProgress()
     out = out or default_path(scenario.name)
-    chosen = BACKENDS[backend] if scheduler is None else HostsBackend(scheduler)
+    chosen = BACKENDS[backend]
+    if scheduler is not None:
+        from harness.play.hosts.hosts_backend import HostsBackend
+
+        chosen = HostsBackend(scheduler)
     if chosen.name != backend:
         raise ScenarioError(f"--scheduler does not work with --backend {backend}: leave out one of them")
     chosen.refuse(scenario)
