@@ -49,6 +49,9 @@ NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitB
 without effect.
 """
 
+_SentMessage = tuple[float, tuple[int, str, int]]
+"""A sent message: the mission second, and the message as (sender, type, sequence number)."""
+
 MAX_CHANCE = 1e-12
 """Probability below which an observation counts as impossible."""
 
@@ -105,26 +108,34 @@ class _LossHistory:
         # The smallest and largest probability that a link sends no second copy, from each of `_changed_at` on:
         self._fewest = [min(shares) for shares in single]
         self._most = [max(shares) for shares in single]
+        self._ranges: dict[tuple[Link, int, int, int, int], tuple[float, float]] = {}
+        """The results of `range_at`, by link and by the positions of the values that are in effect."""
 
     def range_at(self, link: Link, sent_s: float) -> tuple[float, float]:
         """Return the minimum and maximum probability that the link loses all copies at this time. The clock slack
         before and after this time is included.
         """
-        losses = self._around(self._times[link], self._losses[link], sent_s)
-        fewest = min(self._around(self._changed_at, self._fewest, sent_s))
-        most = max(self._around(self._changed_at, self._most, sent_s))
+        earliest, latest = sent_s - self._slack_s, sent_s + self._slack_s
+        times, changed_at = self._times[link], self._changed_at
+        first, end = bisect_right(times, earliest), bisect_right(times, latest)
+        first_change, end_change = bisect_right(changed_at, earliest), bisect_right(changed_at, latest)
+        key = link, first, end, first_change, end_change
+        if (known := self._ranges.get(key)) is not None:
+            return known
+        losses = self._around(self._losses[link], first, end)
+        fewest = min(self._around(self._fewest, first_change, end_change))
+        most = max(self._around(self._most, first_change, end_change))
         # No copy passes a partition, but a second copy passes a link that loses every first copy.
         highest = max(losses)
-        return min(losses) * fewest, highest if highest == 1.0 else highest * most
+        found = self._ranges[key] = min(losses) * fewest, highest if highest == 1.0 else highest * most
+        return found
 
-    def _around(self, times: list[float], values: list[float], sent_s: float) -> list[float]:
-        """Return the values in effect at this time, and during the clock slack before and after it. A value takes
-        effect at the time with the same index in `times`.
+    def _around(self, values: list[float], first: int, end: int) -> list[float]:
+        """Return the values in effect during the clock slack around a time. `first` and `end` are the numbers of values
+        that took effect before the slack and until its end.
         """
-        if len(values) == 1:
-            return values
-        first = max(0, bisect_right(times, sent_s - self._slack_s) - 1)
-        return values[first : max(first + 1, bisect_right(times, sent_s + self._slack_s))]
+        first = max(0, first - 1)
+        return values[first : max(first + 1, end)]
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
@@ -188,35 +199,53 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
     duplicates = any(link.duplicate > 0 for link in evidence.requested_links or ())
     known = {link for _, losses in evidence.link_losses for link in losses}
     expected: dict[int, _ExpectedDeliveries] = {}
+    messages: dict[frozenset[str] | None, dict[int, list[_SentMessage]]] = {}
     for receiver, trace in evidence.traces.items():
         seen = expected[receiver] = _ExpectedDeliveries(dropped=trace.dropped().total())
         ready = _ReadyTimes(evidence, receiver) if in_virtual_time(trace) else None
         counted = None if ready is None else ready.counted
+        if counted not in messages:
+            messages[counted] = _sent(evidence, counted, duplicates)
         triggers = [run.trigger for run in trace.runs if isinstance(run.trigger, MessageTrigger)]
         handled = Counter(
-            (trigger.sender, trigger.message, trigger.sequence)
-            for trigger in triggers
-            if counted is None or trigger.message in counted
+            [
+                (trigger.sender, trigger.message, trigger.sequence)
+                for trigger in triggers
+                if counted is None or trigger.message in counted
+            ]
         )
-        for sender, by_type in evidence.sendings.items():
-            if (sender, receiver) not in known:
+        for sender, sent in messages[counted].items():
+            link = sender, receiver
+            if link not in known:
                 continue
-            for message, by_sequence in by_type.items():
-                if counted is not None and message not in counted:
+            for sent_s, key in sent:
+                if ready is not None and not ready.handles(sent_s):
                     continue
-                for sequence, sent in by_sequence.items():
-                    if len(sent) > 1 and duplicates:
-                        continue  # two incarnations sent it, and the copies of which one were handled is unknown
-                    for sent_s, _ in sent:
-                        if ready is not None and not ready.handles(sent_s):
-                            continue
-                        range_at = history.range_at((sender, receiver), sent_s)
-                        seen.add(over_cuts if over_cuts is not None and range_at[1] == 1.0 else range_at)
-                        key = sender, message, sequence
-                        if handled[key] > 0:
-                            handled[key] -= 1
-                            seen.handled += 1
+                range_at = history.range_at(link, sent_s)
+                seen.add(over_cuts if over_cuts is not None and range_at[1] == 1.0 else range_at)
+                if handled[key] > 0:
+                    handled[key] -= 1
+                    seen.handled += 1
     return expected
+
+
+def _sent(evidence: Evidence, counted: frozenset[str] | None, duplicates: bool) -> dict[int, list[_SentMessage]]:
+    """Return the messages of these types that each agent sent. None stands for all types.
+
+    If the network duplicates messages, the result omits messages that two incarnations of an agent sent. It is unknown
+    whose copies a receiver handled.
+    """
+    return {
+        sender: [
+            (sent_s, (sender, message, sequence))
+            for message, by_sequence in by_type.items()
+            if counted is None or message in counted
+            for sequence, sent in by_sequence.items()
+            if len(sent) == 1 or not duplicates
+            for sent_s, _ in sent
+        ]
+        for sender, by_type in evidence.sendings.items()
+    }
 
 
 class _ReadyTimes:
