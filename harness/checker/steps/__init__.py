@@ -31,7 +31,7 @@ NAME = "every step"
 
 
 def first_cause(judgement: Judgement | None) -> str | None:
-    """Return what the verdict `deviates` is about: the handler of the first step that deviates, or the edited files of
+    """Return the subject of the verdict `deviates`: the handler of the first step that deviates, or the edited files of
     the code that judge and agents share. Return None for other verdicts, and if neither is known.
     """
     if judgement is None or judgement.verdict != "deviates":
