@@ -32,14 +32,7 @@ from harness.archive.record_file import RecordFile, read_record
 from harness.archive.run_journals import CHANNEL_FILE, LAG_FILE, ChannelLine, LagLine, MeasuredLag
 from harness.archive.run_record import AgentRecord, JudgedRecord, RunRecord
 from harness.archive.trace_files import MAX_TRACE_BYTES, is_packed, trace_file, trace_files
-from harness.archive.traces import (
-    HandlerRunLine,
-    Trace,
-    read_clock,
-    read_trace,
-    read_trace_lines,
-    why_not_a_trace,
-)
+from harness.archive.traces import HandlerRunLine, Trace, read_clock, read_trace, read_trace_lines, why_not_a_trace
 from harness.archive.tracks import TRACKS_FILE, VehicleTracks, read_tracks
 from harness.errors import RunDirectoryError
 from ucp.trace import HandlerRun

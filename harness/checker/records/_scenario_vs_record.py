@@ -15,13 +15,7 @@ from itertools import pairwise
 from harness.archive.run_record import FaultRecord, JudgedRecord, NetworkState
 from harness.checker.evidence import Evidence, NetworkLogEntry
 from harness.checker.judgement import agents
-from harness.checker.records.contradiction import (
-    ROUNDED_S,
-    Contradiction,
-    in_virtual_time,
-    of_agent,
-    slack_s,
-)
+from harness.checker.records.contradiction import ROUNDED_S, Contradiction, in_virtual_time, of_agent, slack_s
 from harness.scenario import Scenario
 from harness.scenario.changes import FINAL_RECONCILE, NO_MORE_FATES, RANGE, Change, timeline_of
 from harness.scenario.faults import Fault

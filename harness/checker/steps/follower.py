@@ -12,14 +12,7 @@ from typing import Any, NamedTuple
 
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import branch_is_known, tally_is_known, timer_that_ended, timers_are_known
-from harness.checker.recorded_inputs import (
-    BlockIndex,
-    NotOnRecordError,
-    decoded,
-    event_of,
-    sealed_of,
-    stored_blocks,
-)
+from harness.checker.recorded_inputs import BlockIndex, NotOnRecordError, decoded, event_of, sealed_of, stored_blocks
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_LOCAL_EVENT, ON_TIMER
 from harness.checker.reference.state import Handler, ReferenceState, Timer

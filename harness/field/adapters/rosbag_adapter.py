@@ -25,11 +25,7 @@ from typing import Any, ClassVar
 
 from harness.errors import MachineError, extra
 from harness.field.adapters.adapter import Adapter, ChainExport, Datagram, LoggedEvent, Observation, TraceLine, Unusable
-from harness.field.adapters.bags import (
-    MAGICS,
-    BagMessage,
-    messages,
-)
+from harness.field.adapters.bags import MAGICS, BagMessage, messages
 from harness.field.adapters.bags._decompression import UnreadablePart, message_data
 
 METADATA = "metadata.yaml"

@@ -12,14 +12,7 @@ from harness.checker.reference.reference_agent import ReferenceAgent
 from harness.checker.reference.state import Handler, Settings, Timer
 from ucp.block import Block, next_chain_hash
 from ucp.events import LoggableEvent
-from ucp.messages import (
-    BlockAddResponse,
-    ChainContainResponse,
-    CommitBlock,
-    Datagram,
-    Message,
-    NextInSequenceResponse,
-)
+from ucp.messages import BlockAddResponse, ChainContainResponse, CommitBlock, Datagram, Message, NextInSequenceResponse
 from ucp.store import StoredState
 from ucp.trace import Tally
 

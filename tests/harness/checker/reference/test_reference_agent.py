@@ -20,12 +20,7 @@ from tests.harness.checker.reference.driver import (
     trace,
 )
 from ucp.events import LoggableEvent
-from ucp.messages import (
-    BlockResponse,
-    ChainContainQuery,
-    CommitBlock,
-    Message,
-)
+from ucp.messages import BlockResponse, ChainContainQuery, CommitBlock, Message
 
 # Driver
 
