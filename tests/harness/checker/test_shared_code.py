@@ -5,11 +5,9 @@ from collections.abc import Iterator
 import pytest
 
 from harness.archive import vocabulary
-from harness.checker import Result
 from harness.checker.judgement import Judgement
 from harness.checker.reference import algorithms
-from harness.checker.steps import _shared_code
-from harness.sweep.matrix._cell_play import _first_deviation
+from harness.checker.steps import _shared_code, first_cause
 from tests.harness.test_rooms import imports, modules
 from ucp.agent import HANDLERS, ON_MESSAGE, ON_TIMER
 from ucp.quirks import CRASHED, QUIRKS
@@ -79,4 +77,4 @@ def test_names_of_the_judge_are_those_of_core_and_reference() -> None:
 
 def test_matrix_names_no_handler_if_the_judge_found_none() -> None:
     broken = Judgement("every step", "deviates", "ucp/block.py was edited and contradicts the agent contract")
-    assert _first_deviation(Result({}, {}, {"steps": broken})) is None
+    assert first_cause(broken) is None
