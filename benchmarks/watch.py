@@ -20,9 +20,8 @@ from tempfile import TemporaryDirectory
 import aiohttp
 
 from harness.play.progress import SilentProgress
-from harness.report.live.change_log import ChangeLog
 from harness.report.live.feed import ChangeFeed
-from harness.report.live.server import UPDATE_S, LivePageServer
+from harness.report.live.server import UPDATE_S, ChangeLog, LivePageServer
 from harness.run.run import run
 from harness.scenario import Scenario
 

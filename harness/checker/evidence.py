@@ -23,9 +23,9 @@ from harness.archive.run_journals import ChannelLine, MeasuredLag
 from harness.archive.run_record import AgentRecord, Counters, JudgedRecord, RemoteRecord
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import Kind, UnknownNames, first_unknown, unknown_names
-from harness.checker._sent_times import sent_at, spread_of
 from harness.checker._trace_replay import ReplayedIncarnation, replay
 from harness.checker.judgement import Judgement
+from harness.checker.recorded_inputs import sent_at, spread_of
 from harness.checker.reference.state import ReferenceState
 from harness.checker.signatures import TrustedKeys, are_signed
 from harness.errors import RunDirectoryError

@@ -12,8 +12,7 @@ from harness.commands.terminal import complain, print_lines
 from harness.errors import WRONG_REQUEST, ExportError
 from harness.report import logbook
 from harness.report.logbook.logbook_text import document, lines
-from harness.report.logbook.map_files import geojson, kml
-from harness.report.logbook.positions import EventTrack, recorded_tracks, tracks
+from harness.report.logbook.positions import EventTrack, geojson, kml, recorded_tracks, tracks
 
 
 def chain_command(

@@ -19,8 +19,7 @@ from harness.field.depot.collected_exports import collect_exports
 from harness.field.depot.consolidation import MergedRecord, consolidate
 from harness.field.depot.record_lines import ReconcileResult
 from harness.field.depot.record_outputs import in_words
-from harness.report.logbook.map_files import geojson, kml
-from harness.report.logbook.positions import EventTrack
+from harness.report.logbook.positions import EventTrack, geojson, kml
 
 if TYPE_CHECKING:
     from harness.field.depot.depot_reconcile import ReconciledExports

@@ -14,7 +14,7 @@ from harness.play.variant import Variant, load_variant
 from harness.run.parallel import cores
 from harness.run.variant_in_force import in_force
 from harness.sweep import matrix
-from harness.sweep.matrix import matrix_outputs, matrix_summary, matrix_table
+from harness.sweep.matrix import matrix_outputs, matrix_table
 from harness.sweep.matrix import nights as nights_of_matrix
 from harness.sweep.matrix.matrix_run import Spread, compare_with, name_changes, name_culprits, on_cluster, on_cores
 from harness.sweep.matrix.nights import load_baseline
@@ -116,7 +116,7 @@ def matrix_command(
     if finished.record.outcome == "interrupted":
         complain(f"to continue, repeat the command with --out {directory}")
     if finished.record.tried is not None and not as_json:
-        print_lines(matrix_summary.describe_coverage(finished.record.tried))
+        print_lines(matrix_table.describe_coverage(finished.record.tried))
     end_sweep(finished.record, None if as_json else matrix_table.render(finished.record), directory / "report.html")
 
 

@@ -137,8 +137,7 @@ def watch_command(
 
 
 async def _show(feed: "ChangeFeed", run: Path, port: int) -> None:
-    from harness.report.live.change_log import ChangeLog
-    from harness.report.live.server import LivePageServer, copy_finished_run
+    from harness.report.live.server import ChangeLog, LivePageServer, copy_finished_run
 
     with closing(ChangeLog()) as log:
         async with LivePageServer(log, run, live=False).open(port) as address:

@@ -28,7 +28,7 @@ from harness.conformance._state_space import (
     explore,
     handlers_and_messages,
 )
-from harness.conformance._virtual_lines import LineWriter, VirtualLine
+from harness.conformance._virtual_agent import LineWriter, VirtualLine
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from harness.checker._sent_times import sent_at
+from harness.checker.recorded_inputs import sent_at
 from harness.scenario import Scenario
 from ucp._answer_spread import answer_wait_s
 from ucp.agent import Agent

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 from harness.archive.packets.capture_files import Captures
 from harness.archive.packets.pcap import INBOUND, OUTBOUND
-from harness.checker._sent_times import sent_at, spread_of
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import times
+from harness.checker.recorded_inputs import sent_at, spread_of
 from harness.checker.records.contradiction import Contradiction, of_agent, slack_s
 from ucp.trigger import MessageTrigger
 

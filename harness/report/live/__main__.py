@@ -15,9 +15,8 @@ from typing import Any
 
 from harness.archive.exports import RUN_FILE
 from harness.errors import HarnessError
-from harness.report.live.change_log import ChangeLog
 from harness.report.live.feed import ChangeFeed, RunClock
-from harness.report.live.server import UPDATE_S, LivePageServer, copy_live_run
+from harness.report.live.server import UPDATE_S, ChangeLog, LivePageServer, copy_live_run
 
 MAX_UNWATCHED_S = 3.0
 """If no page is open for this number of seconds, the server ends. A page that is reloaded connects again within this

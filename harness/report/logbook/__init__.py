@@ -1,6 +1,6 @@
 """Print the logbook of a swarm: all events in its chains, as text, JSON, GeoJSON and KML.
 
-`read` reads the exports, `logbook_text` prints chain by chain, and `positions` and `map_files` make tracks for maps.
+`read` reads the exports, `logbook_text` prints chain by chain, and `positions` makes tracks for maps.
 The checker judges whether the chains are correct.
 
 `EventData` decodes the event data of blocks, and decrypts them if the key is known. In a secured mission, agents may

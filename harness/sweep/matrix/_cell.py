@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from harness.backend_names import BackendName
 from harness.scenario.verdict_names import RUN_CHECKS, UNFINISHED, Verdict, kind_of
-from harness.sweep.matrix import _growth_metrics
+from harness.sweep.matrix import _estimate
 from harness.sweep.matrix._estimate import BEFORE_FINAL_RECONCILE, METRICS, Estimate, estimate_share
 from harness.sweep.matrix._matrix_file import MatrixPoint, MatrixTask
 
@@ -97,7 +97,7 @@ def sum_up(point: MatrixPoint, runs: Sequence[Run], *, grows: bool = False) -> C
     unsupported = sum(run.unsupported is not None for run in runs)
     judged = [run for run in runs if run.judged]
     estimates = {metric.name: metric.estimate(run.figures for run in judged) for metric in METRICS}
-    further = BEFORE_FINAL_RECONCILE + (_growth_metrics.METRICS if grows else ())
+    further = BEFORE_FINAL_RECONCILE + (_estimate.GROWTH_METRICS if grows else ())
     known = {metric.name: metric.estimate(run.figures for run in judged) for metric in further}
     verdicts = {key: {run.seed: run.verdicts[key] for run in judged if key in run.verdicts} for key in RUN_CHECKS}
     bad = {key: [seed for seed, verdict in by_seed.items() if is_wrong(verdict)] for key, by_seed in verdicts.items()}

@@ -34,7 +34,7 @@ from harness.proof.coverage.reached import simulate_watched
 from harness.run.run import run
 from harness.scenario import Scenario
 from harness.sweep.matrix._cell import Run
-from harness.sweep.matrix._growth_metrics import growth_figures
+from harness.sweep.matrix._estimate import growth_figures
 from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint, MatrixTask
 from ucp.trace import HandlerRun
 

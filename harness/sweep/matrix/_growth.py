@@ -18,8 +18,7 @@ from pydantic import BaseModel, ConfigDict
 
 from harness.backend_names import BackendName
 from harness.sweep.matrix._cell import Cell, Run
-from harness.sweep.matrix._estimate import CONFIDENCE, student_quantile
-from harness.sweep.matrix._growth_metrics import BY_NAME, FITTED
+from harness.sweep.matrix._estimate import CONFIDENCE, FITTED, GROWTH_BY_NAME, student_quantile
 from harness.sweep.matrix._matrix_file import Matrix
 
 Variable = Literal["agents", "blocks"]
@@ -188,4 +187,4 @@ def _points(over: tuple[Variable, ...], metric: str, runs: Iterable[Run]) -> Ite
     """
     for run in runs:
         values = {"agents": run.agents, "blocks": run.figures.get("blocks") or 0.0}
-        yield [values[name] for name in over], BY_NAME[metric].of(run.figures) or 0.0
+        yield [values[name] for name in over], GROWTH_BY_NAME[metric].of(run.figures) or 0.0

@@ -16,9 +16,8 @@ from harness.present import svg
 from harness.present import text as words
 from harness.present.svg import Axis, ChartArea
 from harness.sweep.matrix._cell import Cell
-from harness.sweep.matrix._estimate import Estimate
+from harness.sweep.matrix._estimate import GROWTH_BY_NAME, Estimate
 from harness.sweep.matrix._growth import Growth, Law, Variable
-from harness.sweep.matrix._growth_metrics import BY_NAME
 from harness.sweep.matrix._growth_table import SYMBOLS, say, say_exponent, say_number
 from harness.sweep.matrix._matrix_file import Matrix
 from harness.sweep.matrix.matrix_record import MatrixRecord
@@ -38,7 +37,7 @@ class GrowthPanel:
 
     @property
     def shares(self) -> bool:
-        return BY_NAME[self.metric].unit != "number"
+        return GROWTH_BY_NAME[self.metric].unit != "number"
 
 
 PANELS = (
@@ -303,7 +302,7 @@ def _at(panel: GrowthPanel, cell: Cell) -> str:
 
 
 def _say(panel: GrowthPanel, cell: Cell) -> str:
-    return say(BY_NAME[panel.metric], cell.estimates.get(panel.metric, Estimate(n=0)))
+    return say(GROWTH_BY_NAME[panel.metric], cell.estimates.get(panel.metric, Estimate(n=0)))
 
 
 def _range(values: Sequence[float]) -> str:

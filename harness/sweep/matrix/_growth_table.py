@@ -12,9 +12,8 @@ from rich.text import Text
 
 from harness.present import text as words
 from harness.sweep.matrix._cell import Cell
-from harness.sweep.matrix._estimate import Estimate, Metric
+from harness.sweep.matrix._estimate import GROWTH_BY_NAME, Estimate, Metric
 from harness.sweep.matrix._growth import Exponent, Growth, Law, Variable
-from harness.sweep.matrix._growth_metrics import BY_NAME
 from harness.sweep.matrix.matrix_record import MatrixRecord
 
 SYMBOLS: dict[Variable, str] = {"agents": "N", "blocks": "B"}
@@ -81,7 +80,7 @@ def runs_of(growth: Growth) -> str:
 
 def label(name: str) -> str:
     """Return the title of a column. A hyphen shows where the title may be divided in a narrow column."""
-    return "idle at end" if name == "finished" else BY_NAME[name].label
+    return "idle at end" if name == "finished" else GROWTH_BY_NAME[name].label
 
 
 def in_one_line(label: str) -> str:
@@ -92,7 +91,9 @@ def size_row(cell: Cell) -> list[str]:
     """Return the means of a summary, in the order of `SIZE_METRICS`."""
     share = Metric("finished", "", lambda _: None, "share of runs")
     return [
-        say(share, cell.finished) if name == "finished" else say(BY_NAME[name], cell.estimates.get(name, Estimate(n=0)))
+        say(share, cell.finished)
+        if name == "finished"
+        else say(GROWTH_BY_NAME[name], cell.estimates.get(name, Estimate(n=0)))
         for name in SIZE_METRICS
     ]
 

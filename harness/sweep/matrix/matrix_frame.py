@@ -1,6 +1,6 @@
 """Return the runs of a matrix as a polars DataFrame, for notebooks."""
 
-from harness.report.export.polars_package import pl
+from harness.report.export.frames import pl
 from harness.scenario.verdict_names import CHARACTERISTICS, ENDED, FURTHER_CHECKS
 from harness.sweep.matrix.matrix_outputs import run_rows
 from harness.sweep.matrix.matrix_run import Finished

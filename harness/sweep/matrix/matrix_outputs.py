@@ -29,8 +29,7 @@ from harness.sweep.matrix._matrix_file import MatrixPoint, write_scenarios
 from harness.sweep.matrix._matrix_picture import draw
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
-from harness.sweep.matrix.matrix_summary import to_markdown
-from harness.sweep.matrix.matrix_table import name_of, troubles, unsupported
+from harness.sweep.matrix.matrix_table import name_of, to_markdown, troubles, unsupported
 from harness.sweep.matrix.nights import StoredNights
 from harness.sweep.matrix.report import to_html
 from ucp.agent_files import write_atomically, write_json_atomically

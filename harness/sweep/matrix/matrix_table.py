@@ -1,20 +1,25 @@
-"""Print the results of a matrix on the terminal: means with 95 % confidence intervals, laws of growth, and failures."""
+"""Print the results of a matrix on the terminal: means with 95 % confidence intervals, laws of growth, and failures.
+
+The file summary.md has the results of a matrix in Markdown, for a CI job or a message to a team.
+"""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from harness.present import text as words
+from harness.present.text import escaped, row
+from harness.report.agent_programs import asked_for, in_sentence
 from harness.scenario.verdict_names import BAD_IN_WORDS, CHARACTERISTICS
 from harness.sweep.matrix import _growth_table
 from harness.sweep.matrix._cell import Cell
 from harness.sweep.matrix._comparison import Change, ChangedRuns, Culprit
 from harness.sweep.matrix._estimate import BY_NAME, METRICS, Estimate, Metric
 from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
-from harness.sweep.matrix.matrix_record import MatrixRecord
+from harness.sweep.matrix.matrix_record import MatrixCoverage, MatrixRecord
 
 NAMED = 5
 """Maximum number of seeds that the table lists for a cell. The table only counts the other runs. matrix.json contains
@@ -281,3 +286,83 @@ def _number(number: float) -> str:
 
 def _margin(number: float) -> str:
     return f"{number:.2g}" if number < 99.5 else f"{number:.0f}"
+
+
+def to_markdown(record: MatrixRecord) -> str:
+    lines = [f"## {escaped(record.matrix.name)}", "", f"**{verdict(record)}**", "", *_markdown_table(record), ""]
+    lines += [explanation(record) + unjudged(record), ""]
+    compared = [*improvements(record), *changed_runs(record)]
+    if findings := [*troubles_of_all(record), *unsupported_of_all(record), *compared]:
+        lines += [*(f"- {escaped(sentence)}" for sentence in findings), ""]
+    if record.tried is not None:
+        lines += [*map(escaped, describe_coverage(record.tried)), ""]
+    if ran := in_sentence(asked_for(record.matrix.scenario_at(record.matrix.points[-1]))):
+        lines += [escaped(ran), ""]
+    versions = ", ".join(f"{name} {version}" for name, version in record.versions.items())
+    lines += [f"<sub>Begun {words.started(record.started_at)}; {versions}</sub>"]
+    return "\n".join(lines) + "\n"
+
+
+def describe_coverage(tried: MatrixCoverage) -> Iterator[str]:
+    """Yield sentences about the share of the protocol that the runs reached."""
+    every, branches = tried.all_cells, tried.all_cells["branches"]
+    yield (
+        f"Coverage of {words.value(tried.runs)} runs: {words.value(every['local_states'])} local states, "
+        f"{words.value(every['pairs'])} pairs of a local state and an input, "
+        f"{branches['taken']} of {branches['exist']} branches of the handlers."
+    )
+    within = every["within"]
+    states, pairs = within["local_states"], within["pairs"]
+    yield (
+        f"Within the bounds of {within['agents']} agents, {within['blocks']} blocks and a {within['network']} network: "
+        f"{states['reached']} of {states['exist']} local states, {pairs['reached']} of {pairs['exist']} pairs."
+    )
+    if every["untold"]:
+        yield f"The coverage is incomplete: {every['untold']}."
+
+
+def verdict(record: MatrixRecord) -> str:
+    """Return the headline. It contains the numbers of runs, of violations, of failures, and of numeric results that
+    became worse.
+    """
+    runs = sum(cell.runs for cell in record.cells)
+    parts = [f"{words.value(runs)} runs"]
+    if record.outcome == "interrupted":
+        parts[0] += f" of {words.value(record.runs_asked)}, interrupted"
+    elif runs < record.runs_asked:
+        parts[0] += f" of {words.value(record.runs_asked)} in the given time"
+    bad = sum(map(violated, record.cells))
+    parts.append(f"{bad} with violations" if bad else "no violations")
+    if record.failed:
+        parts.append(f"{len(record.failed)} failed")
+    if record.unsupported:
+        parts.append(f"{len(record.unsupported)} not supported")
+    if record.against and record.against.cells and record.against.started_at is not None:
+        worse = len(record.against.regressions)
+        which = f"{worse} figures are worse" if worse > 1 else f"{worse or 'no'} figure is worse"
+        parts.append(f"{which} than on {words.started(record.against.started_at)}")
+    if record.against and record.against.not_compared:
+        parts.append("not all cells are compared" if record.against.cells else "not compared with the baseline")
+    return "; ".join(parts)
+
+
+def _markdown_table(record: MatrixRecord) -> Iterator[str]:
+    named = axes(record.matrix)
+    headers = [*named, "runs", *(metric.label for metric in METRICS), "finished", "violated", "failed"]
+    yield row(headers)
+    yield row(["--:"] * len(headers))
+    for cell in record.cells:
+        yield row([*(say(cell.point) for say in named.values()), str(cell.runs), *_figures(cell), *_bad(cell)])
+
+
+def _figures(cell: Cell) -> Iterator[str]:
+    for metric in METRICS:
+        estimate = cell.estimates[metric.name]
+        interval = say_interval(metric, estimate)
+        yield say_mean(metric, estimate) + (f"<br><sub>{interval}</sub>" if interval else "")
+
+
+def _bad(cell: Cell) -> Iterator[str]:
+    yield say_finished(cell)
+    for number in (violated(cell), cell.failed):
+        yield f"**{number}**" if number else "0"

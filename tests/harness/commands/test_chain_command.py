@@ -18,8 +18,7 @@ from harness.archive.exports import ExportedBlock, ExportMaker
 from harness.report import logbook
 from harness.report.logbook import Logbook
 from harness.report.logbook.logbook_text import document, lines
-from harness.report.logbook.map_files import geojson, kml
-from harness.report.logbook.positions import LAST_TIMESTAMP_US, EventTrack, tracks
+from harness.report.logbook.positions import LAST_TIMESTAMP_US, EventTrack, geojson, kml, tracks
 from tests.harness.command import COMMAND, DEADLINE_S, harness, sentences
 from tests.harness.mission import CONNECTED, edit, edit_lines, fly, write_exports, write_run
 from tests.ucp.air import Air

@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 
 from harness.conformance import _udp_lab
-from harness.conformance._kept_failures import keep
 from harness.conformance._state_space import VARIANTS, explore
-from harness.conformance.conformance_run import ConformanceRequest, conform
+from harness.conformance.conformance_run import ConformanceRequest, conform, keep
 from harness.conformance.results import CaseResult, ConformanceResults
 from harness.conformance.results_table import lines_of
 from harness.conformance.vectors import VectorSet

@@ -14,13 +14,13 @@ import yaml
 from docs.generate.wrong_agents import quirky
 from harness.conformance._agent_under_test import AgentUnderTest
 from harness.conformance._alphabet import LOG, TIMER, AgentInput
-from harness.conformance._kept_failures import scenario_of
 from harness.conformance._observation import RecordedDatagram, TestedStep
 from harness.conformance._reference_model import AGENT
 from harness.conformance._state_space import VARIANTS, SettingsVariant, advance, explore, key_of, state_of
 from harness.conformance._suite import VectorSuite
 from harness.conformance._tours import VectorMap
-from harness.conformance._virtual_lines import LineWriter
+from harness.conformance._virtual_agent import LineWriter
+from harness.conformance.conformance_run import scenario_of
 from harness.conformance.vectors import VectorSet
 from harness.run.simulate import simulate
 from harness.scenario import Scenario

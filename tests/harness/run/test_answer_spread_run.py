@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from harness.checker._sent_times import ANSWERS
 from harness.checker.evidence import Evidence
+from harness.checker.recorded_inputs import ANSWERS
 from harness.run.simulate import simulate
 from harness.scenario import Scenario
 from netem.medium import LATENCY

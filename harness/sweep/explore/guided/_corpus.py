@@ -26,9 +26,8 @@ from harness.errors import MachineError, RunDirectoryError, ScenarioError
 from harness.scenario import Scenario
 from harness.scenario.load import parse, read_yaml
 from harness.sweep.explore._scenario_document import Document, document_of
-from harness.sweep.explore.guided._finding_identity import FindingIdentity
 from harness.sweep.explore.guided._hunt import MOST_KEPT, CandidateRun
-from harness.sweep.explore.guided._hunt_trial import with_liveness_phase, without_liveness_phase
+from harness.sweep.explore.guided._hunt_trial import FindingIdentity, with_liveness_phase, without_liveness_phase
 from harness.sweep.explore.guided._mutation import MutationLimits
 from ucp.agent_files import write_atomically, write_json_atomically
 from ucp.plain_file import open_plain_file, parse_json, read_plain_file

@@ -19,9 +19,9 @@ from harness.proof.coverage.reached import MOST
 from harness.run.parallel import FailedTask, sweep
 from harness.scenario import Scenario
 from harness.sweep.explore._scenario_document import Document, with_key
-from harness.sweep.explore.guided._finding_identity import FindingIdentity
 from harness.sweep.explore.guided._hunt_trial import (
     Divergence,
+    FindingIdentity,
     PlayedRun,
     TimerPatterns,
     play_trial,

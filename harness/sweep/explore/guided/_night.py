@@ -26,9 +26,13 @@ from harness.sweep.explore._recording import record
 from harness.sweep.explore._scenario_document import Document
 from harness.sweep.explore._smaller import file_of, scenario_of
 from harness.sweep.explore.guided._corpus import Corpus, Finding, opened
-from harness.sweep.explore.guided._finding_identity import FindingIdentity
 from harness.sweep.explore.guided._hunt import CandidateRun, Hunt
-from harness.sweep.explore.guided._hunt_trial import findings_of, initial_documents, with_liveness_phase
+from harness.sweep.explore.guided._hunt_trial import (
+    FindingIdentity,
+    findings_of,
+    initial_documents,
+    with_liveness_phase,
+)
 from harness.sweep.explore.guided._mutation import MutationLimits
 from harness.sweep.explore.guided._night_page import to_html
 

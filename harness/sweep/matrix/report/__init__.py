@@ -21,15 +21,16 @@ from harness.sweep.matrix._matrix_file import scenario_file
 from harness.sweep.matrix._matrix_picture import draw, series_of
 from harness.sweep.matrix.matrix_record import MatrixRecord
 from harness.sweep.matrix.matrix_run import Finished
-from harness.sweep.matrix.matrix_summary import describe_coverage, verdict
 from harness.sweep.matrix.matrix_table import (
     changed_runs,
+    describe_coverage,
     explanation,
     improvements,
     name_of,
     say_lengths,
     troubles,
     unjudged,
+    verdict,
 )
 from harness.sweep.matrix.nights import StoredNights
 from harness.sweep.matrix.report import _heatmap, _trend

@@ -81,8 +81,7 @@ def test_table_of_a_matrix_has_a_row_for_each_run(tmp_path: Path) -> None:
 
 
 def test_table_without_polars_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("harness.report.export.polars_package", "harness.report.export.frames"):
-        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.delitem(sys.modules, "harness.report.export.frames")
     monkeypatch.setitem(sys.modules, "polars", None)
     import harness.api
 

@@ -14,8 +14,8 @@ from harness.archive.traces import Trace
 from harness.errors import RunDirectoryError
 from harness.report.live import feed as feeds
 from harness.report.live._agent_course import KEY_LENGTH, AgentActions, Change
-from harness.report.live.change_log import FAR_BEHIND_BYTES, ChangeLog
 from harness.report.live.feed import ChangeFeed, RunClock
+from harness.report.live.server import FAR_BEHIND_BYTES, ChangeLog
 from tests.harness.archive.test_history import handler_run, trace_of
 from tests.harness.report.live.runs import film, of_kind, played
 from ucp.trace import SentMessage

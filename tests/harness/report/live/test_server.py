@@ -22,8 +22,7 @@ from harness.errors import MachineError
 from harness.play.interventions import Interventions
 from harness.report.live import server as servers
 from harness.report.live import server_process as module
-from harness.report.live.change_log import ChangeLog
-from harness.report.live.server import LivePageServer
+from harness.report.live.server import ChangeLog, LivePageServer
 from harness.report.live.server_process import live_page, require_packages
 from harness.scenario import Scenario
 from tests.harness.command import harness, sentences

@@ -27,11 +27,11 @@ from harness.scenario.load import find_file
 from harness.sweep.explore._scenario_document import document_of, script
 from harness.sweep.explore.guided import NightResult, in_words, spend
 from harness.sweep.explore.guided._corpus import MOST_BYTES, opened
-from harness.sweep.explore.guided._finding_identity import identities
 from harness.sweep.explore.guided._hunt import CandidateRun, Hunt, KeptRun
 from harness.sweep.explore.guided._hunt_trial import (
     PlayedRun,
     findings_of,
+    identities,
     initial_documents,
     play_trial,
     with_liveness_phase,

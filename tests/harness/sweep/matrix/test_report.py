@@ -27,7 +27,7 @@ from harness.sweep.matrix._matrix_file import scenario_file, write_scenarios
 from harness.sweep.matrix._matrix_picture import PANELS, draw
 from harness.sweep.matrix.matrix_outputs import to_junit
 from harness.sweep.matrix.matrix_run import compare_with
-from harness.sweep.matrix.matrix_summary import to_markdown
+from harness.sweep.matrix.matrix_table import to_markdown
 from harness.sweep.matrix.nights import BaselineNight, StoredNights
 from harness.sweep.matrix.report import _drilldown, _heatmap, _trend, to_html
 from harness.sweep.matrix.report._heatmap import known_figures

@@ -26,7 +26,7 @@ from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._matrix_file import MatrixTask
 from harness.sweep.matrix._matrix_picture import PANELS, draw
 from harness.sweep.matrix.matrix_run import informative, on_cores
-from harness.sweep.matrix.matrix_summary import to_markdown, verdict
+from harness.sweep.matrix.matrix_table import to_markdown, verdict
 from tests.harness.command import harness
 from tests.harness.sweep.matrix.stub import judge, matrix, played
 
