@@ -36,7 +36,8 @@ def check(evidence: Evidence) -> Judgement:
             lacking[agent_id] = missing
     if not lacking and (unknown_agents := evidence.agents_with_unknown_completed()):
         one = min(unknown_agents)
-        why = evidence.describe_unknown_name("operation", agent_id=one) or evidence.traces[one].problem
+        remote = evidence.remote(one)
+        why = evidence.describe_unknown_name("operation", agent_id=one) or (remote.lack if remote else None)
         return Judgement(NAME, "not applicable", f"the completed blocks of {agents(unknown_agents)} are unknown: {why}")
     if not lacking:
         but = f"; {gone} more were lost with agents that {_describe_end(evidence)}" if gone else ""
