@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import os
+import resource
 import signal
 import sys
 import traceback
@@ -33,6 +34,14 @@ def fork_program(
     if pid == 0:
         end_with(lambda: _play(main, cwd, env, files, prepare))
     return pid
+
+
+def limit_files(most_bytes: int) -> None:
+    """Limit the size of the files that this process writes. The process ignores the signal SIGXFSZ, so a write beyond
+    the limit fails with EFBIG.
+    """
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
 
 def end_with(main: Callable[[], int | None]) -> None:

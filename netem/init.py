@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
-import resource
 import selectors
 import signal
 import socket
@@ -33,7 +32,7 @@ from netem._udp_counters import read_udp_counters
 from netem.conditions import NetworkConditions
 from netem.engine import Engine
 from netem.errors import ConditionsError, EngineError, NetemError
-from netem.forked_program import fork_program
+from netem.forked_program import fork_program, limit_files
 
 _MAX_UNREAD = 64 << 20  # maximum of unread bytes for the orchestrator
 
@@ -45,14 +44,6 @@ class _OpeningConnection:
     request: int
     socket: socket.socket
     deadline: float
-
-
-def _limit_files(most_bytes: int) -> None:
-    """Limit the size of the files that this process writes. The process ignores the signal SIGXFSZ, so a write beyond
-    the limit fails with EFBIG.
-    """
-    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
 
 def _module_of(argv: list[str]) -> Callable[[], None]:
@@ -198,7 +189,7 @@ class LabServer:
             for name in ("stdout", "stderr"):
                 files.append(os.open(message[name], mode, 0o644))
             with self._require_fabric().inside(message["vehicle"]):
-                limit = None if most is None else partial(_limit_files, most)
+                limit = None if most is None else partial(limit_files, most)
                 if message["fork"]:
                     pid = fork_program(
                         _module_of(message["argv"]),

@@ -26,6 +26,7 @@ from harness.play.agent_control import AgentRefusedError, AgentSilentError, is_s
 from harness.play.process.controlled_program import ControlledProgram, ProgramEndedError
 from harness.play.process.lab_program import LabProgram
 from harness.play.remote.agent_pool import AgentPool, RemoteIncarnation
+from harness.play.unix_sockets import bind_path
 from netem.errors import LabUnavailable, NetemError, SpawnError
 from netem.lab import Lab
 from ucp.features import UNSUPPORTED
@@ -111,31 +112,27 @@ class UdpLab:
 
     async def _open_sockets(self) -> list[socket.socket]:
         name = "sockets"
-        directory = os.open(self.place, os.O_PATH)
-        try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
-                listener.bind(f"/proc/self/fd/{directory}/{name}")  # the address of a Unix socket has at most 107 bytes
-                listener.listen(1)
-                listener.setblocking(False)
-                helper = await self.lab.spawn(
-                    PEERS_VEHICLE,
-                    [sys.executable, "-P", "-m", _ports.__name__, name, *map(str, self._ports)],
-                    cwd=self.place,
-                    env=dict(os.environ),
-                    stdout=self.place / "ports.log",
-                    stderr=self.place / "ports.log",
-                )
-                loop = asyncio.get_running_loop()
-                accepting = asyncio.create_task(loop.sock_accept(listener))
-                ending = asyncio.create_task(helper.wait())
-                await asyncio.wait({accepting, ending}, return_when=asyncio.FIRST_COMPLETED)
-                ending.cancel()
-                if not accepting.done():
-                    accepting.cancel()
-                    raise self._no_sockets()
-                connection, _ = accepting.result()
-        finally:
-            os.close(directory)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+            bind_path(listener, self.place / name)
+            listener.listen(1)
+            listener.setblocking(False)
+            helper = await self.lab.spawn(
+                PEERS_VEHICLE,
+                [sys.executable, "-P", "-m", _ports.__name__, name, *map(str, self._ports)],
+                cwd=self.place,
+                env=dict(os.environ),
+                stdout=self.place / "ports.log",
+                stderr=self.place / "ports.log",
+            )
+            loop = asyncio.get_running_loop()
+            accepting = asyncio.create_task(loop.sock_accept(listener))
+            ending = asyncio.create_task(helper.wait())
+            await asyncio.wait({accepting, ending}, return_when=asyncio.FIRST_COMPLETED)
+            ending.cancel()
+            if not accepting.done():
+                accepting.cancel()
+                raise self._no_sockets()
+            connection, _ = accepting.result()
         with connection:
             connection.setblocking(True)
             descriptors: list[int] = []

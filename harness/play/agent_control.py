@@ -20,6 +20,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import from_json
 
 from harness.errors import VIOLATED, HarnessError, ScenarioError
+from harness.play.unix_sockets import short_name
 
 FIRST_LINE_BYTES = 256
 """Number of bytes of a script's first line that the kernel reads."""
@@ -207,11 +208,5 @@ class AgentControl:
 
 async def connect(socket_path: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     """Connect to the control socket of an agent, which sends each answer as one line. Raises OSError."""
-    # The address of a socket has at most 107 bytes, and the path of a run directory may be longer.
-    directory = os.open(socket_path.parent, os.O_PATH)
-    try:
-        return await asyncio.open_unix_connection(
-            f"/proc/self/fd/{directory}/{socket_path.name}", limit=ANSWER_LIMIT_BYTES
-        )
-    finally:
-        os.close(directory)
+    with short_name(socket_path.parent) as directory:
+        return await asyncio.open_unix_connection(f"{directory}/{socket_path.name}", limit=ANSWER_LIMIT_BYTES)

@@ -16,7 +16,6 @@ A step to the next handler run has no `seconds`. The answer to `state` has `at_s
 
 import asyncio
 import json
-import os
 from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import Future
 from contextlib import asynccontextmanager
@@ -28,6 +27,7 @@ from pydantic_core import from_json
 from harness.errors import HarnessError, ScenarioError
 from harness.play.agent_control import connect
 from harness.play.interventions import Interventions
+from harness.play.unix_sockets import short_name
 
 SOCKET = "by-hand"
 MAX_REQUEST_BYTES = 64 * 1024
@@ -56,13 +56,9 @@ async def serve_requests(interventions: Interventions, directory: Path) -> Async
             connections.discard(task)
             writer.close()
 
-    descriptor = os.open(directory, os.O_PATH)  # the address of a socket has at most 107 bytes
-    try:
-        path = f"/proc/self/fd/{descriptor}/{SOCKET}"
-        server = await asyncio.start_unix_server(serve_connection, path, limit=MAX_REQUEST_BYTES)
+    with short_name(directory) as name:
+        server = await asyncio.start_unix_server(serve_connection, f"{name}/{SOCKET}", limit=MAX_REQUEST_BYTES)
         (directory / SOCKET).chmod(0o600)
-    finally:
-        os.close(descriptor)
     try:
         yield
     finally:

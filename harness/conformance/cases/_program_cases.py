@@ -25,7 +25,7 @@ from harness.conformance.cases._bench import (
     case,
     require,
 )
-from harness.play.agent_control import AgentRefusedError
+from harness.play.agent_control import AgentRefusedError, connect
 from ucp.block import Block, next_chain_hash
 from ucp.contract.vectors import DIRECTORY
 from ucp.contract.vectors.refusal_vectors import UNKNOWN
@@ -291,12 +291,7 @@ async def _port(bench: CaseBench) -> None:
 
 async def _lines(agent: BenchAgent, *requests: bytes) -> list[Any]:
     """Send several lines at once to the control socket on one connection, and return the answers."""
-    directory = os.open(agent.process.directory, os.O_PATH)
-    try:
-        path = f"/proc/self/fd/{directory}/{agent.agent_id}.control"
-        reader, writer = await asyncio.open_unix_connection(path, limit=2**20)
-    finally:
-        os.close(directory)
+    reader, writer = await connect(agent.process.directory / f"{agent.agent_id}.control")
     try:
         answers = []
         writer.write(b"".join(request + b"\n" for request in requests))

@@ -19,6 +19,10 @@ class LagMeter:
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process
 
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
     @classmethod
     async def start(cls, path: Path, epoch_us: int, speedup: float, networks: Mapping[int, int]) -> "LagMeter":
         """Start to measure, and write the results to `path`. `networks` contains the inode number of each agent's

@@ -22,7 +22,8 @@ from typing import Any, Protocol
 from harness.errors import MachineError
 from harness.play.remote._far_clock import FarClock, ping
 from harness.play.remote._handshake import PROTOCOL, HandshakeError, Hello, receive_hello
-from harness.play.remote._wire import Channel, Kind, WireError, bind_path, hand_over, prepare
+from harness.play.remote._wire import Channel, Kind, WireError, hand_over, prepare
+from harness.play.unix_sockets import bind_path
 from sitl.address import ListenAddress
 from ucp.features import CONTRACT
 

@@ -13,14 +13,10 @@ from __future__ import annotations
 
 import hmac
 import json
-import os
 import socket
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
-from pathlib import Path
 from typing import Any
 
 from ucp.plain_file import parse_json
@@ -210,30 +206,6 @@ def prepare(connection: socket.socket) -> None:
 HANDED_OVER_BYTES = 4096
 KEYS = "keys"
 """Name of the link to the directory in memory, in the directory of a far end."""
-
-
-def bind_path(outside: socket.socket, path: Path) -> None:
-    """Bind a Unix socket to a path of any length. Raises OSError."""
-    with short_name(path.parent) as directory:
-        outside.bind(f"{directory}/{path.name}")
-
-
-def connect_path(inside: socket.socket, path: Path) -> None:
-    """Connect a Unix socket to a path of any length. Raises OSError."""
-    with short_name(path.parent) as directory:
-        inside.connect(f"{directory}/{path.name}")
-
-
-@contextmanager
-def short_name(path: Path) -> Iterator[str]:
-    """Provide a short name for a directory inside the context, because the address of a Unix socket has at most 107
-    bytes.
-    """
-    descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
-    try:
-        yield f"/proc/self/fd/{descriptor}"
-    finally:
-        os.close(descriptor)
 
 
 def hand_over(inside: socket.socket, connection: socket.socket, state: dict[str, Any]) -> None:

@@ -27,6 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from harness.play.process._lag_meter import LagMeter
 from harness.play.remote._connection import Connection
 from harness.play.remote._far_clock import pong
 from harness.play.remote._forked_process import ForkedProcess
@@ -40,11 +41,11 @@ from harness.play.remote._wire import (
     Kind,
     Message,
     WireError,
-    short_name,
     take_over,
 )
+from harness.play.unix_sockets import short_name
 from netem.far_network import FarNetwork, vehicle_at
-from netem.forked_program import fork_program
+from netem.forked_program import fork_program, limit_files
 from ucp.agent_files import write_json_atomically
 from ucp.plain_file import open_plain_file, read_plain_file
 
@@ -53,7 +54,6 @@ POLL_S = 0.05
 and answer.
 """
 READY_POLL_S = 0.02
-END_LIMIT_S = 5.0
 FRAMES_PER_TURN = 64
 MAX_READ_BYTES = 1 << 20
 MAX_ANSWER_BYTES = 2 << 20
@@ -61,7 +61,6 @@ MAX_UNSENT_BYTES = 4 << 20
 """Maximum number of bytes that wait for a slow connection. Beyond this number, datagrams of the agent are lost, and new
 lines of its trace wait in the file.
 """
-LAG_PROBE = Path(__file__).parents[1] / "process" / "_lag_probe.py"
 
 
 class FileTail:
@@ -121,7 +120,7 @@ class FarWorker:
         self._control: asyncio.StreamWriter | None = None
         self._asked: deque[bytes] = deque()
         """The numbers of the requests that the agent has not answered yet. The oldest number is first."""
-        self._lag: asyncio.subprocess.Process | None = None
+        self._lag: LagMeter | None = None
         self._speedup = 1.0
         self._measures_lag = False
         self._store: Path | None = None
@@ -251,7 +250,7 @@ class FarWorker:
         most = order["max_file_bytes"]
         with log.open("ab") as output:
             try:
-                limit = None if most is None else partial(_limit_files, int(most))
+                limit = None if most is None else partial(limit_files, int(most))
                 self._process = await self._started(path.name, output.fileno(), limit)
             except OSError as error:
                 output.write(f"{self._command[0]} cannot be started: {error.strerror}\n".encode())
@@ -343,10 +342,8 @@ class FarWorker:
 
     async def _wait_for_end(self, process: AgentProgram) -> None:
         status = await process.wait()
-        if self._lag is not None and self._lag.stdin is not None:
-            self._lag.stdin.close()
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._lag.wait(), END_LIMIT_S)
+        if self._lag is not None:
+            await self._lag.stop()
         assert self._network is not None
         self._loop.remove_reader(self._network.descriptor)
         while self._leave():
@@ -426,15 +423,8 @@ class FarWorker:
         if not self._measures_lag or self._lag is not None:
             return
         network = Path("/proc/self/ns/net").stat().st_ino
-        self._lag = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-I", "-S", str(LAG_PROBE), str(self._home / "lag.jsonl")),
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.DEVNULL,
-            stderr=asyncio.subprocess.DEVNULL,
-        )
-        assert self._lag.stdin is not None
-        request = {"epoch_us": epoch_us, "speedup": self._speedup, "networks": {str(network): str(self._agent_id)}}
-        self._lag.stdin.write(json.dumps(request).encode() + b"\n")
+        networks = {self._agent_id: network}
+        self._lag = await LagMeter.start(self._home / "lag.jsonl", epoch_us, self._speedup, networks)
 
 
 def _name(text: object) -> str:
@@ -442,11 +432,6 @@ def _name(text: object) -> str:
     if not isinstance(text, str) or not text.isalnum():
         raise WireError("a name has other characters than letters and digits")
     return text
-
-
-def _limit_files(most_bytes: int) -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 
 
 def _other_processes(own: set[int]) -> list[str]:

@@ -38,9 +38,9 @@ from harness.play.remote._wire import (
     Kind,
     Message,
     WireError,
-    connect_path,
     take_over,
 )
+from harness.play.unix_sockets import connect_path
 from netem import addresses
 from ucp.agent_files import write_atomically
 from ucp.clock import MICROSECONDS
