@@ -400,8 +400,10 @@ class RemoteRecord(_RecordModel):
         """A phrase that names the incarnations whose end is not on record, or None if there are none."""
         if not self.incomplete:
             return None
+        if len(self.incomplete) == 1:
+            return f"the end of incarnation {self.incomplete[0]} is not on record, because the vehicle was cut off"
         numbers = ", ".join(map(str, self.incomplete))
-        return f"the end of incarnation {numbers} is not on record, because the vehicle was cut off"
+        return f"the ends of incarnations {numbers} are not on record, because the vehicle was cut off"
 
     def clock_error_s(self, lasted_s: float) -> float:
         """Return the maximum difference between the mission times of the agent and of the harness, in seconds of wall
