@@ -357,14 +357,17 @@ class FarWorker:
         self._report_end(how)
 
     def _report_end(self, how: dict[str, Any]) -> None:
-        self._send_new_lines()
-        if self._connection is not None:
-            self._send_file(Kind.EXPORT, self._home / f"{self._agent_id}.chain.json")
-            if self._store is not None:
-                self._send_file(Kind.STORE, self._store)
-            if self._bundle is not None:
-                self._send_file(Kind.BUNDLE, self._bundle)
-            self._send(Kind.EXIT, json.dumps({**how, "datagrams": self._frames}).encode())
+        if self._connection is None or not self._in_step:
+            return  # the next connection gets the report
+        for kind, tail in self._tails.items():
+            for data in iter(tail.read, b""):  # all of it, although the connection may be slow
+                self._send(kind, data)
+        self._send_file(Kind.EXPORT, self._home / f"{self._agent_id}.chain.json")
+        if self._store is not None:
+            self._send_file(Kind.STORE, self._store)
+        if self._bundle is not None:
+            self._send_file(Kind.BUNDLE, self._bundle)
+        self._send(Kind.EXIT, json.dumps({**how, "datagrams": self._frames}).encode())
 
     # Datagrams and files
 

@@ -7,18 +7,20 @@ import socket
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from harness.archive.directory import RunDirectory
 from harness.errors import AgentFailedError, MachineError
 from harness.play.process._agent_process import AgentProcess
+from harness.play.remote._connection import Connection
 from harness.play.remote._far_clock import pong
 from harness.play.remote._far_ends import FarEnds
 from harness.play.remote._stand_in_task import StandInTask
 from harness.play.remote._wire import Channel, Kind, Message, hand_over
 from harness.play.remote.agent_pool import AgentPool, RemoteIncarnation
+from harness.play.remote.far_worker import MAX_UNSENT_BYTES, FarWorker, FileTail
 from harness.play.remote.stand_in import StandIn
 
 DEADLINE_S = 10.0
@@ -160,6 +162,36 @@ def test_harness_reads_all_messages_of_a_stand_in_at_once(tmp_path: Path) -> Non
         assert incarnation.epoch_us == 7
 
     play(hear)
+
+
+class SlowConnection:
+    """A connection that has not sent its earlier messages yet."""
+
+    unsent = MAX_UNSENT_BYTES + 1
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[Kind, bytes]] = []
+
+    def send(self, kind: Kind, payload: bytes) -> None:
+        self.sent.append((kind, payload))
+
+
+def test_whole_trace_is_sent_before_the_end_on_a_slow_connection(tmp_path: Path) -> None:
+    (tmp_path / "trace").write_bytes(b"x" * 3_000_000)
+
+    async def end() -> None:
+        inside, outside = socket.socketpair()
+        with inside, outside:
+            worker = FarWorker(inside, tmp_path, [])
+            connection = SlowConnection()
+            worker._connection, worker._in_step = cast("Connection", connection), True
+            worker._tails = {Kind.TRACE: FileTail(tmp_path / "trace")}
+            worker._end({"status": 0, "left_behind": []})
+        *lines, (last, _) = connection.sent
+        assert b"".join(data for _, data in lines) == b"x" * 3_000_000
+        assert last is Kind.EXIT
+
+    play(end)
 
 
 @pytest.mark.parametrize(("loss", "error"), [(None, AgentFailedError), ("cannot go on", MachineError)])
