@@ -30,7 +30,7 @@ from harness.errors import UnsupportedError
 from harness.play.agent_control import AgentRefusedError, AgentUnsupportedError
 from ucp.agent import HANDLERS
 
-__all__ = ["ALL_CASES", "CaseBench", "HandwrittenCase"]
+__all__ = ["ALL_CASES", "handwritten"]
 
 
 PARALLEL_CASES = 4

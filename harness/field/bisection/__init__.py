@@ -21,6 +21,17 @@ from harness.field.bisection.outcome import BisectionSubject, Outcome, differenc
 from harness.report.difference import RunDifference, compare
 from harness.run.code_state import GitBisection, GitCommit, RepositoryError, SuspectCommits
 
+__all__ = [
+    "BisectionResult",
+    "BisectionSubject",
+    "Outcome",
+    "SubjectPlayer",
+    "UntestableError",
+    "bisect",
+    "differences",
+    "subject_of",
+]
+
 
 @dataclass(frozen=True)
 class CommitTrial:
@@ -131,16 +142,3 @@ def _first_difference(good_run: Path, run: Path) -> RunDifference | None:
         return compare(good_run, run)
     except RunDirectoryError:  # One of the runs crashed and is incomplete.
         return None
-
-
-__all__ = [
-    "BisectionResult",
-    "BisectionSubject",
-    "CommitTrial",
-    "Outcome",
-    "SubjectPlayer",
-    "UntestableError",
-    "bisect",
-    "differences",
-    "subject_of",
-]

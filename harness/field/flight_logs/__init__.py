@@ -28,7 +28,6 @@ from harness.field.flight_logs._dataflash import FMT, MAGIC, DataFlashReader
 from harness.field.flight_logs._records import (
     ArmingChange,
     Battery,
-    ClockJump,
     EkfStatus,
     FlightLog,
     GpsStatus,
@@ -45,6 +44,14 @@ from ucp.telemetry import mode_name
 
 if TYPE_CHECKING:
     from harness.field.flight_logs._collecting import DamagedBytes
+
+__all__ = [
+    "FlightLog",
+    "GpsTime",
+    "Position",
+    "flight_log_kind",
+    "read_flight_log",
+]
 
 
 MAX_LOG_BYTES = 1024 * 1024 * 1024
@@ -160,22 +167,3 @@ def _problems(problems: list[str], damage: "DamagedBytes", clock: LogClock, budg
             f"its clock jumps {times}, first by {first.by_us / 1e6:+,.1f} s (a restart, a correction or a pause)"
         )
     return sentences
-
-
-__all__ = [
-    "ArmingChange",
-    "Battery",
-    "ClockJump",
-    "EkfStatus",
-    "FlightLog",
-    "GpsStatus",
-    "GpsTime",
-    "LogKind",
-    "ModeChange",
-    "Parameter",
-    "Position",
-    "RadioStatus",
-    "VehicleLog",
-    "flight_log_kind",
-    "read_flight_log",
-]

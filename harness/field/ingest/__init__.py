@@ -4,7 +4,7 @@ Field data is often broken. Lines are truncated, two flights are in one file, a 
 lie in the same directory. This package uses every usable part, and reports every part that it omits.
 """
 
-from harness.field.ingest._ingest import FileRemark, Flight, IngestResult, UnusedPart
+from harness.field.ingest._ingest import Flight, IngestResult, UnusedPart
 from harness.field.ingest._sorting import ingest_files
 
-__all__ = ["FileRemark", "Flight", "IngestResult", "UnusedPart", "ingest_files"]
+__all__ = ["Flight", "IngestResult", "UnusedPart", "ingest_files"]

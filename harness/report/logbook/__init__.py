@@ -23,6 +23,8 @@ from ucp.sealed import sealed_to
 if TYPE_CHECKING:
     from ucp.secure.sealing import Depot
 
+__all__ = ["Logbook", "read"]
+
 
 class SealedError(MalformedEventsError):
     """An error: the event data of a block are encrypted, and no known key decrypts them. The message completes a
@@ -173,6 +175,3 @@ def logged_telemetry(record: RunRecord) -> bool:
 def _absent(agent_id: int, agent: AgentRecord | None) -> str:
     reason = f" ({agent.outcome})" if agent is not None and agent.outcome != "exported" else ""
     return f"agent {agent_id} has no export here{reason}"
-
-
-__all__ = ["Logbook", "read"]

@@ -7,14 +7,11 @@ scenarios, and keeps those that reach new states.
 """
 
 from harness.sweep.explore._exploring import (
-    MAX_RUNS,
     SEEDS,
     Explored,
-    SearchProgress,
-    ViolatingRun,
     explore,
     in_words,
     watching,
 )
 
-__all__ = ["MAX_RUNS", "SEEDS", "Explored", "SearchProgress", "ViolatingRun", "explore", "in_words", "watching"]
+__all__ = ["SEEDS", "Explored", "explore", "in_words", "watching"]

@@ -34,6 +34,8 @@ from harness.report.chain_tree_svg import ChainTreePicture
 from harness.report.map_svg import STYLE as MAP_STYLE
 from ucp.clock import MICROSECONDS
 
+__all__ = ["draw"]
+
 _TEMPLATE = Path(__file__).with_name("page.html.j2")
 _STYLE = _TEMPLATE.with_name("page.css").read_text(encoding="utf-8")
 MAX_ROWS = 3_000
@@ -220,6 +222,3 @@ def _row(block: Block, ink: Mapping[int, AgentColours]) -> dict[str, object]:
         "held": "; ".join(places),
         "block_hash": block.block_hash or "",
     }
-
-
-__all__ = ["draw"]
