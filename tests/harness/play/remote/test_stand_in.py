@@ -17,11 +17,13 @@ from harness.play.process._agent_process import AgentProcess
 from harness.play.remote._connection import Connection
 from harness.play.remote._far_clock import pong
 from harness.play.remote._far_ends import FarEnds
+from harness.play.remote._remote_agents import RemoteAgents
 from harness.play.remote._stand_in_task import StandInTask
 from harness.play.remote._wire import Channel, Kind, Message, hand_over
 from harness.play.remote.agent_pool import AgentPool, RemoteIncarnation
 from harness.play.remote.far_worker import MAX_UNSENT_BYTES, FarWorker, FileTail
 from harness.play.remote.stand_in import StandIn
+from harness.scenario.load import parse
 
 DEADLINE_S = 10.0
 MISSION = b'{"epoch_us": 1000000}'
@@ -162,6 +164,24 @@ def test_harness_reads_all_messages_of_a_stand_in_at_once(tmp_path: Path) -> Non
         assert incarnation.epoch_us == 7
 
     play(hear)
+
+
+def test_losses_of_all_incarnations_are_added(tmp_path: Path) -> None:
+    remote = {"agents": [2], "secret_file": "none"}
+    scenario = parse({"name": "lost", "agents": 2, "vehicles": {"kind": "none"}, "remote": remote})
+    agents = RemoteAgents(scenario, RunDirectory(tmp_path / "run"), lambda: 0.0)
+    for lost, is_complete in ((3, True), (4, False), (2, True)):
+        stand_in, other = socket.socketpair()
+        with stand_in, other:
+            agents.begin(2, stand_in)
+            agents.hear(2, stand_in, {"lost": lost - 1})
+            if is_complete:
+                agents.hear(2, stand_in, {"left_behind": []})
+            agents.hear(2, stand_in, {"lost": lost})
+            agents.hear(2, stand_in, {})
+    record = agents.records()["2"]
+    assert (record.lost, record.incomplete) == (9, [2])
+    assert record.lack == "the end of incarnation 2 is not on record, because the vehicle was cut off"
 
 
 class SlowConnection:
