@@ -269,13 +269,22 @@ def interleave_traces(home: Path, draw: Random) -> None:
 
 def set_clock_back(home: Path, draw: Random) -> None:
     """Decrease all times of a trace from one line on, as if GPS or NTP had set the clock back."""
+    _set_clock(home, draw, -1)
+
+
+def set_clock_forward(home: Path, draw: Random) -> None:
+    """Increase all times of a trace from one line on, as if GPS or NTP had set the clock forward."""
+    _set_clock(home, draw, 1)
+
+
+def _set_clock(home: Path, draw: Random, sign: int) -> None:
     path = _a_trace(home, draw)
     lines = _lines(path)
-    start, by_s = draw.randrange(1, len(lines)), draw.uniform(0.5, 30.0)
+    start, by_s = draw.randrange(1, len(lines)), sign * draw.uniform(0.5, 30.0)
     for number in range(start, len(lines)):
         entry = json.loads(lines[number])
         if "t" in entry:
-            entry["t"] = round(entry["t"] - by_s, 6)
+            entry["t"] = round(entry["t"] + by_s, 6)
             lines[number] = json.dumps(entry, separators=(",", ":")).encode() + b"\n"
     path.write_bytes(b"".join(lines))
 
@@ -332,6 +341,7 @@ DAMAGES: dict[str, Damage] = {
     "trace of another mission": add_other_mission,
     "lines of two traces interleaved": interleave_traces,
     "clock set back": set_clock_back,
+    "clock set forward": set_clock_forward,
     "lines end with CR LF": end_lines_as_windows,
     "packed trace with half a last line": pack_half_a_line,
     "packed trace cut": cut_packed_trace,

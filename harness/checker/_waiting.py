@@ -55,6 +55,16 @@ class _UnfinishedOperation:
     line: int = 0
     since: float = math.inf
     """Mission second of the last step. Infinity if no vote or reconcile is in progress."""
+    due_s: float = math.inf
+    """Mission second until which the next step must follow. Infinity if no vote or reconcile is in progress."""
+    was_late: bool = False
+    """True if the agent may have been suspended during this step."""
+
+    def begin(self, line: int, now: float) -> None:
+        self.line, self.since, self.due_s, self.was_late = line, now, now + self.longest, False
+
+    def end(self) -> None:
+        self.due_s = math.inf
 
     def finding(self, agent_id: int) -> Finding:
         where = f"trace line {self.line}, t={self.since:g} s"
@@ -89,24 +99,32 @@ def _find_in_incarnation(
     for line, run in incarnation:
         step = run.handler in STEPS
         if run.handler == "vote_timer_expiration":
-            vote.since = math.inf
+            vote.end()
         elif step and _continues_reconcile(run):
-            reconcile.since = math.inf
-        if run.t > vote.since + vote.longest or run.t > reconcile.since + reconcile.longest:
+            reconcile.end()
+        if run.t > vote.due_s or run.t > reconcile.due_s:
             yield from _find_overdue(evidence, agent_id, run.t, vote, reconcile)
         if run.branch == "proposed":
-            vote.line, vote.since = line, run.t
+            vote.begin(line, run.t)
         elif step and _continues_reconcile(run) and run.state.reconciling:
-            reconcile.line, reconcile.since = line, run.t
+            reconcile.begin(line, run.t)
 
 
 def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _UnfinishedOperation) -> Iterator[Finding]:
+    """Yield a finding for each overdue vote or reconcile.
+
+    No record of a real flight shows whether the computer was suspended, or whether its clock was set. There, an agent
+    may therefore handle an overdue timer directly after its first line that is late.
+    """
     for wait in waits:
-        if now > wait.since + wait.longest:
-            due_s = wait.since + wait.longest
-            if not (evidence.was_paused(agent_id, wait.since, now) or evidence.was_delayed(agent_id, due_s, now)):
-                yield wait.finding(agent_id)
-            wait.since = math.inf
+        if now <= wait.due_s:
+            continue
+        if evidence.from_field and evidence.record is None and not wait.was_late:
+            wait.was_late, wait.due_s = True, now + _slack_s(evidence.traces[agent_id])
+            continue
+        if not (evidence.was_paused(agent_id, wait.since, now) or evidence.was_delayed(agent_id, wait.due_s, now)):
+            yield wait.finding(agent_id)
+        wait.end()
 
 
 def longest(trace: Trace, timers: tuple[str, ...]) -> float:
@@ -116,7 +134,13 @@ def longest(trace: Trace, timers: tuple[str, ...]) -> float:
     settings: list[Any] = [trace.header.settings.get(timer) for timer in timers]
     if not all(isinstance(setting, int | float) for setting in settings):
         return math.inf
-    speedup, drift = trace.header.clock.get("speedup", 1), trace.header.clock.get("drift", 0)
-    if not isinstance(speedup, int | float) or not isinstance(drift, int | float) or drift <= -1:
+    drift = trace.header.clock.get("drift", 0)
+    if not isinstance(drift, int | float) or drift <= -1:
         return math.inf
-    return float(max(settings)) / (1 + drift) + SLACK_WALL_S * speedup
+    return float(max(settings)) / (1 + drift) + _slack_s(trace)
+
+
+def _slack_s(trace: Trace) -> float:
+    """Return the tolerance for late timers in mission seconds. It is infinite if the speedup is unknown."""
+    speedup = trace.header.clock.get("speedup", 1)
+    return SLACK_WALL_S * speedup if isinstance(speedup, int | float) else math.inf

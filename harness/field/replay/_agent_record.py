@@ -1,7 +1,7 @@
 """Read the record of one agent for a replay: its trace lines in order, and the other records of the flight."""
 
 import base64
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -74,6 +74,10 @@ class RecordedTrace:
         """The damage to a single line that explains a deviation, by the position of the deviation. The value is None
         before the search for such explanations.
         """
+        self.clock_changes: dict[int, str] = {}
+        """The changes of the agent's clock that explain deviations, by the position of the first entry that may have
+        the new clock.
+        """
         if not trace.header.has_inputs:
             raise FieldError(
                 f"{path}: it has the version ucp-trace/1, which lacks received messages; agents must write ucp-trace/2"
@@ -105,12 +109,12 @@ class RecordedTrace:
 
     @property
     def doubtful_runs(self) -> dict[int, str]:
-        """The damage to a single trace line that may explain the deviations of a handler run, by the position of the
-        handler run.
+        """The damage to a single trace line, or the change of the agent's clock, that may explain the deviations of a
+        handler run, by the position of the handler run.
         """
         of_entries = [number for number, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
-        doubts = self.doubts or {}
-        return {number: doubts[entry] for number, entry in enumerate(of_entries) if entry in doubts}
+        doubts = {**self.clock_changes, **(self.doubts or {})}
+        return {bisect_left(of_entries, entry): why for entry, why in doubts.items()}
 
     @property
     def is_counted(self) -> bool:

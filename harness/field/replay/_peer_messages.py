@@ -79,12 +79,20 @@ class PeerMessages:
             trigger = run.trigger
             if isinstance(trigger, MessageTrigger) and trigger.sender == other:
                 sent = self.runs_that_sent(trigger.message, trigger.sequence)
-                if len(sent) == 1:
+                if len(sent) == 1 and _is_same(self.runs[sent[0]][1], run):
                     yield PeerMessage(position, DeliveredMessage(other, own, self.runs[sent[0]][1].t, run.t))
             for message in run.sent:
                 received = self.runs_that_received(message.message, message.seq)
-                if len(received) == 1:
+                if len(received) == 1 and _is_same(run, self.runs[received[0]][1]):
                     yield PeerMessage(position, DeliveredMessage(own, other, run.t, self.runs[received[0]][1].t))
+
+
+def _is_same(sender: HandlerRun, receiver: HandlerRun) -> bool:
+    """Return false if the received datagram is none of those that the sender sent. A restarted agent uses sequence
+    numbers again, so type and sequence number alone do not identify a message.
+    """
+    datagrams = [message.datagram for message in sender.sent]
+    return receiver.input is None or None in datagrams or receiver.input in datagrams
 
 
 MIN_RATE, MAX_RATE = 0.55, 1.8

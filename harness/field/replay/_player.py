@@ -284,8 +284,10 @@ class RecordPlayer:
         if (why := self.record.unrecorded.get(self.position)) is not None:
             return f"{why},"
         of_timers = any(deviation.run is None and deviation.handler in _OF_TIMERS for deviation in deviations)
-        shift = self._clock_set.shift_near(self.position) if of_timers else None
-        return shift or self._doubt(deviations)
+        if of_timers and (change := self._clock_set.change_near(self.position)) is not None:
+            self.record.clock_changes.setdefault(change.position, change.reason)
+            return change.reason
+        return self._doubt(deviations)
 
     def _doubt(self, deviations: list[StepDeviation]) -> str | None:
         """Describe damage to a single line that would also explain the deviations. Return None if no damage explains

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from itertools import islice
 from statistics import median
+from typing import NamedTuple
 
 from harness.archive.traces import Trace
 from harness.checker.recorded_inputs import NotOnRecordError, event_of
@@ -159,10 +160,19 @@ change.
 """
 MESSAGES = 3
 """Size of two groups of messages between the agent and one other agent. One group is before a possible clock change,
-the other after it. The detector compares the median time differences of both groups.
+the other after it. The detector compares the median time differences of both groups. If no groups of this size differ,
+the detector also tries smaller groups at the first and the last messages.
 """
 MIN_SHIFT_S = 1.0
 """Minimum change of a clock, in seconds, that the detector reports."""
+
+
+class ClockChange(NamedTuple):
+    """A change of an agent's clock. No entry before `position` has the new clock."""
+
+    position: int
+    reason: str
+    """A text such as "its clock was set by +30.0 s, as its messages show,"."""
 
 
 class ClockChangeDetector:
@@ -171,20 +181,19 @@ class ClockChangeDetector:
     def __init__(self, record: RecordedTrace) -> None:
         self._record = record
 
-    def shift_near(self, position: int) -> str | None:
-        """Return a text such as "its clock was set by +30.0 s" if the clock changed near this entry. Otherwise return
-        None.
-        """
+    def change_near(self, position: int) -> ClockChange | None:
+        """Return the change of the clock near this entry. Return None if the clock did not change."""
         if self._record.flight.record is not None:
             return None  # The agents of a run share one clock.
         jumps = [_largest_jump(differences, position) for differences in self._differences]
         known = [jump for jump in jumps if jump is not None]
         least_s = max(MIN_SHIFT_S, self._record.header.late_s)
-        shift_s = median(known) if known else 0.0
-        agreeing = sum(abs(jump - shift_s) <= least_s for jump in known)
-        if abs(shift_s) < least_s or 2 * agreeing <= len(known):
+        shift_s = median(jump.by_s for jump in known) if known else 0.0
+        agreeing = [jump for jump in known if abs(jump.by_s - shift_s) <= least_s]
+        if abs(shift_s) < least_s or 2 * len(agreeing) <= len(known):
             return None
-        return f"its clock was set by {shift_s:+.1f} s, as its messages show,"
+        first = min(max(jump.last_old for jump in agreeing) + 1, min(jump.first_new for jump in agreeing))
+        return ClockChange(first, f"its clock was set by {shift_s:+.1f} s, as its messages show,")
 
     @cached_property
     def _differences(self) -> list[list[tuple[int, float]]]:
@@ -204,11 +213,30 @@ class ClockChangeDetector:
         return differences
 
 
-def _largest_jump(differences: list[tuple[int, float]], position: int) -> float | None:
+class _Jump(NamedTuple):
+    """A change of the difference of two clocks, in seconds. It happened between the two entries at these positions."""
+
+    by_s: float
+    last_old: int
+    first_new: int
+
+
+def _largest_jump(differences: list[tuple[int, float]], position: int) -> _Jump | None:
     """Return the largest change of the clock difference around an entry. Return None if there are too few messages."""
-    shift_near = [offset_s for at, offset_s in differences if abs(at - position) <= WITHIN]
-    jumps = (
-        median(shift_near[number : number + MESSAGES]) - median(shift_near[number - MESSAGES : number])
-        for number in range(MESSAGES, len(shift_near) - MESSAGES + 1)
+    near = [message for message in differences if abs(message[0] - position) <= WITHIN]
+    offsets = [offset_s for _, offset_s in near]
+    groups = [
+        (median(offsets[max(number - MESSAGES, 0) : number]), median(offsets[number : number + MESSAGES]), number)
+        for number in range(1, len(near))
+    ]
+    if not groups:
+        return None
+    full = [group for group in groups[MESSAGES - 1 :] if group[2] <= len(near) - MESSAGES]
+    differing = [group for group in full if abs(group[1] - group[0]) >= MIN_SHIFT_S]
+    before_s, after_s, middle = max(differing or groups, key=lambda group: abs(group[1] - group[0]))
+    first_new = next(
+        number
+        for number in range(max(middle - MESSAGES, 0), len(near))
+        if abs(offsets[number] - after_s) <= abs(offsets[number] - before_s)
     )
-    return max(jumps, key=abs, default=None)
+    return _Jump(after_s - before_s, near[max(first_new - 1, 0)][0], near[first_new][0])

@@ -75,6 +75,8 @@ def test_names_of_the_judge_are_those_of_core_and_reference() -> None:
     assert {name for name, handler in HANDLERS.items() if handler.tally in votes} == vocabulary.COUNTS_VOTES
 
 
-def test_matrix_names_no_handler_if_the_judge_found_none() -> None:
+def test_deviation_without_a_handler_has_no_cause_if_no_file_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     broken = Judgement("every step", "deviates", "ucp/block.py was edited and contradicts the agent contract")
     assert first_cause(broken) is None
+    monkeypatch.setattr(_shared_code, "broken_files", lambda: "ucp/block.py")
+    assert first_cause(broken) == "ucp/block.py"

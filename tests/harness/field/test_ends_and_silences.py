@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks import field_damage
 from benchmarks.field_damage import bring_home
-from harness.field.replay import RecordPlayer, ReplayResult, open_record
+from harness.field.replay import RecordPlayer, ReplayResult, open_record, open_records
 from harness.play.progress import SilentProgress
 from harness.run.run import run
 from harness.run.simulate import simulate
@@ -163,6 +163,20 @@ def test_silently_ignored_messages_are_found_in_a_capture(monkeypatch: pytest.Mo
     for capture in (tmp_path / "home").glob("*.pcapng"):
         capture.unlink()
     assert RecordPlayer(open_record(tmp_path / "home", 2)).to_end().deviations == []
+
+
+@pytest.mark.parametrize("number", [0, 14, 16, 34])
+def test_agent_is_not_accused_if_its_clock_was_set_forward(tmp_path: Path, number: int) -> None:
+    """A timer runs while the clock is set. The records of the other agents show the change of the clock, or the agent
+    handles the timer with its next line.
+    """
+    flight, home = field_damage.scenario(number, "sim"), tmp_path / "home"
+    bring_home(flight, number, "sim", tmp_path / "run", home)
+    field_damage.set_clock_forward(home, Random(f"{number} clock set forward"))
+    for record in open_records(home):
+        assert RecordPlayer(record).to_end().deviations == []
+    judged = json.loads(harness("check", home, "--json").stdout)
+    assert {"violated", "deviates"}.isdisjoint(json.dumps(judged).split('"'))
 
 
 def test_clock_set_back_is_no_ignored_message(tmp_path: Path) -> None:
