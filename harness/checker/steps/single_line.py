@@ -3,7 +3,7 @@
 A file from the field may lack a line, or contain a damaged line that is still readable. The difference then does not
 prove a mistake of the agent. The module tries four kinds of damage:
 
-- One character of the line is wrong.
+- One character of the line is wrong, or the line contradicts itself.
 - The line and the next line are in the wrong order.
 - The line before this line is missing. The missing handler run changed no block, so no recorded state reveals it.
 - Several lines before this line are missing. They contained answers to one question, which often arrive together. One
@@ -34,7 +34,7 @@ from ucp.messages import (
     NextInSequenceResponse,
     encode,
 )
-from ucp.trace import HandlerRun, RecordedBytes
+from ucp.trace import HandlerRun, RecordedBytes, SentMessage
 from ucp.trigger import LocalTrigger, MessageTrigger
 
 Line = tuple[int, HandlerRun]
@@ -89,7 +89,7 @@ def damage_that_explains(
         return "a line is missing (its block may have an event that no line logs, and no record has the block)"
     if _has_impossible_top(before, deviation, line, following):
         return "the top chain hash on the line is damaged"
-    if _is_malformed(line[1]):
+    if _contradicts_itself(line[1], before.state.agent_id, others):
         return "the line is damaged"
     for trial in _with_a_line_more(before, line[1], others):
         if _agrees(trial, [line, *following]):
@@ -198,12 +198,21 @@ def _has_impossible_top(before: StepComparer, deviation: StepDeviation, line: Li
     return alike == expected.state and _agrees(before.copy(), [(number, other), *following])
 
 
-def _is_malformed(run: HandlerRun) -> bool:
-    if isinstance(run.trigger, MessageTrigger):
-        try:
+def _contradicts_itself(run: HandlerRun, agent_id: int, others: OtherRecords) -> bool:
+    """Return true if a datagram on the line is invalid, or is not the sent message that the line names.
+
+    An invalid sent datagram that another agent received is a mistake of the agent.
+    """
+    try:
+        if isinstance(run.trigger, MessageTrigger):
             decoded(run.input)
-        except MalformedDatagramError:
-            return True
+        for sent in run.sent:
+            if sent.datagram is not None:
+                whole = SentMessage.of(*decoded(sent.datagram))
+                if (whole.message, whole.seq, whole.block) != (sent.message, sent.seq, sent.block):
+                    return True
+    except MalformedDatagramError:
+        return not any(others.datagrams(agent_id, sent.seq) for sent in run.sent)
     return False
 
 
