@@ -530,12 +530,16 @@ def main() -> None:
     outside.setblocking(False)
 
     async def run() -> int:
-        return await StandIn(outside, task, mission, Path.cwd()).run()
+        status = await StandIn(outside, task, mission, Path.cwd()).run()
+        # The loop removes its handlers before this process ends. A second SIGTERM must not replace the agent's status.
+        signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM, signal.SIGINT))
+        return status
 
     status = asyncio.run(run())
     if status >= 0:
         sys.exit(status)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (-status,))
     if -status != signal.SIGKILL:
         signal.signal(-status, signal.SIG_DFL)
     os.kill(os.getpid(), -status)

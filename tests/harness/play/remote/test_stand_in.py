@@ -23,6 +23,7 @@ from harness.play.remote._wire import Channel, Kind, Message, hand_over
 from harness.play.remote.agent_pool import AgentPool, RemoteIncarnation
 from harness.play.remote.far_worker import MAX_UNSENT_BYTES, FarWorker, FileTail
 from harness.play.remote.stand_in import StandIn
+from harness.play.unix_sockets import bind_path
 from harness.scenario.load import parse
 
 DEADLINE_S = 10.0
@@ -147,6 +148,29 @@ def test_far_computer_that_lost_its_agent_is_reported(tmp_path: Path) -> None:
             assert {"gone": True} in reported(harness)
 
     play(resume)
+
+
+def test_signal_at_the_end_does_not_replace_the_status_of_the_agent(tmp_path: Path) -> None:
+    (tmp_path / "2.mission.json").write_bytes(MISSION)
+
+    async def end() -> None:
+        task = StandInTask(2, 2, 2, 4200, 1.0, measures_lag=False)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+            bind_path(listener, tmp_path / "join")
+            listener.listen(1)
+            command = [*task.command(tmp_path / "join"), "2.mission.json"]
+            program = await asyncio.create_subprocess_exec(*command, cwd=tmp_path)
+            harness, _ = listener.accept()
+        with harness:
+            far = FarEnd(harness)
+            await far.receive(Kind.BEGIN)
+            far.send(Kind.EXIT, json.dumps({"status": 0, "left_behind": [], "datagrams": 0}).encode())
+            while program.returncode is None:
+                program.send_signal(signal.SIGTERM)
+                await asyncio.sleep(0.001)
+        assert program.returncode == 0
+
+    play(end)
 
 
 def test_harness_reads_all_messages_of_a_stand_in_at_once(tmp_path: Path) -> None:
