@@ -2,11 +2,6 @@
 
 An export contains the time at which it was written. The agent's state at this time follows from the trace. The top
 chain hash of the state covers all blocks of the chain and their order.
-
-The module also compares the state that an agent stored on its disk with the state that it exported. An agent writes
-each change to its store before any other agent can observe the change. At its end, the store therefore contains the
-blocks of the export. Stores in a format other than `ucp-store/1` belong to agents of other authors and are not
-compared. The store of an agent with a full disk is not compared either, because it ends early.
 """
 
 from bisect import bisect_left, bisect_right
@@ -19,7 +14,6 @@ from harness.checker._trace_replay import ReplayedIncarnation, TraceObservation
 from harness.checker.evidence import Evidence
 from harness.checker.judgement import Finding
 from harness.checker.records.contradiction import ROUNDED_S, Contradiction, mission_s, of_agent, slack_s
-from ucp.store import SCHEMA, StoredState, StoreError, read_store
 from ucp.trace import StateSummary
 
 FIELDS = {
@@ -186,43 +180,3 @@ def _between_incarnations(
             observation = TraceObservation(line, run, what)
             yield Contradiction(finding(evidence, agent_id, observation))
         now = incarnation.runs[-1].t if incarnation.runs else now
-
-
-MAX_STORE_BYTES = 256 * 1024 * 1024
-
-
-def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each disk store that is damaged, or that differs from the agent's export."""
-    for agent_id, path in evidence.stores.items():
-        export, recorded = evidence.exports.get(agent_id), evidence.recorded(agent_id)
-        incarnations = evidence.incarnations.get(agent_id)
-        if export is None or recorded is None or recorded.outcome != "exported" or recorded.trace_problem:
-            continue
-        if incarnations is None or not any(run.changes for run in incarnations[-1].runs):
-            continue  # its last incarnation wrote no store
-        if not path.is_file() or path.stat().st_size > MAX_STORE_BYTES:
-            yield of_agent(
-                agent_id, f"its store {path.name} is not a file, or is larger than {MAX_STORE_BYTES} bytes", "2"
-            )
-            continue
-        try:
-            header, stored = read_store(path)
-        except (StoreError, OSError):
-            yield of_agent(agent_id, f"its store {path.name} is damaged", "2")
-            continue
-        if not isinstance(header, dict) or header.get("schema") != SCHEMA:
-            continue
-        for place in _differing(stored, export):
-            yield of_agent(agent_id, f"its store and its export differ in the {place}", "2")
-
-
-def _differing(stored: StoredState, export: Export) -> Iterator[str]:
-    for place, blocks, exported in (
-        ("chain", stored.chain, export.chain),
-        ("deque", stored.deque, export.blocks_to_be_committed),
-        ("reconcile stack", stored.stack, export.reconcile_stack),
-    ):
-        if [block.block_hash.hex() for block in blocks] != [block.block_hash for block in exported]:
-            yield place
-    if [block_hash.hex() for block_hash in stored.completed] != export.completed:
-        yield "completed blocks"

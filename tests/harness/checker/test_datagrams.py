@@ -15,7 +15,7 @@ import pytest
 from harness import checker
 from harness.archive.archive import RunArchive
 from harness.checker import Result, check, gather
-from harness.checker.records._datagrams_vs_traces import compare_channel
+from harness.checker.records import _channel_vs_traces
 from harness.play.progress import SilentProgress
 from harness.run.run import run
 from tests.harness.command import harness
@@ -195,7 +195,7 @@ def details(run: Path, edit: Callable[[Lines], Lines] | None = None) -> list[str
         journal.write_text("".join(json.dumps(line) + "\n" for line in lines))
     try:
         evidence = checker.gather(RunArchive(run))
-        return [contradiction.finding.detail for contradiction in compare_channel(evidence)]
+        return [contradiction.finding.detail for contradiction in _channel_vs_traces.compare(evidence)]
     finally:
         journal.write_text(original)
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from docs.generate.cures import STAGGER
-from harness.checker.records import _times
+from harness.checker.records import _headers
 from harness.errors import ScenarioError
 from harness.proof import Bounds, BoundsError
 from harness.proof.graph._exploration import explore
@@ -30,7 +30,7 @@ def test_each_agent_gets_its_own_timers_and_records_agree() -> None:
     assert not simulated.result.bad
     trace = simulated.evidence.traces[7]
     trace.header.settings["vote_timeout_s"] = 10.0
-    assert len([*_times.compare_headers(simulated.evidence)]) == 1
+    assert len([*_headers.compare_headers(simulated.evidence)]) == 1
 
 
 def test_stagger_ends_the_livelock_of_agents_in_step() -> None:
