@@ -69,6 +69,16 @@ def test_edit_of_shared_code_is_found_and_its_file_named(edit: Edit, tmp_path: P
     assert f"ucp/{edit.file} was edited and contradicts the agent contract" in found[1]
 
 
+def test_explore_names_the_handler_that_makes_blocks_too_large(tmp_path: Path) -> None:
+    """No message can carry such a block. The agents in memory nevertheless send it."""
+    edit = Edit("not cleared", "commit.py", "    core.current_block.clear()\n", "", "build_data_block")
+    mission = {"name": "edited", "agents": 2, "duration_s": 120, "events": {"source": "random", "mean_s": 3}}
+    (tmp_path / "scenario.yaml").write_text(yaml.safe_dump(mission), "utf-8")
+    done = run_edited(edit, tmp_path, "explore", "scenario.yaml", "--seeds", "1", "--jobs", "1", "--out", "found.yaml")
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "the first in Algorithm 1, build_data_block" in done.stdout
+
+
 def test_matrix_names_the_file_of_an_edit_of_shared_code(tmp_path: Path) -> None:
     edit = edits("edits_of_shared_code.yaml")[0]
     matrix = {"name": "edited", "scenario": {"duration_s": 100}, "loss": [0.0], "seeds": 2}
