@@ -167,13 +167,12 @@ def _was_received(before: StepComparer, expected: HandlerRun, run: HandlerRun, o
     The line is then correct about this message.
     """
     sent_by_both = [sent.datagram for sent in expected.sent]
-    for sent in run.sent:
-        if sent.datagram is not None and sent.datagram not in sent_by_both:
-            with suppress(ValueError):
-                data = base64.b64decode(sent.datagram.text, validate=True)
-                if data in others.datagrams(before.state.agent_id, sent.seq):
-                    return True
-    return False
+    return any(
+        sent.datagram is not None
+        and sent.datagram not in sent_by_both
+        and _was_received_as(sent, before.state.agent_id, others)
+        for sent in run.sent
+    )
 
 
 def _differ_in_one_character(text: str, other: str) -> bool:
@@ -201,19 +200,37 @@ def _has_impossible_top(before: StepComparer, deviation: StepDeviation, line: Li
 def _contradicts_itself(run: HandlerRun, agent_id: int, others: OtherRecords) -> bool:
     """Return true if a datagram on the line is invalid, or is not the sent message that the line names.
 
-    An invalid sent datagram that another agent received is a mistake of the agent.
+    If another agent received an invalid datagram, the agent has sent it, and the line is correct.
     """
-    try:
-        if isinstance(run.trigger, MessageTrigger):
-            decoded(run.input)
-        for sent in run.sent:
-            if sent.datagram is not None:
-                whole = SentMessage.of(*decoded(sent.datagram))
-                if (whole.message, whole.seq, whole.block) != (sent.message, sent.seq, sent.block):
-                    return True
-    except MalformedDatagramError:
-        return not any(others.datagrams(agent_id, sent.seq) for sent in run.sent)
+    if isinstance(run.trigger, MessageTrigger) and _sent_message(run.input) is None:
+        return True
+    for sent in run.sent:
+        if sent.datagram is None:
+            continue
+        whole = _sent_message(sent.datagram)
+        if whole is None and not _was_received_as(sent, agent_id, others):
+            return True
+        if whole is not None and (whole.message, whole.seq, whole.block) != (sent.message, sent.seq, sent.block):
+            return True
     return False
+
+
+def _sent_message(datagram: RecordedBytes | None) -> SentMessage | None:
+    """Return the message in a datagram. Return None if the datagram is invalid."""
+    try:
+        return SentMessage.of(*decoded(datagram))
+    except MalformedDatagramError:
+        return None
+
+
+def _was_received_as(sent: SentMessage, agent_id: int, others: OtherRecords) -> bool:
+    """Return true if another agent received exactly this datagram."""
+    assert sent.datagram is not None
+    try:
+        data = base64.b64decode(sent.datagram.text, validate=True)
+    except ValueError:
+        return False
+    return data in others.datagrams(agent_id, sent.seq)
 
 
 # A missing line

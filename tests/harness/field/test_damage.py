@@ -308,14 +308,20 @@ def test_damaged_hash_on_one_line_leads_to_no_accusation(
     ],
 )
 def test_line_that_contradicts_its_datagram_leads_to_no_accusation(
-    pattern: str, damaged: str, run: Path, tmp_path: Path
+    pattern: str, damaged: str, whole: tuple[Path, Undamaged], tmp_path: Path
 ) -> None:
-    """A key or a part of a sent datagram is damaged, and the line can still be parsed."""
-    lines = trace_of(run, 1).read_text("utf-8").splitlines(keepends=True)
+    """A key or a part of a sent datagram is damaged, and the line can still be parsed.
+
+    The records of the other agents contain the intact datagram.
+    """
+    home = tmp_path / "home"
+    shutil.copytree(whole[0], home)
+    path = home / "1.trace.jsonl"
+    lines = path.read_text("utf-8").splitlines(keepends=True)
     numbers = [number for number, line in enumerate(lines) if re.search(pattern, line)]
     assert len(numbers) > 5
     for number in numbers[::4]:
         other = re.sub(pattern, damaged, lines[number], count=1)
-        (tmp_path / "1.trace.jsonl").write_text("".join([*lines[:number], other, *lines[number + 1 :]]), "utf-8")
-        found = RecordPlayer(open_record(tmp_path / "1.trace.jsonl")).to_end()
+        path.write_text("".join([*lines[:number], other, *lines[number + 1 :]]), "utf-8")
+        found = RecordPlayer(open_record(home, 1)).to_end()
         assert [deviation.sentence(str) for deviation in found.deviations] == [], number
