@@ -60,6 +60,8 @@ class OtherRecords(Protocol):
 
 LINES_AFTER = 8
 """Number of lines after the difference that must agree with an explanation."""
+MAX_FURTHER = 2
+"""Maximum number of further lost lines among these lines."""
 MAX_ANSWERS = 4
 """Maximum number of lost answers to one question."""
 COUNTS = frozenset(ON_MESSAGE[kind].name for kind in (BlockAddResponse, ChainContainResponse, NextInSequenceResponse))
@@ -92,7 +94,7 @@ def damage_that_explains(
     if _contradicts_itself(line[1], before.state.agent_id, others):
         return "the line is damaged"
     for trial in _with_a_line_more(before, line[1], others):
-        if _agrees(trial, [line, *following]):
+        if _agrees(trial, [line, *following], others):
             return "a line is missing"
     for trial in _with_lines_more(before, [line[1], *(run for _, run in following)], others):
         if _agrees(trial, [line, *following]):
@@ -100,16 +102,24 @@ def damage_that_explains(
     return None
 
 
-def _agrees(follower: StepComparer, lines: Sequence[Line]) -> bool:
+def _agrees(
+    follower: StepComparer, lines: Sequence[Line], others: OtherRecords | None = None, lost: int = MAX_FURTHER
+) -> bool:
     """Return true if the reference agrees with the lines. Lines after the first block with different events do not
-    count.
+    count. If `others` is given, up to `lost` further lines may be missing between the lines.
     """
-    for number, run in lines:
+    start = None if others is None or not lost else follower.copy()
+    for place, (number, run) in enumerate(lines):
         if number > lines[0][0] and _damage_to_events(follower, run) is not None:
             return True
         follower.follow(number, run)
         if follower.deviations or follower.lost:
-            return False
+            if not place or start is None or others is None:
+                return False
+            for earlier in lines[:place]:
+                start.follow(*earlier)
+            trials = _with_a_line_more(start, run, others)
+            return any(_agrees(trial, lines[place:], others, lost - 1) for trial in trials)
     return True
 
 
@@ -260,11 +270,10 @@ def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
 
 
 def _completes_unknown_block(before: StepComparer, deviation: StepDeviation, run: HandlerRun) -> bool:
-    """Return true if the agent completed a block that its recorded events do not fill, and if no record contains this
-    block.
+    """Return true if the agent completed another block than its recorded events result in, and if no record contains
+    this block.
     """
-    expected = deviation.expected
-    if deviation.run is not run or expected is None or run.handler != LOGS or expected.changes or not run.changes:
+    if deviation.run is not run or deviation.expected is None or run.handler != LOGS or not run.changes:
         return False
     try:
         before.block(run.changes[0][1])

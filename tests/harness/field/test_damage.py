@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks import field_damage
 from benchmarks.field_damage import DAMAGES, Undamaged, bring_home, conclude
 from harness.archive.archive import RunArchive
 from harness.archive.traces import read_trace
@@ -19,7 +20,7 @@ from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.trace_header import checked
 from harness.field.ingest import ingest_files
 from harness.field.reconstruct import reconstruct
-from harness.field.replay import RecordPlayer, open_record
+from harness.field.replay import RecordPlayer, open_record, open_records
 from harness.field.replay.field_evidence import field_evidence
 from tests.harness.field.flights import flown, trace_of
 from tests.harness.virtual import scenario
@@ -325,3 +326,14 @@ def test_line_that_contradicts_its_datagram_leads_to_no_accusation(
         path.write_text("".join([*lines[:number], other, *lines[number + 1 :]]), "utf-8")
         found = RecordPlayer(open_record(home, 1)).to_end()
         assert [deviation.sentence(str) for deviation in found.deviations] == [], number
+
+
+@pytest.mark.parametrize("number", [119, 139])
+def test_three_lost_lines_near_each_other_lead_to_no_accusation(number: int, tmp_path: Path) -> None:
+    """In flight 119, no record has the block of a lost event. In flight 139, three answers are lost within 8 lines."""
+    flight, home = field_damage.scenario(number, "sim"), tmp_path / "home"
+    bring_home(flight, number, "sim", tmp_path / "run", home)
+    name = "three lines cut out of each trace"
+    DAMAGES[name](home, Random(f"{number} {name}"))
+    for record in open_records(home):
+        assert [deviation.sentence(str) for deviation in RecordPlayer(record).to_end().deviations] == []
