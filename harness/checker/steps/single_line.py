@@ -42,7 +42,7 @@ Line = tuple[int, HandlerRun]
 
 
 class OtherRecords(Protocol):
-    """The records of a flight from all agents other than the judged agent."""
+    """The records of a flight: those of all other agents, and the times of the judged agent's reconciles."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
         """Return the recorded datagrams with this sender and this sequence number."""
@@ -56,6 +56,9 @@ class OtherRecords(Protocol):
         """Return false if the records of other agents prove that the agent received no message of this kind from
         `sender` before this time.
         """
+
+    def was_reconciling(self, at_s: float) -> bool:
+        """Return true if the last trace line of the judged agent before this mission second shows a reconcile."""
 
 
 LINES_AFTER = 8
@@ -287,7 +290,7 @@ def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecord
     lost.
     """
     yield from _with_local_events_more(before, run)
-    yield from _with_an_expiry_more(before, run)
+    yield from _with_an_expiry_more(before, run, others)
     for message in _answers(before.state, run, others):
         for sender in sorted(before.roster - {before.state.agent_id}):
             if others.may_have_arrived(sender, message, run.t):
@@ -310,8 +313,17 @@ def _with_local_events_more(before: StepComparer, run: HandlerRun) -> Iterator[S
         yield trial.copy()
 
 
-def _with_an_expiry_more(before: StepComparer, run: HandlerRun) -> Iterator[StepComparer]:
-    """Yield copies of the reference after the expiry of a timer, and after the local events that follow."""
+def _with_an_expiry_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
+    """Yield copies of the reference after the expiry of a timer, and after the local events that follow.
+
+    During a reconcile, Algorithm 5 does nothing. The loss of its line therefore shows only after the reconcile.
+    """
+    voting = before.state.voting_timer
+    if voting.deadline is not None and others.was_reconciling(due_s := before.mission_s(voting.deadline)):
+        trial = before.copy()
+        if due_s <= run.t:
+            trial.stop_timer(voting.name)
+            yield trial
     for timer in before.state.timers:
         trial = before.copy()
         if trial.play_lost_expiry(timer.name, run.t):
@@ -329,7 +341,7 @@ def _with_lines_more(
         for trial in _with_answers_more(before, following, others, count):
             if count > 1:
                 yield trial
-            yield from _with_an_expiry_more(trial, following[0])
+            yield from _with_an_expiry_more(trial, following[0], others)
 
 
 def _with_answers_more(

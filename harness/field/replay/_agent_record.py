@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Protocol
 
@@ -172,6 +173,12 @@ class RecordedTrace:
             )
         sent = self._sent_by_complete_traces.get(sender)
         return sent is None or any(_are_alike(other, message) for other in sent)
+
+    def was_reconciling(self, at_s: float) -> bool:
+        """Return true if the last trace line before this mission second shows a reconcile."""
+        earlier = [entry.content for entry in self.entries if entry.content.t < at_s]
+        runs = (content for content in reversed(earlier) if isinstance(content, HandlerRun))
+        return any(run.state.reconciling for run in islice(runs, 1))
 
     @cached_property
     def _sent_by_complete_traces(self) -> dict[int, list[Message]]:

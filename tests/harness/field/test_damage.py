@@ -337,3 +337,23 @@ def test_three_lost_lines_near_each_other_lead_to_no_accusation(number: int, tmp
     DAMAGES[name](home, Random(f"{number} {name}"))
     for record in open_records(home):
         assert [deviation.sentence(str) for deviation in RecordPlayer(record).to_end().deviations] == []
+
+
+def test_lost_expiry_of_a_vote_during_a_reconcile_leads_to_no_accusation(five: Path, tmp_path: Path) -> None:
+    """Algorithm 5 does nothing during a reconcile. The loss of its line shows only at the next vote."""
+    home = tmp_path / "home"
+    shutil.copytree(five, home)
+    removed = 0
+    for agent_id in range(1, 6):
+        path = home / f"{agent_id}.trace.jsonl"
+        lines = path.read_text("utf-8").splitlines(keepends=True)
+        idle = [
+            number for number, line in enumerate(lines) if '"algorithm":5' in line and '"branch":"reconcile' in line
+        ]
+        for number in idle[:3]:
+            path.write_text("".join([*lines[:number], *lines[number + 1 :]]), "utf-8")
+            found = RecordPlayer(open_record(home, agent_id)).to_end()
+            assert [deviation.sentence(str) for deviation in found.deviations] == [], (agent_id, number)
+        path.write_text("".join(lines), "utf-8")
+        removed += len(idle[:3])
+    assert removed > 0
