@@ -330,7 +330,7 @@ def test_line_that_contradicts_its_datagram_leads_to_no_accusation(
 
 @pytest.mark.parametrize("number", [119, 139])
 def test_three_lost_lines_near_each_other_lead_to_no_accusation(number: int, tmp_path: Path) -> None:
-    """In flight 119, no record has the block of a lost event. In flight 139, three answers are lost within 8 lines."""
+    """Flight 119 has a lost event whose block is on no record. Flight 139 has three lost answers within 8 lines."""
     flight, home = field_damage.scenario(number, "sim"), tmp_path / "home"
     bring_home(flight, number, "sim", tmp_path / "run", home)
     name = "three lines cut out of each trace"
