@@ -4,19 +4,11 @@ The judge gives the recorded inputs of each agent, step by step, to the independ
 (`harness.checker.reference`). It compares branch, changes, messages, timers, vote counts and state. It needs only the
 recorded files of a run, so it judges agents in any language, and an edit of `ucp` does not change it. After a
 difference the judge continues from the agent's own state, so one mistake gives one finding.
-
-The module also finds timers that expired later than the measured delays of the machine can explain. A correct agent
-runs a timer late only if the machine wakes it late, or if its process is busy or waits for a processor. The harness
-measures both delays during a run (`lag.jsonl`). The measured delay is an upper bound, so a single timer reveals only a
-large error. If the duration of a timer is wrong, all expiries of this timer are late. Their mean lateness over the run
-then reveals smaller errors, too.
 """
 
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import replace
 from itertools import islice
-from statistics import mean
 
 from harness.archive.traces import Trace
 from harness.archive.vocabulary import IGNORED_KINDS, first_unknown, unknown_names
@@ -24,106 +16,16 @@ from harness.checker.evidence import Evidence
 from harness.checker.judgement import MAX_EVIDENCE, Finding, Judgement, agents, times
 from harness.checker.recorded_inputs import BlockIndex, decoded
 from harness.checker.records import cross_examine
-from harness.checker.records.contradiction import in_virtual_time
 from harness.checker.reference import why_not_handled
 from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE
 from harness.checker.steps import _shared_code
+from harness.checker.steps._late_timers import JudgedTimers
 from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.end_of_record import crashes, failure
-from harness.checker.steps.follower import OptionalTraceFields, RecordedTimerExpiry, StepComparer
-from harness.checker.steps.trace_header import (
-    ROUNDING_S,
-    CheckedHeader,
-    ImpossibleHeaderError,
-    UnknownSettingError,
-    checked,
-)
+from harness.checker.steps.follower import OptionalTraceFields, StepComparer
+from harness.checker.steps.trace_header import CheckedHeader, ImpossibleHeaderError, UnknownSettingError, checked
 from ucp.messages import MalformedDatagramError
 from ucp.trace import CommandEntry, DroppedDatagram
-
-SINGLE_WALL_S = 0.03
-"""Maximum lateness of a single timer, in seconds of wall time, that needs no explanation."""
-MEAN_WALL_S = 0.01
-"""Maximum mean lateness of one timer's expiries, in seconds of wall time, that needs no explanation."""
-ENOUGH = 8
-"""Minimum number of expiries for which a mean is computed."""
-
-
-@dataclass
-class JudgedTimers:
-    """The number of judged timer expiries of all agents, and the number of expiries for which the delay of the machine
-    was not measured.
-    """
-
-    expiries: int = 0
-    unmeasured: int = 0
-
-    @property
-    def remark(self) -> str:
-        """A remark about timers that could not be judged. It is an empty text if all timers were judged."""
-        if not self.unmeasured:
-            return ""
-        which = "timers" if self.unmeasured == self.expiries else f"{self.unmeasured} of {self.expiries} timers"
-        return f"; the lag of the machine is not recorded for {which}, so they may be up to 1 s of wall time late"
-
-    def judge(
-        self, evidence: Evidence, trace: Trace, expiries: Sequence[RecordedTimerExpiry]
-    ) -> Iterator[StepDeviation]:
-        """Yield the expiries of an agent's timers that were later than the measured delays of the machine explain."""
-        agent_id, speedup = trace.header.agent_id, trace.header.clock.get("speedup")
-        if in_virtual_time(trace):
-            yield from _in_virtual_time(evidence, agent_id, expiries)
-            return
-        if not isinstance(speedup, int | float) or speedup <= 0:
-            return
-        explained: dict[str, list[tuple[RecordedTimerExpiry, float]]] = defaultdict(list)
-        for expiry in expiries:
-            due_s = expiry.t - max(0.0, expiry.late_s)
-            lag_s = evidence.lag.explains(agent_id, due_s, expiry.t) if evidence.lag else None
-            self.expiries += 1
-            if lag_s is None:
-                self.unmeasured += 1
-            elif not evidence.was_paused(agent_id, due_s, expiry.t):
-                explained[expiry.timer].append((expiry, lag_s * speedup))
-        for timer, of_kind in explained.items():
-            yield from _of_kind(agent_id, timer, of_kind, speedup)
-
-
-def _in_virtual_time(
-    evidence: Evidence, agent_id: int, expiries: Sequence[RecordedTimerExpiry]
-) -> Iterator[StepDeviation]:
-    """Yield each expiry that is later than the delays of the scenario explain. Virtual time has no lag."""
-    for expiry in expiries:
-        due_s = expiry.t - max(0.0, expiry.late_s)
-        if expiry.late_s > ROUNDING_S and not evidence.was_delayed(agent_id, due_s, expiry.t):
-            what = f"it ran {expiry.late_s:.3g} s after the {expiry.timer} timer expired, and virtual time has no lag"
-            yield StepDeviation(agent_id, expiry.line, expiry.t, expiry.handler, what)
-
-
-def _of_kind(
-    agent_id: int, timer: str, expiries: list[tuple[RecordedTimerExpiry, float]], speedup: float
-) -> Iterator[StepDeviation]:
-    """Yield each expiry of this timer that was too late. If no single expiry was too late, but the mean lateness is too
-    high, yield the last expiry.
-    """
-    late = [(expiry, lag_s) for expiry, lag_s in expiries if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
-    for expiry, lag_s in late:
-        what = (
-            f"it ran {expiry.late_s:.3g} s after the {timer} timer expired, but the measured lag explains only "
-            f"{lag_s:.2g} s"
-        )
-        yield StepDeviation(agent_id, expiry.line, expiry.t, expiry.handler, what)
-    if late or len(expiries) < ENOUGH:
-        return
-    late_s, lag_s = mean(expiry.late_s for expiry, _ in expiries), mean(lag_s for _, lag_s in expiries)
-    if late_s > lag_s + MEAN_WALL_S * speedup:
-        last, _ = expiries[-1]
-        what = (
-            f"{len(expiries)} {timer} timers ran {late_s:.3g} s after they expired on average, but the measured lag "
-            f"explains only {lag_s:.2g} s"
-        )
-        yield StepDeviation(agent_id, last.line, last.t, last.handler, what)
-
 
 NAME = "every step"
 

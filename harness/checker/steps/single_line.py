@@ -319,11 +319,11 @@ def _with_an_expiry_more(before: StepComparer, run: HandlerRun, others: OtherRec
     During a reconcile, Algorithm 5 does nothing. The loss of its line therefore shows only after the reconcile.
     """
     voting = before.state.voting_timer
-    if voting.deadline is not None and others.was_reconciling(due_s := before.mission_s(voting.deadline)):
+    due_s = None if voting.deadline is None else before.mission_s(voting.deadline)
+    if due_s is not None and due_s <= run.t and others.was_reconciling(due_s):
         trial = before.copy()
-        if due_s <= run.t:
-            trial.stop_timer(voting.name)
-            yield trial
+        trial.stop_timer(voting.name)
+        yield trial
     for timer in before.state.timers:
         trial = before.copy()
         if trial.play_lost_expiry(timer.name, run.t):

@@ -278,7 +278,7 @@ def test_control_characters_of_a_record_are_not_printed(traces_only: Path) -> No
     change(traces_only / "2.trace.jsonl", swear)
     commands = "goto 21\ns\ncompare\nl\no\n"
     ended = harness("replay", traces_only, "--agent", 2, "--step", input=commands)
-    assert ended.returncode == 0, "what nobody understands is no accusation"
+    assert ended.returncode == 0, "unknown words of a trace accuse no agent"
     assert "[bold]" in ended.stdout
     assert not any(character in ended.stdout + ended.stderr for character in "\x1b\x07")
 
