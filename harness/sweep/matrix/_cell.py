@@ -41,7 +41,7 @@ class Run(CellRecord):
     the agents, the edited files instead. None if no step deviates.
     """
     steps: str = ""
-    """The fingerprint of the run's handler runs (see `_cell_play`). It is empty for real processes, and for runs
+    """The fingerprint of the run's handler runs (see `_run_steps`). It is empty for real processes, and for runs
     without traces.
     """
     failed: str | None = None

@@ -17,9 +17,9 @@ from pydantic import BaseModel, Field
 
 from harness.play.backends import BACKENDS
 from harness.sweep.matrix._cell import Cell, CellRecord, Run
-from harness.sweep.matrix._cell_play import FirstChange
 from harness.sweep.matrix._estimate import BY_NAME, CONFIDENCE, Estimate, Metric, estimate_mean
 from harness.sweep.matrix._matrix_file import MatrixPoint
+from harness.sweep.matrix._run_steps import FirstChange
 
 
 class Change(CellRecord):

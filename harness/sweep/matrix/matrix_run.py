@@ -22,13 +22,14 @@ from harness.run.provenance import versions
 from harness.scenario import Scenario
 from harness.sweep.matrix._away import AwayPlayer, AwayRun, cluster
 from harness.sweep.matrix._cell import Run, sum_up
-from harness.sweep.matrix._cell_play import FirstChange, Judge, RunPlayer, first_changed, name_change, simulated
+from harness.sweep.matrix._cell_play import Judge, RunPlayer, simulated
 from harness.sweep.matrix._comparison import Comparison, compare, compare_pairs, is_paired
 from harness.sweep.matrix._culprits import find_culprits
 from harness.sweep.matrix._estimate import BY_NAME, Estimate
 from harness.sweep.matrix._growth import growths
 from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint, MatrixTask
 from harness.sweep.matrix._results_file import MatrixResults, opened
+from harness.sweep.matrix._run_steps import FirstChange, first_changed, name_change
 from harness.sweep.matrix.matrix_record import CoverageTally, MatrixRecord, RunWithoutResult
 from harness.sweep.matrix.nights import BaselineNight
 

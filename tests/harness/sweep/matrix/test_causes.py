@@ -12,8 +12,8 @@ import pytest
 from harness.field.bisection import Outcome, UntestableError
 from harness.scenario import Scenario
 from harness.sweep.matrix import Finished, MatrixRecord, _culprits, matrix_outputs, run_matrix
-from harness.sweep.matrix._cell_play import fingerprint, first_changed, name_change
 from harness.sweep.matrix._culprits import find_culprits
+from harness.sweep.matrix._run_steps import fingerprint, first_changed, name_change
 from harness.sweep.matrix.matrix_run import compare_with, name_changes, on_cores
 from harness.sweep.matrix.matrix_table import changed_runs, troubles
 from harness.sweep.matrix.nights import BaselineNight, StoredNights
