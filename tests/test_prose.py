@@ -1,5 +1,6 @@
-"""Test that the texts are in plain English: pattern counts may only decrease, and subjects of new commits are short."""
+"""Test that the texts are in plain English: pattern counts may only decrease, and names and subjects are short."""
 
+import re
 import subprocess
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from tests.prose import COUNTS, EXCEPTIONS, REPOSITORY, counted, files, occurren
 RATCHET_START = "2026-11-24T15:30:00Z"
 """Commits after this time must have subjects of at most SUBJECT_LENGTH characters."""
 SUBJECT_LENGTH = 72
+TEST_NAME_LENGTH = 72
 
 
 def test_no_file_has_more_patterns_than_recorded() -> None:
@@ -40,6 +42,12 @@ def test_subjects_of_new_commits_have_at_most_72_characters() -> None:
     if log.returncode:
         pytest.skip("no git history: the subjects of commits cannot be read")
     assert [subject for subject in log.stdout.splitlines() if len(subject) > SUBJECT_LENGTH] == []
+
+
+def test_names_of_tests_have_at_most_72_characters() -> None:
+    sources = [path.read_text() for path in (REPOSITORY / "tests").rglob("*.py")]
+    names = [name for source in sources for name in re.findall(r"^\s*(?:async )?def (test_\w+)", source, re.MULTILINE)]
+    assert [name for name in names if len(name) > TEST_NAME_LENGTH] == []
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ class _Lines:
 def main(arguments: Sequence[str]) -> int:
     quirk, mission_file = arguments
     if mission_file == "--virtual":
-        virtual.serve(_Lines(quirk), sys.stdout.buffer)  # type: ignore[arg-type]  # all that it does is read lines
+        virtual.serve(_Lines(quirk), sys.stdout.buffer)  # type: ignore[arg-type]  # only lines are read
         return 0
     path = Path(mission_file)
     path.write_text(json.dumps(wrong(json.loads(path.read_text(encoding="utf-8")), quirk)), encoding="utf-8")

@@ -113,7 +113,7 @@ def test_second_opinion_refuses_a_setting_that_the_specification_lacks(setting: 
     ]
 
 
-def test_second_opinion_refuses_a_setting_whose_constant_the_specification_lacks(
+def test_second_opinion_refuses_settings_that_the_specification_lacks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "Swarm.tla").write_text((tlc.MODULES / "Swarm.tla").read_text().replace("Phase1TiePops", "Other"))
