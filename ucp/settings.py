@@ -125,21 +125,21 @@ class Settings:
     asks_after_commit: Annotated[
         bool,
         ChoiceSetting(
-            "Algorithms 5, 7 and 20: a finalize gap after its commit, an agent asks which agents do not follow. An "
-            "agent that has diverged then reconciles."
+            "Algorithms 5, 7 and 20: an agent that has committed its own block waits for the finalize gap, and then "
+            "sends a query. A receiver whose chain has diverged starts a reconcile."
         ),
     ] = False
     top_needs_majority: Annotated[
         bool,
         ChoiceSetting(
-            'Algorithm 15: "Is Top Of Chain" ends the search only if a vote would be approved: more than half of the '
-            "agents have this very chain."
+            'Algorithm 15: "Is Top Of Chain" ends the search only if more than half of the agents that answered have '
+            "this chain. The agent counts itself among them."
         ),
     ] = False
     phase1_tie: Annotated[
         Phase1Tie,
         _reading(
-            "Algorithm 11 on a tie: continue with phase 2 as printed, or pop another block.",
+            "Algorithm 11 after a tie: continue with phase 2, as in the thesis, or remove a further block.",
             "Phase1TiePops",
             get_args(Phase1Tie),
         ),
@@ -147,7 +147,8 @@ class Settings:
     phase2_tie: Annotated[
         Phase2Tie,
         _reading(
-            'Algorithm 15 on a tie: take the oldest timestamp, or never "Is Top Of Chain" while a block is on offer.',
+            'Algorithm 15 after a tie: select the answer with the oldest timestamp. With `block`, "Is Top Of Chain" '
+            "never wins a tie.",
             "Phase2TieTakesBlock",
             get_args(Phase2Tie),
         ),
@@ -156,8 +157,8 @@ class Settings:
     answer_spread_s: Annotated[
         float,
         NumberSetting(
-            "Greatest wait before an answer is sent (Algorithms 3, 9, 13 and 17). Each answer waits for its own share "
-            "of this time, so that the answers of many agents do not collide on a shared channel. 0 is no wait.",
+            "Maximum delay of an answer (Algorithms 3, 9, 13 and 17). Each answer has its own delay, so that the "
+            "answers of many agents do not collide on a shared channel. 0 means no delay.",
             "at least 0 seconds, less than each of the four timers",
             0,
             MAX_TIMER_S,
