@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import pytest
 
 from harness.play.remote.secret_file import create_secret
 from tests.harness.command import harness, sentences, write_scenario
-from tests.harness.two_computers import FAR, LISTEN, OUR_AGENT, TwoComputers, needs_two_computers, wait_until
+from tests.harness.two_computers import FAR, LISTEN, TwoComputers, needs_two_computers, wait_until
 from tests.machine import require_arm64
 from ucp import contract
 
@@ -34,14 +34,17 @@ def computers(tmp_path: Path) -> Iterator[TwoComputers]:
 def scenario(directory: Path, **keys: Any) -> Path:
     remote = {"agents": [2], "secret_file": "lab.key", "listen": LISTEN}
     usual = {"vehicles": {"kind": "none"}, "events": {"source": "random", "mean_s": 10}, "final_reconcile": True}
-    return write_scenario(directory, speedup=20, **usual, **{"remote": remote, **keys})
+    return write_scenario(directory, **{"speedup": 20, **usual, "remote": remote, **keys})
 
 
 def play(
-    computers: TwoComputers, path: Path, *disturb: Any, command: Sequence[object] = OUR_AGENT
+    computers: TwoComputers, path: Path, *disturb: Any, far: subprocess.Popen[str] | None = None
 ) -> tuple[dict[str, Any], str]:
-    """Play a run with agent 2 on the far computer. Return the content of run.json, and the output."""
-    far = computers.join("--service", command=command)
+    """Play a run with agent 2 on the far computer. Return the content of run.json, and the output.
+
+    `far` is the program with which the far computer joins, if it does not join with our agent.
+    """
+    far = far or computers.join("--service")
     run = computers.start("lab", "run", path, "--seed", 1, "--out", "run")
     for step in disturb:
         step()
@@ -118,7 +121,7 @@ def test_agent_on_an_arm64_processor_is_judged_as_any_agent(computers: TwoComput
         network={"loss": 0.1},
         timeline=[{"at_s": 60, "reboot": [2], "down_s": 20, "disk": "kept"}],
     )
-    record, output = play(computers, path, command=(emulator, program))
+    record, output = play(computers, path, far=computers.join("--service", command=(emulator, program)))
     assert (verdicts(record), record["status"]) == (GOOD, 0), output
     assert record["agents"]["2"]["version"] == "ucp_agent.c, 1"
 
