@@ -4,7 +4,7 @@ import asyncio
 import signal
 import threading
 import time
-from collections.abc import Collection, Coroutine
+from collections.abc import Callable, Collection, Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -45,6 +45,7 @@ from harness.scenario.scenario_file import to_yaml
 from ucp.agent_files import write_atomically
 
 REPLAY_FILE = "replay.yaml"
+CANCELLATION_CHECK_S = 0.5
 
 
 def replay_of(record: RunRecord, by_hand_s: Collection[float]) -> str:
@@ -100,6 +101,7 @@ def run(
     delivers_all: bool = False,
     interventions: Interventions | None = None,
     scheduler: str | None = None,
+    is_cancelled: Callable[[], bool] | None = None,
 ) -> Run:
     """Run a scenario, check the run, and write the run directory. Return the finished run.
 
@@ -111,6 +113,8 @@ def run(
       contain them.
     - `interventions`: faults that the user requests during the run. They must belong to this scenario.
     - `scheduler`: address of a Dask scheduler, whose workers run the agents. It needs the backend `process`.
+    - `is_cancelled`: is called repeatedly, for a run in a thread that receives no signals. If it returns true, the
+      mission ends as after Ctrl-C.
 
     Ctrl-C, SIGTERM, SIGHUP and SIGQUIT end the mission early. The agents are then exported, and the run is checked up
     to this moment. Ctrl-C during the check raises InterruptedRunError. The function also works inside a running event
@@ -135,11 +139,11 @@ def run(
         options |= {"interactive": interventions.prepares_all_agents, "pace": interventions.pace}
         interventions.on_entry_added = partial(recording.record_requests, interventions)
     interrupted = asyncio.Event()
+    running = _until_interrupted(interrupted, chosen, scenario, seed, recording.directory, progress, story, **options)
+    if is_cancelled is not None:
+        running = _until_cancelled(running, interrupted, is_cancelled)
     try:
-        played = _outcome_of(
-            _until_interrupted(interrupted, chosen, scenario, seed, recording.directory, progress, story, **options),
-            interrupted,
-        )
+        played = _outcome_of(running, interrupted)
     except HarnessError as error:
         recording.fail(error)
         raise
@@ -288,6 +292,23 @@ def _outcome_of(run: Coroutine[Any, Any, RunOutcome], interrupted: asyncio.Event
         except KeyboardInterrupt:
             loop.call_soon_threadsafe(interrupted.set)
             return playing.result()
+
+
+async def _until_cancelled(
+    running: Coroutine[Any, Any, RunOutcome], interrupted: asyncio.Event, is_cancelled: Callable[[], bool]
+) -> RunOutcome:
+    """Carry out a run. Set `interrupted` as soon as `is_cancelled` returns true."""
+
+    async def watch() -> None:
+        while not is_cancelled():
+            await asyncio.sleep(CANCELLATION_CHECK_S)
+        interrupted.set()
+
+    watching = asyncio.create_task(watch())
+    try:
+        return await running
+    finally:
+        watching.cancel()
 
 
 _ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)

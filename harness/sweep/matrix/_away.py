@@ -67,7 +67,7 @@ class AwayPlayer:
 
         worker: Any = get_worker()
         with TemporaryDirectory(prefix="ucp-", dir=worker.local_directory) as scratch:
-            there = replace(self.play, directory=Path(scratch))
+            there = replace(self.play, directory=Path(scratch), is_cancelled=_cancellation(worker))
             outcome = outcome_of(_checked(there), task)
             archive = _pack(Path(scratch), directory_name(task))
         if isinstance(outcome, FailedTask):
@@ -75,6 +75,19 @@ class AwayPlayer:
         elif isinstance(outcome, HarnessError):
             outcome.args = (f"the worker at {worker.address} cannot play a run: {outcome}",)
         return AwayRun(outcome, archive)
+
+
+def _cancellation(worker: Any) -> Callable[[], bool]:
+    """Return a function that returns true if the scheduler has cancelled the present task of this thread, for example
+    because the user pressed Ctrl-C. Dask does not end an active task itself.
+    """
+    key = worker.get_current_task()
+
+    def is_cancelled() -> bool:
+        task = worker.state.tasks.get(key)
+        return task is None or task.state == "cancelled"
+
+    return is_cancelled
 
 
 def _checked(play: RunPlayer) -> Callable[[MatrixTask], Run]:

@@ -79,6 +79,8 @@ class RunPlayer:
     """The function that carries out and judges simulated runs."""
     covers: bool = False
     """True if the coverage of each run is measured. If it is true, `judge` is not used in virtual time."""
+    is_cancelled: Callable[[], bool] | None = None
+    """A function that returns true if a run with real programs must end early, for a thread without signals."""
 
     def __call__(self, task: MatrixTask) -> Run:
         scenario = self.matrix.scenario_at(task.point)
@@ -123,7 +125,9 @@ class RunPlayer:
         directory = self.directory / directory_name(task)
         shutil.rmtree(directory, ignore_errors=True)  # remains of an interrupted run
         try:
-            finished = run(scenario, task.seed, directory, SilentProgress(), task.point.backend)
+            finished = run(
+                scenario, task.seed, directory, SilentProgress(), task.point.backend, is_cancelled=self.is_cancelled
+            )
         except HarnessError as error:  # errors that every run would have were found by `refuse`
             raise RunFailedError(f"{error}; see {directory}") from None
         if finished.played.outcome == "interrupted":

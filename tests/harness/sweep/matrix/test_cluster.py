@@ -3,6 +3,7 @@
 import contextlib
 import json
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -168,6 +169,22 @@ def test_killed_worker_loses_no_run_of_processes(tmp_path: Path, dask: Cluster) 
     for seed in (1, 2, 3, 4):
         (directory,) = (out / "runs").glob(f"*-process-seed-{seed}")
         assert harness("check", directory).returncode in (0, 4)
+
+
+@pytest.mark.lab
+def test_ctrl_c_ends_the_runs_of_workers(tmp_path: Path, dask: Cluster) -> None:
+    address = dask.start_scheduler()
+    dask.start_worker(address, "one")
+    asked, out = of_processes(tmp_path, scenario={"duration_s": 100_000}), tmp_path / "out"
+    command = [*COMMAND, "matrix", str(asked), "--scheduler", address, "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        until(lambda: any(tmp_path.glob("dask/one/**/agents/*.trace.jsonl")) or process.poll() is not None)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == 130, said
+    until(lambda: not any(tmp_path.glob("dask/one/**/agents")))
+    with cluster([-1], abs, address) as outcomes:
+        assert list(outcomes) == [(-1, 1)]
 
 
 @pytest.mark.lab
