@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
-import json
 import math
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Literal
 
 import pytest
 
 from sitl._plane import LOITER_RADIUS_M
 from sitl.plan import By, GoTo, Land, Loiter, Plan, PlanError, TakeOff
-from sitl.track import VehicleTrack, track
+from sitl.track import track
 from sitl.vehicle import VehicleType
 from tests.sitl.cockpit import Cockpit
 from tests.sitl.flying import HOME
 from tests.sitl.recorded import flight
 
-TRACKS = Path(__file__).parent / "tracks"
 SQUARE = Plan(
     (TakeOff(20), *(GoTo(*corner, speed_ms=5) for corner in ((100, 0), (100, 100), (0, 100), (0, 0))), Land())
 )
@@ -73,47 +68,6 @@ def test_impossible_plan_is_refused() -> None:
         track("rover", SQUARE)
 
 
-def recorded(by: str) -> list[tuple[float, float, float, float]]:
-    document = json.loads((TRACKS / f"arducopter_3.5.7_{by}.json").read_text())
-    return [tuple(point) for point in document["points"]]
-
-
-def climbed_s(points: list[tuple[float, float, float, float]], altitude_m: float) -> float:
-    """Return the time at which a climb first passed an altitude."""
-    for (before_s, *_, low_m), (after_s, *_, high_m) in itertools.pairwise(points):
-        if low_m < altitude_m <= high_m:
-            return before_s + (altitude_m - low_m) / (high_m - low_m) * (after_s - before_s)
-    raise AssertionError("it never climbed")
-
-
-def arrivals_s(points: list[tuple[float, float, float, float]]) -> list[float]:
-    """Return the times at which the vehicle first came within 5 m of each corner of the square, and of the ground."""
-    corners = [(100, 0, 20), (100, 100, 20), (0, 100, 20), (0, 0, 20), (0, 0, 0)]
-    remaining, arrivals = iter(points), []
-    for corner in corners:
-        arrivals.append(next(time_s for time_s, *place in remaining if math.dist(place, corner) < 5))
-    return arrivals
-
-
-def as_points(computed: VehicleTrack) -> list[tuple[float, float, float, float]]:
-    return [(tenth / 10, *computed.at(tenth / 10)) for tenth in range(round(computed.course.end_s * 10))]
-
-
-@pytest.mark.parametrize("by", ["mission", "guided"])
-def test_recorded_square_of_a_copter_equals_the_track(by: str) -> None:
-    """The copter is always within 2 m of the computed path. Each side and the landing take as long as computed, within
-    4 s.
-
-    Times count from the middle of the take-off. The recorded copter is of 2018. It leaves each waypoint sooner than
-    version 4.7.
-    """
-    real, model = recorded(by), as_points(track("copter", SQUARE))
-    line = [place for _, *place in model]
-    assert max(min(math.dist(place, near) for near in line) for _, *place in real) < 2.0
-    real_s, model_s = (list(legs_s(points)) for points in (real, model))
-    assert real_s == pytest.approx(model_s, abs=4.0)
-
-
 OUT_AND_BACK = {
     "copter": (TakeOff(30), GoTo(200, 100, speed_ms=8), Loiter(60), GoTo(0, 0), Land()),
     "rover": (GoTo(150, 50, speed_ms=4), Loiter(60), GoTo(0, 0)),
@@ -145,8 +99,3 @@ def test_recorded_plane_is_near_the_track(by: By) -> None:
     flown = flight(f"plane-{by}")  # type: ignore[arg-type]
     assert max(math.dist(place, computed.at(second)) for second, *place in flown) < 80.0
     assert max(min(math.dist(place[:2], near) for near in path) for _, *place in flown) < 30.0
-
-
-def legs_s(points: list[tuple[float, float, float, float]]) -> Iterator[float]:
-    for before_s, after_s in itertools.pairwise([climbed_s(points, 10), *arrivals_s(points)]):
-        yield after_s - before_s

@@ -19,7 +19,6 @@ from statistics import median
 from typing import Protocol
 
 from harness.field.flight_logs._records import FlightLog, FlightRecord, Position, VehicleLog
-from harness.present import text
 
 MAX_PLACES = 500
 """Maximum number of an agent's positions that are used to find the time difference between the agent and a
@@ -326,8 +325,3 @@ def _turns(
 
 def _time(record: FlightRecord) -> int:
     return record.at_us if record.utc_us is None else record.utc_us
-
-
-def change_in_words(change: LoggedChange) -> tuple[str, str, str]:
-    """Return the time, the agent and the kind of the change, each as text."""
-    return text.moment(change.at_us), "" if change.agent_id is None else str(change.agent_id), change.words

@@ -21,7 +21,6 @@ from harness.run.run import run
 from harness.run.simulate import Simulated, simulate
 from harness.scenario import load_scenario
 from tests.harness.command import Running, sentences, write_scenario
-from tests.harness.scenario.test_scenarios import LIVELOCKS
 from tests.harness.virtual import scenario
 from tests.machine import require, unavailable
 from ucp.agent import HANDLERS
@@ -316,14 +315,6 @@ def test_judged_traces_equal_the_trace_files(name: str, tmp_path: Path) -> None:
     for agent_id, trace in files.items():
         assert trace.header.model_dump() == judged[agent_id].header.model_dump()
         assert replace(trace, header=judged[agent_id].header) == judged[agent_id]
-
-
-@pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*[!x].yaml")), ids=lambda path: path.stem)
-def test_every_scenario_runs_in_virtual_time(path: Path) -> None:
-    simulated = simulate(load_scenario(path), 1, tracing=True)
-    assert simulated.played.settled == (path.stem not in LIVELOCKS)
-    found = (*LIVELOCKS, "rogue", "captured", "missed_commit", "field_test_2020")
-    assert bool(simulated.result.bad) == (path.stem in found)
 
 
 @pytest.mark.parametrize(
