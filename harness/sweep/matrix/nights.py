@@ -103,7 +103,7 @@ MAX_BYTES = 64 * 1024 * 1024
 def _load(path: Path) -> MatrixRecord:
     """Load matrix.json. Raises ScenarioError unless it contains finished results of a matrix.
 
-    Raises OtherVersionError if the file names the schema but does not match it.
+    Raises OtherVersionError if the file has another version of the schema, or does not match its schema.
     """
     try:
         document = read_json(path, MAX_BYTES)
@@ -112,6 +112,8 @@ def _load(path: Path) -> MatrixRecord:
     except ValueError as error:
         raise ScenarioError(f"{path}: {json_problem(error)}; name the matrix.json of an earlier night") from None
     schema = document.get("schema") if isinstance(document, dict) else None
+    if schema != SCHEMA and isinstance(schema, str) and re.fullmatch(rf"{SCHEMA.partition('/')[0]}/\d{{1,9}}", schema):
+        raise OtherVersionError(f"{path} has schema {schema}, and this version of the harness reads {SCHEMA}")
     if schema != SCHEMA:
         claim = f"has schema {shown(schema)}" if schema is not None else "names no schema"
         raise ScenarioError(f"{path} {claim}: name the matrix.json of an earlier night, whose schema is {SCHEMA}")

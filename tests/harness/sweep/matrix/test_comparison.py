@@ -160,12 +160,19 @@ def test_cells_that_differ_are_named_and_not_compared(
     assert ("worse than" in summary) == bool(compared)
 
 
-def test_baseline_of_another_version_is_named_and_not_compared(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ('{"schema": "ucp-matrix/1"}', ": this version of the harness cannot read its `matrix`"),
+        ('{"schema": "ucp-matrix/2"}', " has schema ucp-matrix/2, and this version of the harness reads ucp-matrix/1"),
+    ],
+)
+def test_baseline_of_another_version_is_named_and_not_compared(tmp_path: Path, content: str, sentence: str) -> None:
     path = tmp_path / "baseline.json"
-    path.write_text('{"schema": "ucp-matrix/1"}')
+    path.write_text(content)
     finished = tonight(path)
     assert finished.record.against is not None
-    sentence = f"{path}: this version of the harness cannot read its `matrix`, so no cell is compared"
+    sentence = f"{path}{sentence}, so no cell is compared"
     assert finished.record.against.not_compared == [sentence]
     matrix_outputs.write(finished, tmp_path)
     assert f"- {escaped(sentence)}\n" in (tmp_path / "summary.md").read_text()

@@ -48,7 +48,7 @@ def test_files_that_are_no_night_of_this_matrix_are_named(tmp_path: Path) -> Non
     said = " | ".join(found.left_out)
     assert "contains results of another matrix: `loss` differs" in said
     assert f"{tmp_path / 'a.json'}: not JSON at line 1" in said
-    assert f"{tmp_path / 'b.json'} has schema 'ucp-matrix/2'" in said
+    assert f"{tmp_path / 'b.json'} has schema ucp-matrix/2, and this version" in said
     assert f"{tmp_path / 'c.json'}: cannot be read: is a directory" in said
     assert "cannot read its `cells.0.estimates.uniform.mean`" in said
     assert found.said_left_out == f"5 files in {tmp_path} are not in the trend"
