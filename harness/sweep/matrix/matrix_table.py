@@ -38,7 +38,8 @@ def render(record: MatrixRecord) -> RenderableType:
     better = (Text(note, style="green") for note in improvements(record))
     changed = (Text(note, style="yellow") for note in changed_runs(record))
     explained = Text(explanation(record) + unjudged(record), style="dim")
-    return Group(*parts, explained, *_growth_table.render(record), *notes, *lacking, *better, *changed)
+    growth = _growth_table.render(record)
+    return Group(*parts, explained, *growth, Text(verdict(record)), *notes, *lacking, *better, *changed)
 
 
 def _table(record: MatrixRecord, cells: Sequence[Cell]) -> Table:

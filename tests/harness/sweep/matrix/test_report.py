@@ -322,6 +322,13 @@ def test_share_of_finished_swarms_is_a_column() -> None:
     assert [figure.of(finished.record.cells[1]).mean for figure in known_figures(finished.record.cells)][-2] == 0.25
 
 
+def test_terminal_has_the_headline_of_the_page() -> None:
+    record = played(matrix(), 1, judge).record
+    shown = Console(width=100, record=True, file=io.StringIO())
+    shown.print(matrix_table.render(record))
+    assert f"\n{matrix_table.verdict(record)}\n" in shown.export_text()
+
+
 def test_column_without_values_is_left_out() -> None:
     shown = Console(width=100, record=True, file=io.StringIO())
     shown.print(matrix_table.render(played(matrix(), 1, judge).record))
