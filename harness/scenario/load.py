@@ -110,7 +110,8 @@ def read_yaml(path: Path, what: str) -> dict[str, object]:
         text = read_text(path, MAX_SCENARIO_BYTES)
     except FileNotFoundError:
         names = "`ucp-harness scenarios` lists the included scenarios"
-        raise ScenarioError(f"{path}: no such file or {what}; {names}{did_you_mean(path, _near(path))}") from None
+        hint = did_you_mean(path, _near(path)) or did_you_mean(path.stem, scenario_names())
+        raise ScenarioError(f"{path}: no such file or {what}; {names}{hint}") from None
     except OSError as error:
         raise ScenarioError(f"{str(path)[:MAX_PROBLEM]}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -140,7 +141,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
     problems: list[Any] = error.errors()
     problem = max(problems, key=lambda candidate: (len(candidate["loc"]), candidate["type"] == "extra_forbidden"))
     key = ".".join(shown_key(part) for part in problem["loc"])
-    if problem["type"] == "extra_forbidden":
+    if problem["type"] in ("extra_forbidden", "invalid_key"):
         allowed = _siblings(model, problem["loc"])
         return f"`{key}` is unknown: use one of {', '.join(allowed)}{did_you_mean(problem['loc'][-1], allowed)}"
     if problem["type"] == "missing":

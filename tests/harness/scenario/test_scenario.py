@@ -40,6 +40,7 @@ def test_scenario_with_only_a_name_is_the_experiment_of_the_thesis(tmp_path: Pat
         ("name: x\ntimeline: [{at_s: 3, partion: [[1]]}]", "; did you mean `partition`?"),
         ("name: x\nsettings: {vote_timout_s: 3}", "; did you mean `vote_timeout_s`?"),
         ("name: x\nvehicles: {kind: ardupilt}", "; did you mean `ardupilot`?"),
+        ("name: x\nexpect: {6: violated}", "`expect.6` is unknown: use one of characteristics, "),
         ("name: x\nexpect: {figures: {mutual_chian: 3}}", "; did you mean `mutual_chain`?"),
         ("name: x\ntimeline: [{at_s: 1, kill: 2}]", "`timeline.0.kill` is 2: it should be a valid list, as [2]"),
         (
@@ -183,6 +184,8 @@ def test_alias_bomb_is_refused_with_a_short_error(tmp_path: Path) -> None:
 def test_missing_or_oversized_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="no such file or scenario; `ucp-harness scenarios` lists"):
         load_scenario(tmp_path / "none.yaml")
+    with pytest.raises(ScenarioError, match=r"; did you mean `loss_15`\?"):
+        load_scenario(tmp_path / "los_15.yaml")
     with pytest.raises(ScenarioError, match="larger than"):
         load_scenario(write(tmp_path, "#" * 9_000_000))
 
