@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 from pydantic import ValidationError
 
 from harness.archive.directory import claim
-from harness.errors import MachineError, RunDirectoryError
+from harness.errors import HarnessError, MachineError, RunDirectoryError
 from harness.sweep.matrix._cell import Run
 from harness.sweep.matrix._matrix_file import Matrix, MatrixTask
 from ucp.agent_files import write_atomically
@@ -47,11 +47,13 @@ class MatrixResults:
 
 @contextlib.contextmanager
 def opened(directory: Path, matrix: Matrix) -> Iterator[MatrixResults]:
-    """Open the results of `matrix` in `directory`, which may be new or empty.
+    """Open the results of `matrix` in `directory`, which may be new or empty. If the matrix cannot be played, and a new
+    directory contains no result, remove the directory.
 
     Raises RunDirectoryError if the directory contains other files, or if another command uses it.
     """
     path = directory / FILE
+    is_new = not directory.exists()
     with contextlib.ExitStack() as stack:
         try:
             if not path.exists():
@@ -71,7 +73,14 @@ def opened(directory: Path, matrix: Matrix) -> Iterator[MatrixResults]:
         started_at = _start_time(first, matrix, directory)
         file.truncate(whole)
         file.seek(whole)
-        yield MatrixResults(directory, started_at, _read(lines, matrix, path), file)
+        results = MatrixResults(directory, started_at, _read(lines, matrix, path), file)
+        try:
+            yield results
+        except HarnessError:
+            if is_new and [*directory.iterdir()] == [path] and not results.runs:
+                path.unlink()
+                directory.rmdir()
+            raise
 
 
 def _header(matrix: Matrix) -> dict[str, object]:

@@ -66,6 +66,18 @@ def test_a_crashed_run_is_a_result(tmp_path: Path) -> None:
     assert again.cells == first.cells
 
 
+@pytest.mark.parametrize("done", [0, 3])
+def test_directory_of_an_unplayable_matrix_remains_only_with_results(tmp_path: Path, done: int) -> None:
+    def lacks(scenario: Scenario, seed: int) -> Result:
+        if seed > done:
+            raise MachineError("this machine lacks a program")
+        return judge(scenario, seed)
+
+    with pytest.raises(MachineError):
+        played(matrix(), 1, lacks, tmp_path / "out")
+    assert (tmp_path / "out").exists() == (done > 0)
+
+
 @pytest.mark.parametrize("padding", [0, 5000])
 def test_half_a_last_line_is_played_again(tmp_path: Path, padding: int) -> None:
     whole = played(matrix(), 1, judge, tmp_path)
