@@ -1,6 +1,6 @@
 # make run    play the thesis's 15 % loss experiment and write a report
-# make check  run lint, types and the essential tests, in three minutes
-# make test   run all tests
+# make check  run lint, types and the essential tests, in two minutes on two idle cores
+# make test   run all tests, in 20 minutes on two idle cores
 # All set up what they need: Debian packages (asking sudo if you are not root) and a virtual environment in .venv.
 
 PYTHON ?= python3
