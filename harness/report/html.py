@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
+from importlib.util import cache_from_source
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +28,14 @@ PAGE_STYLE = PALETTE + (_HERE / "page.css").read_text(encoding="utf-8")
 
 
 class _TemplateCache(BytecodeCache):
-    """A cache that stores compiled templates in `__pycache__`, beside the compiled modules of Python. To compile the
+    """A cache that stores compiled templates in the directory in which Python caches this module. To compile the
     template of a report takes longer than to render it.
     """
 
     def _file(self, bucket: Bucket) -> Path:
-        return _HERE / "__pycache__" / f"{bucket.key}.{sys.implementation.cache_tag}.j2c"
+        return Path(cache_from_source(str(_HERE / "html.py"))).with_name(
+            f"{bucket.key}.{sys.implementation.cache_tag}.j2c"
+        )
 
     def load_bytecode(self, bucket: Bucket) -> None:
         with suppress(OSError, EOFError, ValueError, TypeError), self._file(bucket).open("rb") as file:

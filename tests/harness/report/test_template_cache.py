@@ -13,6 +13,7 @@ PAGE = "<p>{{ words }}</p>{% for style in styles %}{{ style }}{% endfor %}"
 def template(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(html, "_HERE", tmp_path)
     monkeypatch.setattr("sys.dont_write_bytecode", False)
+    monkeypatch.setattr("sys.pycache_prefix", None)
     (tmp_path / "__pycache__").mkdir()
     path = tmp_path / "page.j2"
     path.write_text(PAGE)
@@ -50,6 +51,17 @@ def test_damaged_file_in_the_cache_is_replaced(template: Path, content: bytes) -
     whole = file.read_bytes()
     file.write_bytes(content or whole[: len(whole) // 2])
     assert drawn(template) == "<p>a &lt; b</p>x"
+
+
+def test_templates_are_cached_below_the_prefix_of_python(
+    template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    below = Path(f"{tmp_path}/prefix{tmp_path}")
+    below.mkdir(parents=True)
+    monkeypatch.setattr("sys.pycache_prefix", f"{tmp_path}/prefix")
+    drawn(template)
+    assert len([*below.iterdir()]) == 1
+    assert cached(template) == []
 
 
 def test_nothing_is_written_without_a_cache_directory(template: Path) -> None:
