@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 STYLE = (Path(__file__).parent / "chart.css").read_text(encoding="utf-8")
 
@@ -191,6 +191,13 @@ def document(
             foot=foot,
         )
     )
+
+
+def filled(template: str, *values: object) -> Markup:
+    """Insert values into a template and escape their text, except Markup. `Markup(template).format(*values)` gives the
+    same result, but takes more than twice as long.
+    """
+    return Markup(template.format(*map(escape, values)))  # noqa: S704 - the values are escaped
 
 
 def n(number: float) -> str:

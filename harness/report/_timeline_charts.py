@@ -16,7 +16,7 @@ from harness.archive.replication import ReplicationFigures
 from harness.archive.run_record import Cycle, FaultRecord
 from harness.checker.recurring_cycles import findings, in_words
 from harness.present import text
-from harness.present.svg import linear_axis, n
+from harness.present.svg import filled, linear_axis, n
 
 TICK_HEIGHT = 22
 
@@ -176,8 +176,12 @@ def _chart(
     ]
     until = [*(moment.at_s for moment in moments[1:]), end_s]
     tips = [
-        Markup('<rect class="tip" x="{}" width="{}" height="{}"><title>{}</title></rect>').format(
-            format_number(moment.at_s), format_number(until_s - moment.at_s), HEIGHT, _tip(moment, figures, name)
+        filled(
+            '<rect class="tip" x="{}" width="{}" height="{}"><title>{}</title></rect>',
+            format_number(moment.at_s),
+            format_number(until_s - moment.at_s),
+            HEIGHT,
+            _tip(moment, figures, name),
         )
         for moment, until_s in zip(moments, until, strict=True)
         if until_s > moment.at_s

@@ -3,8 +3,6 @@ bottom.
 
 No information depends on colour alone. Votes without approval are hollow, phases of a reconcile have different heights,
 faults have different shapes, and each mark has a tooltip.
-
-Frequent marks are formatted with `%`. It escapes text like `format`, but takes a third of the time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +22,7 @@ from harness.archive.history import (
     ReconcilePhase,
 )
 from harness.archive.run_record import FaultRecord
-from harness.present.svg import n
+from harness.present.svg import filled, n
 from harness.report._timeline_charts import (
     PartitionShade,
     draw_background,
@@ -207,7 +205,8 @@ def _css_class(outcome: str) -> str:
 
 def _vote(vote: AgentVote, names: Mapping[str, str]) -> Markup:
     tip = f"agent {vote.agent}: vote on {block_label(vote.block, names)}, {_from_to(vote)}:"
-    return Markup('<rect class="vote %s" x="%s" y="3" width="%s" height="%s"><title>%s</title></rect>') % (
+    return filled(
+        '<rect class="vote {}" x="{}" y="3" width="{}" height="{}"><title>{}</title></rect>',
         _css_class(vote.outcome),
         format_number(vote.start_s),
         format_number(vote.end_s - vote.start_s),
@@ -235,7 +234,8 @@ def _bar(reconcile: AgentReconcile, lane_height: int) -> Markup:
 
 
 def _reconcile_bar(span: ReconcilePhase | AgentReconcile, height: int, lane_height: int, tip: str) -> Markup:
-    return Markup('<rect class="reconcile" x="%s" y="%s" width="%s" height="%s"><title>%s</title></rect>') % (
+    return filled(
+        '<rect class="reconcile" x="{}" y="{}" width="{}" height="{}"><title>{}</title></rect>',
         format_number(span.start_s),
         lane_height - 3 - height,
         format_number(span.end_s - span.start_s),
@@ -257,7 +257,8 @@ def _commit(group: Sequence[BlockCommit], lane_height: int, names: Mapping[str, 
     top, bottom = _VOTE_HEIGHT + 4, lane_height - _PHASES_HEIGHT - 1
     if bottom - top < 6:
         top, bottom = 2, lane_height - 2
-    return Markup('<path class="commit" d="M%s %sV%s"><title>%s</title></path>') % (
+    return filled(
+        '<path class="commit" d="M{} {}V{}"><title>{}</title></path>',
         format_number(first.at_s),
         top,
         bottom,

@@ -12,6 +12,7 @@ from markupsafe import Markup
 from harness.archive.exports import Export, name_blocks
 from harness.present import text as words
 from harness.present.colours import AgentColours
+from harness.present.svg import filled
 from harness.report.chain_tree import (
     BOX_HEIGHT,
     FONT_SIZE,
@@ -141,17 +142,22 @@ class ChainTreePicture:
         text = _text(placed, "#1c2126")
         if mark.kind == "ellipsis":
             first, last = self._name(mark.nodes[0]), self._name(mark.nodes[-1])
-            return Markup('<g class="ellipsis"><title>{} to {}, of {}</title>{}</g>\n').format(
-                first, last, _agents(mark.holders), text
+            return filled(
+                '<g class="ellipsis"><title>{} to {}, of {}</title>{}</g>\n', first, last, _agents(mark.holders), text
             )
         if mark.kind == "oval":
-            return Markup(
+            return filled(
                 '<g class="oval"><title>The chain of {} ends here</title>'
-                '{} rx="{}" stroke="#5c6670" stroke-dasharray="2 4"/>{}</g>\n'
-            ).format(_agents(mark.holders), _rectangle(placed), _n(BOX_HEIGHT / 2), text)
+                '{} rx="{}" stroke="#5c6670" stroke-dasharray="2 4"/>{}</g>\n',
+                _agents(mark.holders),
+                _rectangle(placed),
+                _n(BOX_HEIGHT / 2),
+                text,
+            )
         block = mark.nodes[0].block
         ink = self._ink[block.agent_id] if block else _INCEPTION
-        return Markup('<g class="{}"><title>{}</title>{} rx="3" fill="{}" stroke="{}"{}/>{}</g>\n').format(
+        return filled(
+            '<g class="{}"><title>{}</title>{} rx="3" fill="{}" stroke="{}"{}/>{}</g>\n',
             "block" if block else "inception",
             self._tooltip(mark.nodes[0]),
             _rectangle(placed),
@@ -203,8 +209,12 @@ def _path_beside(block: PlacedMark, oval: PlacedMark) -> str:
 
 def _rectangle(placed: PlacedMark) -> Markup:
     """Return the beginning of a `<rect>` element."""
-    return Markup('<rect x="{}" y="{}" width="{}" height="{}"').format(
-        _n(placed.x - placed.width / 2), _n(placed.y), _n(placed.width), _n(placed.height)
+    return filled(
+        '<rect x="{}" y="{}" width="{}" height="{}"',
+        _n(placed.x - placed.width / 2),
+        _n(placed.y),
+        _n(placed.width),
+        _n(placed.height),
     )
 
 
@@ -213,7 +223,8 @@ def _text(placed: PlacedMark, colour: str) -> Markup:
     line_height, size = (BOX_HEIGHT / 2, SMALL_FONT_SIZE) if small else (LINE_HEIGHT, FONT_SIZE)
     first = placed.y + placed.height / 2 - (len(placed.mark.lines) - 1) * line_height / 2 + 0.36 * size
     return Markup("").join(
-        Markup('<text x="{}" y="{}" fill="{}"{}>{}</text>').format(
+        filled(
+            '<text x="{}" y="{}" fill="{}"{}>{}</text>',
             _n(placed.x),
             _n(first + number * line_height),
             colour,
