@@ -5,7 +5,9 @@ The argument is the directory of another clone, or a revision, which the benchma
 Each of the two sides plays in its own process. In each round, the two sides and the bare model
 (`benchmarks.bare_model`) play the same seed alternately. A ratio below 1 means that this revision needs less processor
 time than the other one or the model. If this clone has compiled modules, it uses them. A revision that the benchmark
-checks out has no compiled modules. Thus the argument `HEAD` measures the effect of the compilation.
+checks out has no compiled modules. Thus the argument `HEAD` measures the effect of the compilation. Both sides may
+write bytecode, even if PYTHONDONTWRITEBYTECODE is set. Otherwise, the row "from the shell" would measure Python's
+parser.
 
 The scenario has 20 minutes at 15 % loss with a final reconcile. Each revision judges its own runs. `--large` also plays
 50 agents and a larger proof. Both together take minutes.
@@ -50,9 +52,11 @@ class Player:
     """A process that plays runs with the code in the directory `root`."""
 
     def __init__(self, root: Path) -> None:
+        environment = {**os.environ, "PYTHONPATH": str(root)}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
         self._process = subprocess.Popen(
             [sys.executable, PLAYER],
-            env={**os.environ, "PYTHONPATH": str(root)},
+            env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
