@@ -191,7 +191,10 @@ class Lab:
     async def _start(
         self, engine: EngineName | None, needs: Sequence[str], networks: Mapping[int, int], log: Path
     ) -> str | None:
-        """Build the network. Return None on success, or the message of a tool that could not enter namespaces."""
+        """Build the network. Return None on success.
+
+        If the kernel refuses new namespaces, return the error message of `unshare` or `setpriv`.
+        """
         if not await self._channel.inside():
             await self.close()
             message = _last_line(log)

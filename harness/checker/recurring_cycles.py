@@ -58,8 +58,8 @@ def cycle_of(evidence: Evidence) -> Cycle | None:
 
 
 def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
-    """Return the mission second of the last handler run of the agents in a standstill. Received messages without effect
-    do not count.
+    """Return the mission second after which no agent of a standstill ran a handler. A handler run for a message that
+    changed nothing does not count.
     """
     traces = [evidence.traces.get(agent_id) for agent_id in standstill.agents]
     ran_at = [runs[-1].t for trace in traces if trace is not None and (runs := _own_runs(trace))]

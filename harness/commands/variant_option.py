@@ -9,7 +9,7 @@ from harness.commands._shared_options import RARE
 
 
 def variant_option() -> Any:
-    """Define the option --variant. The variant in this file is active until the command ends."""
+    """Define the option --variant FILE. The protocol variant in FILE is active until the command ends."""
 
     def put_in_force(ctx: typer.Context, file: Path | None) -> None:
         if file is not None and not ctx.resilient_parsing:

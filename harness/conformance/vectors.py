@@ -116,8 +116,9 @@ def to_lines(generated: Sequence[VectorSet]) -> Iterator[str]:
 
 
 def _step(number: int, after: int, line: VirtualLine, state: str | None) -> dict[str, object]:
-    """Return the JSON object for one line. `state` describes the tested state, or is None for a step that only leads to
-    a test.
+    """Return the JSON object for one input line.
+
+    If the agent is tested after this line, `state` describes the state before it. Otherwise `state` is None.
     """
     runs = [{"algorithm": run.algorithm, "handler": run.handler, "branch": run.branch} for run in line.outcome.runs]
     step = {"step": number, "after": after, "input": line.name, "in": line.given, "out": line.answer}

@@ -84,8 +84,9 @@ class RunOfOneTest:
 
 @contextmanager
 def one_sentence() -> Iterator[None]:
-    """Report an exception inside the context as one sentence. Skip the test if this machine cannot run it. Let the test
-    fail after any other exception.
+    """Turn an error of the harness into the result of the test, with a message of one sentence.
+
+    The test is skipped if this machine cannot run it. After any other error, the test fails.
     """
     try:
         yield

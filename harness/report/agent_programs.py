@@ -22,7 +22,7 @@ class AgentProgram:
 
     @property
     def in_words(self) -> str:
-        """Return a phrase such as "agent 2 ran ./my_agent --fast (1.4)" or "agents 1, 3 ran the harness's own"."""
+        """Describe the program, for example "agent 2 ran ./my_agent --fast (1.4)"."""
         program = "the harness's own" if self.command is None else shlex.join(self.command)
         of_version = "" if self.version is None else f" ({self.version})"
         return f"agent{'s' * (len(self.agents) > 1)} {', '.join(ranges([*self.agents]))} ran {program}{of_version}"

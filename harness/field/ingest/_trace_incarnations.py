@@ -169,8 +169,10 @@ class TraceReader:
     """
 
     def __init__(self, path: Path, agent_id: int | None = None, counts: str = "line") -> None:
-        """Create a reader for one trace. `agent_id` is the ID of the agent, or None if the source does not determine
-        it. `counts` is the word for the unit that messages about this trace count, such as "line".
+        """Create a reader for one trace.
+
+        `agent_id` is the ID of the agent, or None if the source does not determine it. The reader's messages use the
+        word `counts` for one entry of the trace, for example "line".
         """
         self.path = path
         self._agent_id, self._counts = agent_id, counts

@@ -255,8 +255,8 @@ class RecordedTrace:
     def was_paused(self, since: float, until: float) -> bool:
         """Return true if the agent was paused, or may have been paused, between two mission seconds.
 
-        run.json contains the pauses of a run. Without run.json, the agent may have been paused if it wrote no line
-        while a timer was overdue, and handled the timer with its next line.
+        If there is a run.json, it contains the pauses. Otherwise, two facts together suggest a pause: the agent wrote
+        no line between the two seconds, and its next line handles an overdue timer.
         """
         if self.flight.record is not None:
             return Evidence({}, record=self.flight.record).was_paused(self.agent_id, since, until)

@@ -56,8 +56,9 @@ class StateBatch(NamedTuple):
 
 
 class ForkedStates(NamedTuple):
-    """A task for a worker: idle states in which agents have different chains. The worker answers with a
-    `NeededVotes`.
+    """A task for a worker: to count the votes that lead to one chain.
+
+    `batch` contains idle states in which agents have different chains. The worker answers with a `NeededVotes`.
     """
 
     batch: StateBatch

@@ -1,7 +1,8 @@
-"""Find the blocks that an agent's state contains, and exchange them for other blocks.
+"""Exchange the blocks in an agent's state for other blocks. The prover thus treats states as equal that differ only in
+the identity of their blocks.
 
-Agents only compare blocks for equality, with one exception: a tie of phase 2 (Algorithm 15) compares their ages. With
-`Bounds.clocks_any`, either of two blocks may be the older one, so the identity of blocks makes no difference.
+The exchange is correct because agents compare blocks only for equality. The one exception is a tie of phase 2
+(Algorithm 15), which compares the ages of two blocks. With `Bounds.clocks_any`, either block may be the older one.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -52,12 +52,12 @@ class ReferenceComparison:
         to_reference: Give,
         name_of: Callable[[str], str],
     ) -> tuple[str, str] | None:
-        """If the agent's step differs from the step of the reference, return the handler and a sentence. Otherwise
-        return None.
+        """Compare one step of an agent with the same step of the reference. Return None if the two steps are equal.
+        Otherwise return the handler and a sentence about the difference.
 
-        `before` is the state in which the agent got the input. It is None if the agent had just been switched on.
-        `give` gives the input to an agent, and `to_reference` gives it to the reference. `name_of` returns the name of
-        a block, given its hash.
+        `before` is the state of the agent before the step, or None if the agent had just been switched on. The
+        functions `give` and `to_reference` pass the input of the step to the agent and to the reference. `name_of`
+        returns the name of the block with a given hash.
         """
         reference = self._reference(agent_id, before)
         error = _error_of(reference, to_reference)

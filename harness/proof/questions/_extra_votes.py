@@ -60,9 +60,10 @@ class ExtraVotes:
         return next((votes for votes in range(1, most + 1) if self._a_vote_leads(fork, votes)), self._flaw)
 
     def _a_vote_leads(self, fork: State, votes: int, instants: int = 0) -> bool:
-        """Return true if one vote, followed by at most `votes - 1` further votes, leads to equal chains.
+        """Return true if the swarm can reach equal chains with at most `votes` votes. The first vote starts now.
 
-        `instants` is the number of instants on the path so far. This number is limited because the search is recursive.
+        `instants` is the number of instants that the search has already examined on this path. The search is
+        recursive, so it limits this number.
         """
         return any(self._leads(after, votes - 1, instants + 1) for after in self._after_a_vote(fork))
 

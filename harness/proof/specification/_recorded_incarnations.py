@@ -103,10 +103,10 @@ class ChainNumbers:
 
 
 def lives(trace: Trace, header: CheckedHeader, chains: ChainNumbers, *, ended: bool) -> Iterator[EncodedIncarnation]:
-    """Yield the encoded steps of each incarnation of an agent, up to the first line of the incarnation that cannot be
-    encoded.
+    """Encode the steps of an agent. Yield one object for each incarnation. The first line that cannot be encoded ends
+    the steps of its incarnation.
 
-    `ended` is true if the agent reached the end of its mission. Its last steps are then on record.
+    `ended` is true if the agent reached the end of its mission. The trace then contains the agent's last step.
     """
     parts = OptionalTraceFields.of(trace)
     count = len(trace.starts) + 1

@@ -282,11 +282,10 @@ class CurrentLinks:
         self._moved_ns = -1
 
     def move(self, position: FieldPosition) -> list[LinkLine] | None:
-        """Store a new position.
+        """Store a new position. If the links are due to be drawn, return their lines, otherwise None.
 
-        If it is time to update the lines, return the lines that belong to the previous positions. Return None
-        otherwise. All vehicles report their positions at the same times. When the first later position arrives, the
-        lines for one time are therefore complete.
+        All vehicles report their positions at the same times. A position with a later time therefore means that all
+        positions of the earlier time are known. The returned lines connect these earlier positions.
         """
         at_ns = position.at_ns
         due = at_ns > self._moved_ns and self._are_due(at_ns)

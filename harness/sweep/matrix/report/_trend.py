@@ -30,8 +30,9 @@ LARGEST = 1e12
 
 
 def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures: int) -> Sequence[MatrixRecord]:
-    """Return at least two of the latest nights. Return more than two only if all charts together then have at most
-    `MAX_DOTS` dots.
+    """Return the latest nights. Their number is limited so that all charts together have at most `MAX_DOTS` dots.
+
+    At least two nights are returned, even if they exceed this limit.
     """
     return nights[-max(2, MAX_DOTS // max(1, len(tonight.cells) * figures)) :]
 
