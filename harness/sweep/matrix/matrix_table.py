@@ -122,13 +122,15 @@ def say_interval(metric: Metric, estimate: Estimate) -> str:
 
 def explanation(record: MatrixRecord) -> str:
     """Return a sentence that explains the numbers in the table."""
-    seeds = len(record.matrix.seed_list)
-    if seeds == 1:
-        return "Each cell has one run, so there are no intervals."
     counts = [cell.runs for cell in record.cells]
-    if record.outcome == "completed" and counts and min(counts) < max(counts):
-        return f"Means of {min(counts)} to {max(counts)} runs per cell, with 95 % intervals."
-    return f"Means of {seeds} runs per cell, with 95 % intervals. All cells have the same seeds."
+    if not counts:
+        return "No run has ended."
+    fewest, most = min(counts), max(counts)
+    if most == 1:
+        return "Each cell has one run, so there are no intervals."
+    number = str(most) if fewest == most else f"{fewest} to {most}"
+    same_seeds = " All cells have the same seeds." if fewest == len(record.matrix.seed_list) else ""
+    return f"Means of {number} runs per cell, with 95 % intervals.{same_seeds}"
 
 
 def unjudged(record: MatrixRecord) -> str:

@@ -237,6 +237,26 @@ def test_all_runs_are_played_if_the_time_suffices() -> None:
     assert sorted(begun) == sorted(matrix(loss=LOSS, seeds=20).tasks)
 
 
+@pytest.mark.parametrize(
+    ("ended", "sentence"),
+    [
+        (0, "No run has ended."),
+        (1, "Each cell has one run, so there are no intervals."),
+        (2, "Means of 2 runs per cell, with 95 % intervals."),
+        (6, "Means of 2 to 4 runs per cell, with 95 % intervals."),
+    ],
+)
+def test_interrupted_matrix_has_the_number_of_its_runs(ended: int, sentence: str) -> None:
+    calls = itertools.count()
+
+    def interrupted(scenario: Scenario, seed: int) -> Result:
+        if next(calls) == ended:
+            raise KeyboardInterrupt
+        return judge(scenario, seed)
+
+    assert matrix_table.explanation(played(matrix(), 1, interrupted).record) == sentence
+
+
 def test_run_that_did_not_begin_is_no_interruption(tmp_path: Path) -> None:
     asked = matrix(seeds=3)
     finished = run_matrix(asked, tmp_path, on_cores(asked, 1), budget_s=1e-9)
