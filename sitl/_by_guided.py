@@ -122,7 +122,7 @@ class GuidedFlight:
         target = (self._to.link.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1)
         place = (*on_earth(waypoint.place, self._home), waypoint.place.up_m)
         if self._to.vehicle_type == "plane":
-            self._to.link.acks.pop(mavlink.MAV_CMD_DO_REPOSITION, None)
+            self._to.link.forget(mavlink.MAV_CMD_DO_REPOSITION)
             params = (-1.0, 0.0, 0.0, 0.0)
             reposition = mavlink.MAV_CMD_DO_REPOSITION
             self._to.link.send(mavlink.MAVLink_command_int_message(*target, frame, reposition, 0, 0, *params, *place))

@@ -90,7 +90,7 @@ class MissionFlight:
         elif step is AUTO:
             self._to.set_mode("AUTO")
         elif step is ARM:
-            self._to.link.acks.pop(mavlink.MAV_CMD_MISSION_START, None)
+            self._to.link.forget(mavlink.MAV_CMD_MISSION_START)
             self._to.arm()
         elif step is START:
             self._to.set_mode("AUTO")

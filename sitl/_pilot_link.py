@@ -78,6 +78,10 @@ class PilotLink(asyncio.Protocol):
         """
         self.foreign_sysid: int | None = None
         self.acks: dict[int, int] = {}  # MAV_CMD: the last MAV_RESULT
+        self.accepted: set[int] = set()
+        """The commands that the vehicle has accepted since the last `forget`. A vehicle may refuse the repetition of a
+        command that it already carries out, for example a take-off.
+        """
         self.parameters: dict[str, float] = {}
         self.parameter_count: int | None = None
         self.listed: set[int] = set()  # list indices of the received parameters
@@ -154,6 +158,11 @@ class PilotLink(asyncio.Protocol):
         """Send a COMMAND_LONG. Missing parameters are 0."""
         padded = [*params, *[0.0] * (7 - len(params))]
         self.send(mavlink.MAVLink_command_long_message(self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1, command, 0, *padded))
+
+    def forget(self, command: int) -> None:
+        """Forget the answers of the vehicle to a command."""
+        self.acks.pop(command, None)
+        self.accepted.discard(command)
 
     def ask_for_mode(self, number: int) -> None:
         """Request a change of the mode (custom_mode)."""
@@ -345,6 +354,8 @@ class PilotLink(asyncio.Protocol):
 
     def _on_ack(self, message: Any) -> None:
         self.acks[message.command] = message.result
+        if message.result == mavlink.MAV_RESULT_ACCEPTED:
+            self.accepted.add(message.command)
 
     def _on_parameter(self, message: Any) -> None:
         if message.param_id not in self.parameters and len(self.parameters) >= MAX_PARAMETERS:

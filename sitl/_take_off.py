@@ -62,7 +62,7 @@ class TakeOff:
         elif step is self._in_mode:
             self._to.set_mode(self._mode)
         elif step is ARM:
-            link.acks.pop(mavlink.MAV_CMD_NAV_TAKEOFF, None)
+            link.forget(mavlink.MAV_CMD_NAV_TAKEOFF)
             self._to.arm()
         elif step is TAKE_OFF:
             link.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, self._altitude_m)

@@ -105,7 +105,7 @@ class Commander:
         self.link.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
 
     def accepted(self, command: int) -> bool:
-        return self.link.acks.get(command) == int(mavlink.MAV_RESULT_ACCEPTED)
+        return command in self.link.accepted
 
     def refused(self, commands: Sequence[int]) -> bool:
         """Return true if the vehicle answered one of these commands with MAV_RESULT_FAILED. Each answer is counted only

@@ -17,6 +17,7 @@ import sitl.pilot
 from sitl._autopilot import Autopilot
 from sitl._vehicle_state import Battery, ReportedPosition
 from sitl.pilot import Pilot
+from sitl.procedure import Commander
 from sitl.serial_channel import ClientChannel
 from sitl.streams import heartbeat
 from sitl.vehicle import FlightError, VehicleType
@@ -193,3 +194,17 @@ def test_state_has_the_reported_motion_and_battery(tmp_path: Path) -> None:
         assert pilot.state.position == ReportedPosition(-35.363262, 149.165237, 584.0, 0.0, heading_deg=270.0)
         assert pilot.state.battery == Battery(16.8, 1.0)
         assert pilot.state.item == 0
+
+
+def test_refused_repetition_does_not_undo_an_accepted_take_off(tmp_path: Path) -> None:
+    autopilot = mavlink.MAVLink(None, srcSystem=3, srcComponent=mavlink.MAV_COMP_ID_AUTOPILOT1)
+    answers = [
+        mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_NAV_TAKEOFF, result).pack(autopilot)
+        for result in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED)
+    ]
+    with connected_pilot(tmp_path) as (pilot, _):
+        to = Commander(pilot.link, "copter")
+        pilot.link.data_received(b"".join(answers))
+        assert to.accepted(mavlink.MAV_CMD_NAV_TAKEOFF)
+        pilot.link.forget(mavlink.MAV_CMD_NAV_TAKEOFF)
+        assert not to.accepted(mavlink.MAV_CMD_NAV_TAKEOFF)
