@@ -34,7 +34,9 @@ class LagLine(BaseModel):
     machine_s: _Seconds
     busy_s: dict[AgentKey, _Seconds]
     computer_of: AgentKey | None = None
-    """The remote agent whose computer was measured. null for the machine of the harness."""
+    """The remote agent whose computer was measured. If the computer runs several agents, they are the keys of `busy_s`.
+    null for the machine of the harness.
+    """
 
 
 class MeasuredLag:
@@ -44,6 +46,12 @@ class MeasuredLag:
         self._lines: dict[AgentKey | None, list[LagLine]] = defaultdict(list)
         for line in sorted(lines, key=lambda line: line.until_s):
             self._lines[line.computer_of].append(line)
+        self._computer_of = {
+            agent: line.computer_of
+            for line in lines
+            if line.computer_of is not None
+            for agent in (line.computer_of, *line.busy_s)
+        }
         self._ends = {computer: [line.until_s for line in lines] for computer, lines in self._lines.items()}
 
     def explains(self, agent_id: int, from_s: float, until_s: float) -> float | None:
@@ -53,7 +61,7 @@ class MeasuredLag:
         Return None if the delays were not measured during all of this time.
         """
         agent = str(agent_id)
-        computer = agent if agent in self._ends else None
+        computer = self._computer_of.get(agent)
         ends = self._ends.get(computer, [])
         lines = self._lines[computer][bisect_left(ends, from_s) : bisect_left(ends, until_s) + 1]
         if not lines or lines[0].from_s > from_s or lines[-1].until_s < until_s:

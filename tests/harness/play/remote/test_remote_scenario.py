@@ -122,3 +122,10 @@ def test_lag_of_a_remote_agent_is_that_of_its_computer() -> None:
     assert lag.explains(1, 1.5, 2.5) == 1.0
     assert lag.explains(2, 1.5, 2.5) == pytest.approx(0.03)
     assert lag.explains(2, 1.5, 3.5) is None, "the far computer was measured up to 3 s"
+
+
+def test_lag_of_a_worker_counts_for_all_its_agents() -> None:
+    here = LagLine(from_s=0, until_s=9, machine_s=0.5, busy_s={})
+    there = LagLine(from_s=0, until_s=9, machine_s=0.01, busy_s={"1": 0.0, "2": 0.02}, computer_of="1")
+    lag = MeasuredLag([here, there])
+    assert [lag.explains(agent, 1, 2) for agent in (1, 2, 3)] == [0.01, pytest.approx(0.03), None]
