@@ -22,7 +22,7 @@ from netem.errors import LabError
 BRIDGE = "air"
 
 # A fresh namespace lets us choose interface numbers, so we need not ask the kernel for them.
-_LO = 1
+LO = 1
 _ETH0 = 2
 _BRIDGE_INDEX = 2
 _FIRST_PORT_INDEX = 3
@@ -40,7 +40,7 @@ class VirtualSwitch:
         self._namespaces = dict(networks)
         disable_ipv6()
         _bypass_firewall()
-        self.netlink.send([set_up("lo", _LO), bridge(BRIDGE, _BRIDGE_INDEX)])
+        self.netlink.send([set_up("lo", LO), bridge(BRIDGE, _BRIDGE_INDEX)])
         inside = {vehicle: self._namespace(vehicle) for vehicle in self.vehicles}
         self.netlink.send([self._cable(vehicle) for vehicle in self.vehicles])
         for vehicle, netlink in inside.items():
@@ -128,7 +128,7 @@ def configure_vehicle(vehicle: int, index: int) -> list[NetlinkRequest]:
     where = f"vehicle {vehicle}"
     own = addresses.address(vehicle)
     return [
-        set_up(f"{where}: lo", _LO),
+        set_up(f"{where}: lo", LO),
         set_up(f"{where}: eth0", index),
         address(f"{where}: address {own}", index, own, addresses.PREFIX_LENGTH, addresses.BROADCAST),
         default_route(f"{where}: default route", index),

@@ -33,7 +33,7 @@ _IFLA_BRPORT_STATE, _BR_STATE_FORWARDING = 1, 3
 _IFLA_BRPORT_BCAST_FLOOD = 30
 _VETH_INFO_PEER = 1
 _IFA_ADDRESS, _IFA_LOCAL, _IFA_BROADCAST = 1, 2, 4
-_RTA_OIF = 4
+_RTA_DST, _RTA_OIF = 1, 4
 _RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST = 254, 4, 253, 1
 
 
@@ -93,10 +93,18 @@ def default_route(what: str, index: int) -> NetlinkRequest:
     """Return a request that adds a default route without a gateway. With this route, the kernel treats all addresses as
     neighbours on this link.
     """
+    return _route(what, 0, number(_RTA_OIF, index))
+
+
+def multicast_route(what: str, index: int) -> NetlinkRequest:
+    """Return a request that adds a route for all multicast addresses."""
+    return _route(what, 4, attribute(_RTA_DST, socket.inet_aton("224.0.0.0")) + number(_RTA_OIF, index))
+
+
+def _route(what: str, prefix_length: int, attributes: bytes) -> NetlinkRequest:
     kind = (_RT_TABLE_MAIN, _RTPROT_STATIC, _RT_SCOPE_LINK, _RTN_UNICAST)
-    return NetlinkRequest(
-        what, RTM_NEWROUTE, _RTMSG.pack(socket.AF_INET, 0, 0, 0, *kind, 0) + number(_RTA_OIF, index), NEW
-    )
+    message = _RTMSG.pack(socket.AF_INET, prefix_length, 0, 0, *kind, 0)
+    return NetlinkRequest(what, RTM_NEWROUTE, message + attributes, NEW)
 
 
 def forwarding(netlink: NetlinkSocket) -> set[int]:

@@ -21,7 +21,6 @@ from pathlib import Path
 
 CLONE_NEWNET = 0x40000000
 _CLONE_NEWNS, _CLONE_NEWUSER, _CLONE_NEWPID = 0x00020000, 0x10000000, 0x20000000
-_NEW_NAMESPACES = CLONE_NEWNET | _CLONE_NEWNS | _CLONE_NEWPID
 _PR_SET_PDEATHSIG = 1
 _MS_NOSUID, _MS_NODEV, _MS_NOEXEC, _MS_REC, _MS_PRIVATE = 2, 4, 8, 0x4000, 0x40000
 
@@ -66,16 +65,23 @@ def die_with_parent() -> None:
     _check(_libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL))
 
 
-def become_first_process(*, user_namespace: bool) -> None:
-    """Create a private network, and return in its first process, which is a grandchild of the calling process. The
-    calling process does not return. It waits outside the private network, as `unshare --kill-child` does. Each of these
-    processes ends when its parent ends.
+def become_root() -> None:
+    """Move this process into a user namespace of its own, in which it has all rights. The process must have one
+    thread.
     """
     user, group = os.geteuid(), os.getegid()
-    _check(_libc.unshare(_NEW_NAMESPACES | (_CLONE_NEWUSER if user_namespace else 0)))
-    if user_namespace:
-        for name, text in (("setgroups", "deny"), ("uid_map", f"0 {user} 1"), ("gid_map", f"0 {group} 1")):
-            Path("/proc/self", name).write_text(text)
+    _check(_libc.unshare(_CLONE_NEWUSER))
+    for name, text in (("setgroups", "deny"), ("uid_map", f"0 {user} 1"), ("gid_map", f"0 {group} 1")):
+        Path("/proc/self", name).write_text(text)
+
+
+def become_first_process(network: int) -> None:
+    """Return in the first process of a PID namespace, which is a grandchild of the calling process. Its network is the
+    network namespace with the file descriptor `network`. The calling process does not return. It waits outside the PID
+    namespace, as `unshare --kill-child` does. Each of these processes ends when its parent ends.
+    """
+    enter_network(network)
+    _check(_libc.unshare(_CLONE_NEWNS | _CLONE_NEWPID))
     die_with_parent()
     pid = os.fork()
     if pid:

@@ -16,8 +16,8 @@ import struct
 from collections.abc import Sequence
 
 from netem import _namespaces, addresses
-from netem._fabric import configure_vehicle, disable_ipv6
-from netem._fabric_requests import mtu
+from netem._fabric import LO, configure_vehicle, disable_ipv6
+from netem._fabric_requests import mtu, multicast_route, set_up
 from netem._netlink import NetlinkSocket
 from netem.errors import LabUnavailable
 from netem.frames import udp_broadcast
@@ -59,16 +59,31 @@ def needs_user_namespace() -> bool:
     return message != _namespaces.AS_ROOT
 
 
-def die_with_parent() -> None:
-    """Let the kernel kill this process when its parent ends."""
+def become_keeper(*, user_namespace: bool) -> None:
+    """Let this process create networks with `create_network`. The kernel kills it when its parent ends.
+    `user_namespace` is the result of `needs_user_namespace`. The process must have one thread.
+    """
+    if user_namespace:
+        _namespaces.become_root()
     _namespaces.die_with_parent()
 
 
-def become_first_process(*, user_namespace: bool) -> None:
-    """Create a private network, and return in its first process, which is a grandchild of the calling process. Each of
-    these processes ends when its parent ends. `user_namespace` is the result of `needs_user_namespace`.
+def create_network() -> int:
+    """Move this process into a new network, and return a file descriptor of the network. Programs in the network reach
+    each other at 127.0.0.1. Multicast datagrams stay in the network. Raises OSError or NetlinkError.
     """
-    _namespaces.become_first_process(user_namespace=user_namespace)
+    _namespaces.unshare_network()
+    netlink = NetlinkSocket()
+    netlink.send([set_up("lo", LO), multicast_route("multicast route", LO)])
+    netlink.close()
+    return _namespaces.open_network()
+
+
+def become_first_process(network: int) -> None:
+    """Enter a network of `create_network`, and return in a process that is PID 1 of its own PID namespace. It is a
+    grandchild of the calling process. Each of these processes ends when its parent ends.
+    """
+    _namespaces.become_first_process(network)
 
 
 def vehicle_at(address: str) -> int | None:

@@ -185,14 +185,16 @@ class RunDirectory:
         """Append the log line of a message on a shared radio channel."""
         self._append(CHANNEL_FILE, record)
 
-    def append_lag(self, agent_id: int, line: str) -> None:
-        """Append a measurement of the computer of a remote agent."""
+    def append_lag(self, agent_id: str, line: bytes) -> None:
+        """Append a measurement of the computer of a remote agent. If the computer runs several agents, `agent_id` is
+        one of them.
+        """
         try:
             measured = json.loads(line)
         except ValueError:
             return
         if isinstance(measured, dict):
-            self._append(LAG_FILE, {**measured, "computer_of": str(agent_id)})
+            self._append(LAG_FILE, {**measured, "computer_of": agent_id})
 
     def append_tracks(self, at_s: float, places: Mapping[int, Place]) -> None:
         """Append the positions of vehicles at mission second `at_s`."""

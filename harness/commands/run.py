@@ -77,7 +77,9 @@ def run_command(
     scheduler: Annotated[
         str | None,
         typer.Option(
-            metavar="TCP://HOST:PORT", rich_help_panel=RARE, help="Dask scheduler whose workers play the agents."
+            metavar="TCP://HOST:PORT",
+            rich_help_panel=RARE,
+            help="Dask scheduler whose workers play agents and vehicles.",
         ),
     ] = None,
     capture: Annotated[

@@ -94,7 +94,8 @@ def figures(record: RunRecord) -> list[tuple[str, str]]:
 
 def cut_off(record: RunRecord) -> list[str]:
     """Return a sentence for each time when agents on other computers were cut off, because their connections were lost.
-    Agents of the same worker share a sentence. Further sentences name the traces that are incomplete for this reason.
+    Agents of the same worker share a sentence. Further sentences name the vehicle programs that were lost, and the
+    traces that are incomplete for this reason.
     """
     lines = []
     for computer, agents in _by_computer(record).items():
@@ -115,6 +116,14 @@ def cut_off(record: RunRecord) -> list[str]:
                 f"{agents_in_words(together)} {'was' if one else 'were'} cut off from {from_s:.0f} s {end}, because "
                 f"the connection to {'its' if one else 'their'} {computer} was lost"
             )
+    lost: dict[str, list[int]] = {}
+    for vehicle, found in record.vehicles.items():
+        if isinstance(worker := found.get("lost_with"), str):
+            lost.setdefault(worker, []).append(int(vehicle))
+    for worker, vehicles in lost.items():
+        one = len(vehicles) == 1
+        named = agents_in_words(vehicles).replace("agent", "vehicle")
+        lines.append(f"{named} {'was' if one else 'were'} lost with {'its' if one else 'their'} worker {worker}")
     lines += [
         f"the trace of agent {agent} is incomplete: {lack}"
         for agent, remote in record.remote.items()

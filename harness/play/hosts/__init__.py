@@ -1,9 +1,14 @@
-"""Spread the agents of one run over the workers of a Dask cluster.
+"""Spread the agents and vehicles of one run over the workers of a Dask cluster.
 
 The network of the run stays in one lab, on the computer where the command runs. Losses, delays, partitions, radio,
-channel and captures are therefore exactly those of a run on one machine. The workers of the cluster run the agents, so
-their processors share the load. Each worker joins the run once for all its agents, with the mechanism of
-`harness.play.remote`.
+channel and captures are therefore exactly those of a run on one machine. The workers of the cluster run the agents and
+the vehicle programs, so their processors share the load. The mechanism of `harness.play.remote` connects each agent.
+
+The program of a vehicle runs on the worker of its agent. Both are in one network there, so the agent reads the
+telemetry of its vehicle without a detour. The pilots and the ground station stay in the lab. Each worker has one more
+connection, which carries their MAVLink messages, the commands that start and end vehicle programs, and the files that
+these programs write. A vehicle program cannot return after a lost connection as an agent does, because its pilot in the
+lab gives it up after 10 s without messages.
 
 A mesh of tunnels between labs on all computers was rejected. Each link between two computers would have the delay and
 the losses of the real network in addition to those of the scenario, and the engines of several kernels would have to

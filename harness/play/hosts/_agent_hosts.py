@@ -1,4 +1,4 @@
-"""The workers of a Dask cluster that run the agents of one run.
+"""The workers of a Dask cluster that run the agents and the vehicle programs of one run.
 
 The run has a secret of its own. Dask hands it to the workers together with the address at which the harness listens.
 Each worker gets one task, which lasts as long as the run. Dask would start the task of a lost worker again. The harness
@@ -11,16 +11,21 @@ import asyncio
 import contextlib
 import secrets
 import socket
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from harness.errors import MachineError
 from harness.play.hosts._placement import place
+from harness.play.hosts._worker_connection import FarVehicle, WorkerConnection
 from harness.play.hosts._worker_task import HostOrder, play_agents
 from harness.play.machine.dask_cluster import connected
+
+if TYPE_CHECKING:
+    from harness.play.remote._far_ends import FarEnd
 
 BACKLOG = 512
 WATCH_EVERY_S = 0.5
@@ -43,6 +48,10 @@ class AgentHosts:
         self._ended: dict[str, asyncio.Future[None]] = {}
         """A future for each worker, which becomes done when the task of the worker ends."""
         self._loop = asyncio.get_running_loop()
+        self._connections: dict[str, asyncio.Future[WorkerConnection]] = {
+            worker: self._loop.create_future() for worker in self._placed
+        }
+        self._vehicles: dict[int, FarVehicle] = {}
         self._problem: asyncio.Future[str] = self._loop.create_future()
         self.secret = secrets.token_bytes(32)
 
@@ -83,11 +92,77 @@ class AgentHosts:
         """Let each worker start its agents. The agents connect to the addresses of `listen`."""
         for worker, agents in self._placed.items():
             host, port = self._listeners[_own_address(worker)].getsockname()[:2]
-            order = HostOrder(host, port, self.secret.hex(), {agent: _words(self._commands[agent]) for agent in agents})
+            commands = {agent: _words(self._commands[agent]) for agent in agents}
+            order = HostOrder(worker, host, port, self.secret.hex(), commands)
             task = self._client.submit(play_agents, order, workers=[worker], pure=False, allow_other_workers=False)
             task.add_done_callback(partial(self._notify, worker))
             self._tasks.append(task)
             self._ended[worker] = self._loop.create_future()
+
+    # The connections of the workers
+
+    def refusal(self, worker: str) -> str:
+        """Return the sentence with which the run refuses the connection of a worker, or an empty text."""
+        if (connection := self._connections.get(worker)) is None:
+            return f"this run has no worker {worker}"
+        return "the worker has begun in another process, and its data are lost with it" if connection.done() else ""
+
+    async def receive(self, far_end: FarEnd, record_lag: Callable[[str, bytes], None]) -> None:
+        """Accept the connection of a worker. The function `record_lag` gets the ID of the worker's first agent, and a
+        line with a measurement of the worker's delays. Raises OSError.
+        """
+        worker = far_end.session
+        first = str(self._placed[worker][0])
+        connection = WorkerConnection(worker, partial(record_lag, first))
+        await connection.open(far_end)
+        self._connections[worker].set_result(connection)
+
+    async def joined(self) -> None:
+        """Wait until all workers have connected."""
+        await asyncio.gather(*map(asyncio.shield, self._connections.values()))
+
+    def measure_lag(self, epochs_us: Mapping[int, int | None], speedup: float) -> None:
+        """Let each worker measure its delays. `epochs_us` contains the start of the mission on the clock of each
+        agent's computer.
+        """
+        for worker, agents in self._placed.items():
+            epoch_us = next((epochs_us[agent] for agent in agents if epochs_us[agent] is not None), None)
+            if epoch_us is not None:
+                self._connections[worker].result().measure_lag(epoch_us, speedup)
+
+    # Vehicle programs: the methods of harness.play.process._run_lab.VehicleLab
+
+    async def spawn(
+        self,
+        vehicle: int,
+        argv: Sequence[str],
+        *,
+        cwd: Path,
+        env: Mapping[str, str],
+        stdout: Path,
+        stderr: Path,
+        role: str,
+        max_file_bytes: int | None = None,
+    ) -> FarVehicle:
+        """Start the program of a vehicle on the worker of its agent, with the environment variables of the worker.
+        Raises SpawnError.
+        """
+        program = await self._connection_of(vehicle).start(vehicle, argv, cwd, stdout)
+        self._vehicles[vehicle] = program
+        return program
+
+    async def connect(self, vehicle: int, port: int, *, timeout_s: float) -> socket.socket:
+        return await self._connection_of(vehicle).connect(self._vehicles[vehicle], port, timeout_s)
+
+    def lost_worker(self, vehicle: int) -> str | None:
+        """Return the address of the worker of a vehicle if the worker is lost. Otherwise return None."""
+        connection = self._connection_of(vehicle)
+        return connection.worker if connection.is_lost else None
+
+    def _connection_of(self, vehicle: int) -> WorkerConnection:
+        return self._connections[self._worker_of[vehicle]].result()
+
+    # The end of tasks
 
     def _notify(self, worker: str, task: Any) -> None:
         """Report the end of a task. A thread of Dask calls this method."""
@@ -116,6 +191,9 @@ class AgentHosts:
         """Wait until the workers have ended their agents. The workers end them as soon as the harness no longer
         listens.
         """
+        for connection in self._connections.values():
+            if connection.done():
+                connection.result().close()
         with contextlib.suppress(OSError):  # the scheduler is lost
             present = await asyncio.to_thread(self._client.nthreads)
             if waiting := [ended for worker, ended in self._ended.items() if worker in present]:

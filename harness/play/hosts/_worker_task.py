@@ -14,14 +14,16 @@ from harness.errors import MachineError
 from harness.play.agent_control import last_line
 from netem import far_network
 from netem.errors import LabUnavailable
+from sitl.installed import sha256
 
 
 @dataclass(frozen=True)
 class HostOrder:
     """The order to a worker: the agents that it runs, and the address at which they join the run. An agent without a
-    command is the agent of the harness.
+    command is the agent of the harness. `worker` is the address of the worker.
     """
 
+    worker: str
     host: str
     port: int
     secret: str
@@ -29,11 +31,12 @@ class HostOrder:
     commands: dict[int, list[str] | None]
 
 
-def why_not(programs: list[str], has_keys: bool) -> str | None:
-    """Return a sentence if this computer cannot run agents, or if one of the agent programs is missing. Otherwise
-    return None.
+def why_not(programs: list[str], binaries: dict[str, str | None], has_keys: bool) -> str | None:
+    """Return a sentence if this computer cannot run agents and vehicles, or if one of their programs is missing.
+    Otherwise return None.
 
-    If `has_keys` is true, the agents get keys, and this computer must be able to decrypt them.
+    `binaries` contains the SHA-256 hashes of the vehicle programs by their paths. If `has_keys` is true, the agents get
+    keys, and this computer must be able to decrypt them.
     """
     try:
         far_network.needs_user_namespace()
@@ -41,8 +44,11 @@ def why_not(programs: list[str], has_keys: bool) -> str | None:
         return str(error)
     if has_keys and find_spec("cryptography") is None:
         return "this mission has keys, which must travel encrypted: run `pip install 'ucp-harness[secure]'` there"
-    missing = [program for program in programs if not os.access(program, os.X_OK)]
-    return f"it has no program {missing[0]}: install it there at the same path" if missing else None
+    missing = [program for program in (*programs, *binaries) if not os.access(program, os.X_OK)]
+    if missing:
+        return f"it has no program {missing[0]}: install it there at the same path"
+    other = [path for path, digest in binaries.items() if sha256(Path(path)) != digest]
+    return f"its {other[0]} is another program than here: install the same file on all computers" if other else None
 
 
 def play_agents(order: HostOrder) -> None:

@@ -1,7 +1,8 @@
-"""Run the agents of one run on a worker: `python -m harness.play.hosts.far_host`.
+"""Run the agents and vehicles of one run on a worker: `python -m harness.play.hosts.far_host`.
 
 The first line of standard input is an order in JSON (`harness.play.hosts._worker_task.HostOrder`). The end of standard
 input ends the program and its agents, so they end with the worker. Each agent joins the run as with `ucp-harness join`.
+The worker itself joins, too, for the vehicle programs (`harness.play.hosts._vehicle_host`).
 """
 
 import asyncio
@@ -9,14 +10,17 @@ import json
 import os
 import signal
 import sys
+from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import Any
 
 from harness.errors import HarnessError
 from harness.play.hosts._nursery import OWN_AGENT, Nursery
+from harness.play.hosts._vehicle_host import VehicleHost
+from harness.play.remote._far_ends import WORKER
 from harness.play.remote._wire import KEYS
-from harness.play.remote.join import JoinRequest, directory_of_agents, play_incarnations
+from harness.play.remote.join import JoinRequest, RunOverError, connect, directory_of_agents, play_incarnations
 from netem import far_network
 from netem.errors import LabUnavailable
 
@@ -27,18 +31,31 @@ async def _play(order: dict[str, Any], nursery: Nursery, directory: Path) -> Non
     """Run all agents until the end of the run. If an agent fails, wait for the other agents, and then raise the first
     error.
     """
-    playing = []
+    address = order["host"], order["port"]
+    secret = bytes.fromhex(order["secret"])
+    playing = [
+        _play_vehicles(JoinRequest(*address, WORKER, secret, [], service=False), order["worker"], nursery, directory)
+    ]
     for agent, words in order["commands"].items():
-        request = JoinRequest(
-            order["host"], order["port"], int(agent), bytes.fromhex(order["secret"]), words or OWN_AGENT, service=False
-        )
+        request = JoinRequest(*address, int(agent), secret, words or OWN_AGENT, service=False)
         folder = directory / agent
         folder.mkdir()
         (folder / KEYS).symlink_to((directory / KEYS).absolute())
-        playing.append(play_incarnations(request, nursery.start, lambda sentence: None, folder))
+        start = partial(nursery.start_agent, int(agent))
+        playing.append(play_incarnations(request, start, lambda sentence: None, folder))
     for problem in await asyncio.gather(*playing, return_exceptions=True):
         if problem is not None:
             raise problem
+
+
+async def _play_vehicles(request: JoinRequest, worker: str, nursery: Nursery, directory: Path) -> None:
+    folder = directory / "vehicles"
+    folder.mkdir()
+    try:
+        joined = await connect(request, worker)
+    except RunOverError:
+        return
+    await VehicleHost(nursery, folder).run(joined)
 
 
 async def _until_input_ends(work: Any) -> None:

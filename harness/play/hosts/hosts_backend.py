@@ -1,4 +1,4 @@
-"""The process backend, with agents that run on the workers of a Dask cluster."""
+"""The process backend, with agents and vehicles that run on the workers of a Dask cluster."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -12,12 +12,14 @@ from harness.play.hosts._worker_task import why_not
 from harness.play.machine.dask_cluster import connected
 from harness.play.mission import Swarm
 from harness.play.process._process_backend import ProcessBackend
+from harness.play.process.vehicle_kinds import choose_vehicles
 from harness.play.progress import ProgressDisplay
 from harness.scenario import Scenario
+from sitl.ardupilot import ArduPilot
 
 
 class HostsBackend(ProcessBackend):
-    """A backend that runs vehicles and the network on this machine, and agents on the workers of a Dask cluster."""
+    """A backend that runs the network on this machine, and vehicles and agents on the workers of a Dask cluster."""
 
     def __init__(self, scheduler: str) -> None:
         """Create the backend. `scheduler` is the address of a Dask scheduler (tcp://host:port)."""
@@ -30,7 +32,7 @@ class HostsBackend(ProcessBackend):
         own = {self.agent_command(scenario, agent)[0] for agent in scenario.roster if not scenario.command_of(agent)}
         with connected(self._scheduler) as client:
             needed = [program for program in programs if program not in own]
-            for worker, why in client.run(why_not, needed, scenario.security is not None).items():
+            for worker, why in client.run(why_not, needed, _binaries(scenario), scenario.security is not None).items():
                 if why is not None:
                     raise MachineError(f"the worker at {worker} cannot play agents: {why}")
 
@@ -61,8 +63,9 @@ def _refuse_scenario(scenario: Scenario) -> None:
     """Raise ScenarioError if the agents of the scenario cannot run on another computer."""
     if scenario.remote is not None:
         raise ScenarioError("`remote` does not work with --scheduler, which places all agents: leave out one of them")
-    if scenario.vehicles.kind != "none" and scenario.events.source == "mavlink":
-        raise ScenarioError(
-            "with --scheduler, agents cannot read the telemetry of their vehicles: add `events: {source: random}`, or "
-            "use --vehicles none"
-        )
+
+
+def _binaries(scenario: Scenario) -> dict[str, str | None]:
+    """Return the SHA-256 hashes of the ArduPilot programs, by path."""
+    kinds = choose_vehicles(scenario).values()
+    return {str(kind.binary): kind.sha256 for kind in kinds if isinstance(kind, ArduPilot)}

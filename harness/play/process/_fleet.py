@@ -3,13 +3,14 @@
 import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from harness.archive.directory import RunDirectory
 from harness.archive.run_record import GroundStationRecord
 from harness.errors import ScenarioError
 from harness.play._radio_range import track_of
-from harness.play.process._run_lab import MissionLab
+from harness.play.process._run_lab import VehicleLab
 from harness.play.process._vehicle_process import VehicleProcess
 from harness.play.process._watchers import MissionTasks
 from harness.scenario import Scenario
@@ -41,12 +42,17 @@ class Fleet:
         rundir: RunDirectory,
         clock: MissionClock,
         watchers: MissionTasks,
+        lost_worker: Callable[[int], str | None] | None = None,
     ) -> None:
+        """Create the vehicles without starting them. If vehicles run on the workers of a cluster, `lost_worker` returns
+        the address of a vehicle's worker if the worker is lost.
+        """
         self._scenario = scenario
         self._kinds = kinds
         self._rundir = rundir
         self._clock = clock
         self._watchers = watchers
+        self._lost_worker = lost_worker or (lambda vehicle_id: None)
         self._sysids = system_ids(scenario.roster)
         self._vehicles = {vehicle_id: self._vehicle(vehicle_id) for vehicle_id in scenario.roster if kinds}
         self._station: GroundStation | None = None
@@ -56,9 +62,11 @@ class Fleet:
         return bool(self._vehicles)
 
     def _vehicle(self, vehicle_id: int, incarnation: int = 1) -> VehicleProcess:
-        return VehicleProcess(vehicle_id, self._sysids[vehicle_id], self._kinds[vehicle_id], self._rundir, incarnation)
+        sysid, kind = self._sysids[vehicle_id], self._kinds[vehicle_id]
+        lost_worker = partial(self._lost_worker, vehicle_id)
+        return VehicleProcess(vehicle_id, sysid, kind, self._rundir, incarnation, lost_worker)
 
-    async def start(self, lab: MissionLab, show: Callable[[str], None]) -> None:
+    async def start(self, lab: VehicleLab, show: Callable[[str], None]) -> None:
         """Start all vehicles, and wait until all vehicles can be armed. `show` receives the progress as text. Raises
         VehicleFailedError, and ScenarioError if the ground station cannot be reached.
         """
@@ -75,7 +83,7 @@ class Fleet:
             show(f"{ready} of {len(readied)} vehicles are ready")
             await next_one
 
-    async def _boot(self, vehicle: VehicleProcess, lab: MissionLab) -> None:
+    async def _boot(self, vehicle: VehicleProcess, lab: VehicleLab) -> None:
         await vehicle.start(lab, self._home_of(vehicle.vehicle_id), self._scenario.speedup)
 
     def _home_of(self, vehicle_id: int) -> Home:
@@ -91,7 +99,7 @@ class Fleet:
         for vehicle_id in vehicle_ids:
             self._vehicles[vehicle_id].hand_over()
 
-    async def _supervise(self, vehicle: VehicleProcess, lab: MissionLab) -> None:
+    async def _supervise(self, vehicle: VehicleProcess, lab: VehicleLab) -> None:
         """Watch a vehicle that has just started, give it its flight plan, and connect it to the ground station."""
         self._watchers.start(vehicle.watch(), of=f"vehicle {vehicle.vehicle_id}")
         flight = self._scenario.flight_of(vehicle.vehicle_id)
@@ -124,7 +132,7 @@ class Fleet:
         self._watchers.stop(f"vehicle {vehicle_id}")
         await self._vehicles[vehicle_id].kill()
 
-    async def replace(self, vehicle_id: int, lab: MissionLab, incarnation: int) -> None:
+    async def replace(self, vehicle_id: int, lab: VehicleLab, incarnation: int) -> None:
         """Kill the program of a vehicle, and start a new program with the same flight. In a run without vehicles, do
         nothing.
         """

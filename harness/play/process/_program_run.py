@@ -30,7 +30,7 @@ from harness.play.process._channel_process import ChannelProcess
 from harness.play.process._fleet import Fleet
 from harness.play.process._lag_meter import LagMeter
 from harness.play.process._rogue_process import RogueProcess
-from harness.play.process._run_lab import MissionLab, OpenLab
+from harness.play.process._run_lab import MissionLab, OpenLab, VehicleLab
 from harness.play.process._watchers import MissionTasks, open_unless_interrupted
 from harness.play.process.process_preflight import add_rogue_listener
 from harness.play.progress import ProgressDisplay, SwarmSnapshot
@@ -85,7 +85,7 @@ class ProgramRun:
         - `open_lab`: opens a lab of processes or of containers.
         - `keeps_disks`: each agent has a disk with which it can reboot. Otherwise only the agents that the scenario
           reboots with their disk have one.
-        - `hosts`: runs all agents on other computers. By default, the agents run in the lab.
+        - `hosts`: runs all agents and vehicles on other computers. By default, they run in the lab.
         """
         self.scenario = scenario
         self.seed = seed
@@ -102,6 +102,7 @@ class ProgramRun:
         self.stage = "building the lab"
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
+        self._hosts = hosts
         self._remote = RemoteAgents(scenario, rundir, self.clock.now, hosts)
         self.agents = [
             AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now)
@@ -114,7 +115,8 @@ class ProgramRun:
         self._reach = RadioRange(scenario)
         self._changing_network = asyncio.Lock()
         self._watchers = MissionTasks()
-        self._fleet = Fleet(scenario, kinds, rundir, self.clock, self._watchers)
+        lost_worker = hosts.lost_worker if hosts else None
+        self._fleet = Fleet(scenario, kinds, rundir, self.clock, self._watchers, lost_worker)
         self._lag: LagMeter | None = None
         self._udp_before_start: Mapping[int, UdpCounters] = {}
         self._injected: list[TimedInjection] = []
@@ -168,6 +170,10 @@ class ProgramRun:
                 self._end_early(MachineError(f"{error.strerror}: {error.filename or self.rundir.path}"))
             await self._end_run(lab)
 
+    @property
+    def _vehicle_lab(self) -> VehicleLab:
+        return self._lab if self._hosts is None else self._hosts
+
     async def _watch_for_interruption(self) -> None:
         await self.interrupted.wait()
         raise InterruptedRunError(f"the run was interrupted at mission second {self.clock.now():.0f}")
@@ -182,7 +188,7 @@ class ProgramRun:
 
     async def begin(self, first: Change) -> None:
         self._watchers.start(self._remote.watch_hosts(), of="hosts")
-        await self._fleet.start(self._lab, self._show)
+        await self._fleet.start(self._vehicle_lab, self._show)
         await self._start_agents(self._lab)
         if self._channel is not None:
             await self._channel.start(self._lab.network)
@@ -244,6 +250,7 @@ class ProgramRun:
             bundle = None if captured is None else self._keys.write_bundle(captured, kept=True)
             await self._rogue.begin(epoch_us, bundle)
         self.clock.start(epoch_us)
+        self._remote.measure_lag()
         self._udp_before_start = await self._lab.network.datagrams()
         local = [agent_id for agent_id in self.scenario.roster if agent_id not in self._remote]
         namespaces = {agent_id: self._lab.network.networks[agent_id] for agent_id in local}
@@ -343,7 +350,7 @@ class ProgramRun:
 
     async def _restart_with_vehicle(self, agent: AgentProcess) -> None:
         """Start a new vehicle program in place of the lost vehicle, and a new agent program on the new vehicle."""
-        await self._fleet.replace(agent.agent_id, self._lab, incarnation=agent.incarnations + 1)
+        await self._fleet.replace(agent.agent_id, self._vehicle_lab, incarnation=agent.incarnations + 1)
         await self._start_agent(agent, self._lab)
 
     async def _apply_conditions(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:

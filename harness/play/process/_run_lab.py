@@ -18,8 +18,30 @@ from netem.lab import Lab as NetworkLab
 Role = Literal["agent", "vehicle"]
 
 
-class MissionLab(Protocol):
-    """A virtual network with vehicles. Its methods raise NetemError if the network fails.
+class VehicleLab(Protocol):
+    """A lab or cluster that runs vehicle programs. Its methods raise NetemError if a program cannot be started.
+
+    `netem.lab.Lab` documents the methods.
+    """
+
+    async def spawn(
+        self,
+        vehicle: int,
+        argv: Sequence[str],
+        *,
+        cwd: Path,
+        env: Mapping[str, str],
+        stdout: Path,
+        stderr: Path,
+        role: Role,
+        max_file_bytes: int | None = None,
+    ) -> LabProgram: ...
+
+    async def connect(self, vehicle: int, port: int, *, timeout_s: float) -> socket: ...
+
+
+class MissionLab(VehicleLab, Protocol):
+    """A virtual network with vehicles and agents. Its methods raise NetemError if the network fails.
 
     `netem.lab.Lab` documents the methods that have no docstring here.
     """
@@ -38,21 +60,6 @@ class MissionLab(Protocol):
         """The underlying network of `netem`. The harness runs its own programs in this network, such as packet
         captures.
         """
-
-    async def spawn(
-        self,
-        vehicle: int,
-        argv: Sequence[str],
-        *,
-        cwd: Path,
-        env: Mapping[str, str],
-        stdout: Path,
-        stderr: Path,
-        role: Role,
-        max_file_bytes: int | None = None,
-    ) -> LabProgram: ...
-
-    async def connect(self, vehicle: int, port: int, *, timeout_s: float) -> socket: ...
 
     async def apply(self, conditions: NetworkConditions) -> AppliedConditions: ...
 

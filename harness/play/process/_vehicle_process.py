@@ -4,14 +4,14 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
 from harness.archive.directory import RunDirectory
 from harness.errors import HarnessError
 from harness.play._child_processes import passed_on
-from harness.play.process._run_lab import MissionLab
+from harness.play.process._run_lab import VehicleLab
 from harness.play.process.lab_program import LabProgram
 from harness.scenario.vehicles import Flight
 from netem.radio import Place
@@ -38,11 +38,18 @@ class VehicleFailedError(HarnessError):
 
 class VehicleProcess:
     """The program of one vehicle. `sysid` is the MAVLink system ID of the vehicle. `incarnation` is 1 for the first
-    program of the vehicle, and greater for a replacement.
+    program of the vehicle, and greater for a replacement. `lost_worker` returns the address of the worker on which the
+    program runs, if this worker is lost.
     """
 
     def __init__(
-        self, vehicle_id: int, sysid: int, kind: VehicleKind, rundir: RunDirectory, incarnation: int = 1
+        self,
+        vehicle_id: int,
+        sysid: int,
+        kind: VehicleKind,
+        rundir: RunDirectory,
+        incarnation: int = 1,
+        lost_worker: Callable[[], str | None] = lambda: None,
     ) -> None:
         self.vehicle_id = vehicle_id
         self.sysid = sysid
@@ -54,12 +61,15 @@ class VehicleProcess:
         self._flight: PilotProcedure | None = None
         self._circumstances: list[dict[str, Any]] = []
         self._station_port = STATION_PORT
+        self._lost_worker = lost_worker
+        self._lost_with: str | None = None
+        """The worker with which the vehicle was lost."""
 
     @property
     def _output(self) -> Path:
         return self._directory / "output.log"
 
-    async def start(self, lab: MissionLab, home: Home, speedup: float) -> None:
+    async def start(self, lab: VehicleLab, home: Home, speedup: float) -> None:
         """Start the vehicle and connect its pilot. Raises VehicleFailedError."""
         self._home = home
         try:
@@ -77,7 +87,7 @@ class VehicleProcess:
         )
         await self._connect(lab, launch, speedup)
 
-    async def _connect(self, lab: MissionLab, launch: Launch, speedup: float) -> None:
+    async def _connect(self, lab: VehicleLab, launch: Launch, speedup: float) -> None:
         assert self._process is not None
         self._station_port = launch.station_port
         deadline = asyncio.get_running_loop().time() + LISTEN_LIMIT_S
@@ -98,7 +108,7 @@ class VehicleProcess:
         self.pilot = Pilot(self.sysid, sock, tlog, speedup, self._home, self.kind.vehicle_type, self.vehicle_id)
         await self.pilot.start()
 
-    async def join(self, station: GroundStation, lab: MissionLab) -> None:
+    async def join(self, station: GroundStation, lab: VehicleLab) -> None:
         """Connect the vehicle with the ground station. Raises VehicleFailedError."""
         try:
             sock = await lab.connect(self.vehicle_id, self._station_port, timeout_s=CONNECT_LIMIT_S)
@@ -161,13 +171,18 @@ class VehicleProcess:
         await self._run_pilot(self.pilot.stay_in_touch())
 
     async def _run_pilot(self, flight: Coroutine[Any, Any, None]) -> None:
-        """Run an operation of the pilot. If it fails, kill the vehicle and raise VehicleFailedError."""
+        """Run an operation of the pilot. If it fails, kill the vehicle and raise VehicleFailedError. If the vehicle was
+        lost with its worker, return.
+        """
         try:
             await flight
         except VehicleError as error:
             assert self._process is not None
             with contextlib.suppress(TimeoutError):  # a process ends shortly after its connection
                 await asyncio.wait_for(self._process.wait(), END_LIMIT_S)
+            if self._is_lost():
+                return
+            if self._process.returncode is not None:
                 raise self._end_error(self._process) from None
             self._abandoned = True
             await self._process.send_signal(signal.SIGKILL)  # it may be in an endless loop, or fly away
@@ -177,8 +192,13 @@ class VehicleProcess:
         """Wait for the process to end. Raises VehicleFailedError if it ended without a request."""
         assert self._process is not None
         await self._process.wait()
-        if not self._abandoned:
+        if not self._abandoned and not self._is_lost():
             raise self._end_error(self._process)
+
+    def _is_lost(self) -> bool:
+        """Return true if the vehicle was lost with its worker. Such a vehicle is not at fault, and the run goes on."""
+        self._lost_with = self._lost_with or self._lost_worker()
+        return self._lost_with is not None
 
     async def kill(self) -> None:
         """Kill the process with SIGKILL. Before the call, cancel the tasks that run `watch` and `fly`."""
@@ -198,6 +218,8 @@ class VehicleProcess:
         None.
         """
         if self.pilot is None or self._flight is None or self._process is None or self._process.returncode is not None:
+            return None
+        if self._is_lost():
             return None
         return self.pilot.shortfall(self._flight)
 
@@ -225,6 +247,8 @@ class VehicleProcess:
     def to_json(self) -> dict[str, object]:
         record: dict[str, Any] = {"kind": self.kind.name, "type": self.kind.vehicle_type, "sysid": self.sysid}
         record |= self._firmware()
+        if self._lost_with is not None:
+            record["lost_with"] = self._lost_with
         if self.pilot is not None:
             state, factor = self.pilot.state, self.pilot.real_time_factor
             record["mode"] = state.mode

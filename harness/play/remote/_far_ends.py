@@ -28,6 +28,9 @@ from sitl.address import ListenAddress
 from ucp.features import CONTRACT
 
 SOCKET = "join"
+WORKER = 0
+"""The agent ID in the hello of a worker itself (`harness.play.hosts`). The session is then the address of the worker.
+"""
 JOIN_LIMIT_S = 300.0
 """Seconds of wall time in which all far ends must connect."""
 PINGS = 20

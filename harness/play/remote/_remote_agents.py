@@ -20,7 +20,7 @@ from harness.archive.run_record import CutOff, RemoteRecord
 from harness.errors import MachineError, ScenarioError
 from harness.play.hosts._agent_hosts import AgentHosts
 from harness.play.process.lab_program import LabProgram
-from harness.play.remote._far_ends import JOIN_LIMIT_S, SOCKET, FarEnd, FarEnds, listening
+from harness.play.remote._far_ends import JOIN_LIMIT_S, SOCKET, WORKER, FarEnd, FarEnds, listening
 from harness.play.remote._remote_program import RemoteProgram
 from harness.play.remote._stand_in_task import StandInTask
 from harness.play.remote.secret_file import read_secret
@@ -120,7 +120,8 @@ class RemoteAgents:
 
     def stand_in_command(self, agent_id: int) -> list[str]:
         """Return the command of a stand-in, without the mission file."""
-        task = StandInTask(agent_id, agent_id, agent_id, PORT, self._scenario.speedup, measures_lag=True)
+        measures_lag = self._hosts is None  # each worker measures its delays once for all its agents
+        task = StandInTask(agent_id, agent_id, agent_id, PORT, self._scenario.speedup, measures_lag)
         return task.command(self._rundir.path / SOCKET)
 
     @asynccontextmanager
@@ -188,6 +189,8 @@ class RemoteAgents:
         while missing := self._missing():
             show(f"waiting for agent {', '.join(map(str, missing))} to join")
             await self._vehicles[missing[0]].joined.wait()
+        if self._hosts is not None:
+            await self._hosts.joined()
 
     def _missing(self) -> list[int]:
         return [vehicle.agent_id for vehicle in self._vehicles.values() if not vehicle.joined.is_set()]
@@ -195,6 +198,8 @@ class RemoteAgents:
     # The methods of harness.play.remote._far_ends.Host
 
     def refusal(self, agent_id: int, session: str, host: str) -> str:
+        if agent_id == WORKER and self._hosts is not None:
+            return self._hosts.refusal(session)
         vehicle = self._vehicles.get(agent_id)
         if vehicle is None:
             awaited = ", ".join(map(str, self._vehicles))
@@ -206,6 +211,9 @@ class RemoteAgents:
         return ""
 
     async def receive(self, far_end: FarEnd) -> None:
+        if far_end.agent_id == WORKER and self._hosts is not None:
+            await self._hosts.receive(far_end, self._rundir.append_lag)
+            return
         vehicle = self._vehicles[far_end.agent_id]
         if not vehicle.joined.is_set():
             vehicle.delay_s = await far_end.measured_delay()
@@ -253,7 +261,13 @@ class RemoteAgents:
             vehicle.is_connected = not message["cut_off"]
             self._set_cut_off(vehicle, message["cut_off"])
         if (line := message.get("lag")) is not None:
-            self._rundir.append_lag(vehicle.agent_id, line)
+            self._rundir.append_lag(str(vehicle.agent_id), line.encode())
+
+    def measure_lag(self) -> None:
+        """Let the workers of a cluster measure their delays, from the start of the mission."""
+        if self._hosts is not None:
+            epochs_us = {vehicle.agent_id: vehicle.epoch_us for vehicle in self._vehicles.values()}
+            self._hosts.measure_lag(epochs_us, self._scenario.speedup)
 
     def _set_cut_off(self, vehicle: _RemoteVehicle, cut_off: bool) -> None:
         if vehicle.cut_off == cut_off or self._ended:

@@ -34,7 +34,7 @@ class WireError(Exception):
 
 class Kind(IntEnum):
     """The kinds of messages. The harness sends the kinds `begin`, `resume`, `idle`, `request`, `signal` and `ping` to
-    the far end.
+    the far end. Only the connections of workers (`harness.play.hosts`) use `stream` and `file`.
     """
 
     PING = 1
@@ -54,6 +54,8 @@ class Kind(IntEnum):
     LAG = 15
     EXIT = 16
     BUNDLE = 17
+    STREAM = 18
+    FILE = 19
 
 
 @dataclass(frozen=True)

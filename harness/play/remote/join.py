@@ -70,7 +70,7 @@ class JoinRequest:
 
 
 @dataclass(frozen=True)
-class _Connected:
+class JoinedRun:
     """A connection whose other end has proved that it knows the secret."""
 
     connection: socket.socket
@@ -114,7 +114,7 @@ def join_command(listen: str, agent_id: int) -> str:
     return f"ucp-harness join {where} --as {agent_id} --secret-file FILE -- COMMAND"
 
 
-class _RunOverError(Exception):
+class RunOverError(Exception):
     """An error: no harness listens any more, so the run has ended."""
 
 
@@ -209,8 +209,8 @@ class _Joining:
         joined = False
         while True:
             try:
-                connected = await self._connect()
-            except _RunOverError as error:
+                connected = await connect(self._request, self._session)
+            except RunOverError as error:
                 if self._request.service:
                     self._say_once(f"waits for a harness at {self._request.address}")
                     await asyncio.sleep(RETRY_S)
@@ -230,32 +230,32 @@ class _Joining:
             self._say_once(f"agent {self._request.agent_id} has joined {connected.name!r} at {self._request.address}")
             await self._play_run(connected, directory)
 
-    async def _play_run(self, first: _Connected, directory: Path) -> None:
+    async def _play_run(self, first: JoinedRun, directory: Path) -> None:
         """Run incarnations until the harness accepts no further connection."""
         places = [
             self._play_place(connected, first.run, directory) for connected in (first, *[None] * (first.places - 1))
         ]
         ended = await asyncio.gather(*places, return_exceptions=True)
         for error in ended:
-            if not isinstance(error, JoinError | _RunOverError):
+            if not isinstance(error, JoinError | RunOverError):
                 raise error
 
-    async def _play_place(self, connected: _Connected | None, run: str, directory: Path) -> NoReturn:
-        """Run one incarnation after another. Raises _RunOverError when the run has ended, and JoinError."""
+    async def _play_place(self, connected: JoinedRun | None, run: str, directory: Path) -> NoReturn:
+        """Run one incarnation after another. Raises RunOverError when the run has ended, and JoinError."""
         while True:
             if connected is not None:
                 await self._play_incarnation(connected, directory)
-            connected = await self._connect()
+            connected = await connect(self._request, self._session)
             if connected.run != run:
                 connected.connection.close()
-                raise _RunOverError("another run has begun")
+                raise RunOverError("another run has begun")
 
     def _say_once(self, sentence: str) -> None:
         if sentence != self._said:
             self._said = sentence
             self._say(sentence)
 
-    async def _play_incarnation(self, connected: _Connected, directory: Path) -> None:
+    async def _play_incarnation(self, connected: JoinedRun, directory: Path) -> None:
         """Run a worker process with this connection until the worker ends. If the worker asks for another connection,
         provide one.
         """
@@ -290,7 +290,7 @@ class _Joining:
             return False
         return bool(asking.result())
 
-    async def _reconnect(self, run: str, ended: asyncio.Task[int]) -> _Connected | None:
+    async def _reconnect(self, run: str, ended: asyncio.Task[int]) -> JoinedRun | None:
         """Connect again. Return None if the incarnation must end, because `REJOIN_LIMIT_S` has passed or the run has
         ended.
         """
@@ -298,8 +298,8 @@ class _Joining:
         deadline = loop.time() + REJOIN_LIMIT_S
         while loop.time() < deadline and not ended.done():
             try:
-                connected = await self._connect()
-            except _RunOverError:
+                connected = await connect(self._request, self._session)
+            except RunOverError:
                 return None
             except JoinError:
                 await asyncio.sleep(RETRY_S)
@@ -310,41 +310,42 @@ class _Joining:
             return None
         return None
 
-    async def _connect(self) -> _Connected:
-        """Connect to the harness. Raises _RunOverError if no harness listens, and JoinError for any other problem."""
-        request, loop = self._request, asyncio.get_running_loop()
-        where = f"the harness at {request.address}"
-        hello: dict[str, Any] = {
-            "protocol": PROTOCOL,
-            "contract": CONTRACT,
-            "agent": request.agent_id,
-            "session": self._session,
-            "command": list(request.command),
-        }
-        connection = None
-        try:
-            async with asyncio.timeout(CONNECT_LIMIT_S):
-                found = await loop.getaddrinfo(request.host, request.port, type=socket.SOCK_STREAM)
-                family, kind, protocol, _, place = found[0]
-                connection = socket.socket(family, kind, protocol)
-                prepare(connection)
-                await loop.sock_connect(connection, place)
-            channel, welcome = await introduce(connection, request.secret, hello)
-            places = min(MAX_PLACES, int(welcome["places"]))
-            return _Connected(connection, channel, str(welcome["run"]), str(welcome["name"]), places)
-        except BaseException as error:
-            if connection is not None:
-                connection.close()
-            match error:
-                case ConnectionRefusedError():
-                    raise _RunOverError(f"no harness listens at {request.address}") from None
-                case RefusedError():
-                    raise JoinError(f"{where} refused agent {request.agent_id}: {error}") from None
-                case HandshakeError():
-                    raise JoinError(f"{where} {error}") from None
-                case TimeoutError():
-                    raise JoinError(f"{where} does not answer: check the address and the firewall") from None
-                case OSError():
-                    why = error.strerror or error
-                    raise JoinError(f"{where} cannot be reached ({why}): check the address") from None
-            raise
+
+async def connect(request: JoinRequest, session: str) -> JoinedRun:
+    """Connect to the harness. Raises RunOverError if no harness listens, and JoinError for any other problem."""
+    loop = asyncio.get_running_loop()
+    where = f"the harness at {request.address}"
+    hello: dict[str, Any] = {
+        "protocol": PROTOCOL,
+        "contract": CONTRACT,
+        "agent": request.agent_id,
+        "session": session,
+        "command": list(request.command),
+    }
+    connection = None
+    try:
+        async with asyncio.timeout(CONNECT_LIMIT_S):
+            found = await loop.getaddrinfo(request.host, request.port, type=socket.SOCK_STREAM)
+            family, kind, protocol, _, place = found[0]
+            connection = socket.socket(family, kind, protocol)
+            prepare(connection)
+            await loop.sock_connect(connection, place)
+        channel, welcome = await introduce(connection, request.secret, hello)
+        places = min(MAX_PLACES, int(welcome["places"]))
+        return JoinedRun(connection, channel, str(welcome["run"]), str(welcome["name"]), places)
+    except BaseException as error:
+        if connection is not None:
+            connection.close()
+        match error:
+            case ConnectionRefusedError():
+                raise RunOverError(f"no harness listens at {request.address}") from None
+            case RefusedError():
+                raise JoinError(f"{where} refused agent {request.agent_id}: {error}") from None
+            case HandshakeError():
+                raise JoinError(f"{where} {error}") from None
+            case TimeoutError():
+                raise JoinError(f"{where} does not answer: check the address and the firewall") from None
+            case OSError():
+                why = error.strerror or error
+                raise JoinError(f"{where} cannot be reached ({why}): check the address") from None
+        raise

@@ -1,15 +1,20 @@
-"""Test runs whose agents are on the workers of a Dask cluster, which are local processes."""
+"""Test runs whose agents and vehicles are on the workers of a Dask cluster, which are local processes."""
 
 import contextlib
 import json
 import os
+import re
 import signal
+import socket
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from harness.play.hosts._vehicle_files import file_path
+from harness.play.hosts._worker_task import why_not
 from tests.harness.command import Running, harness, sentences, write_scenario
 from tests.harness.dask_processes import Cluster, until
 
@@ -178,6 +183,131 @@ def test_nothing_is_left_behind_by_an_ended_command(tmp_path: Path, hosts: Hosts
     until(lambda: hosts.left_behind() == [])
 
 
+# Vehicle programs on workers
+
+SITL = """#!{python}
+# A stand-in for ArduPilot SITL: it reads the same options, and writes a parameter file and a flight log.
+import pathlib, sys
+option = dict(zip(sys.argv[1::2], sys.argv[2::2]))
+sysid = next(line.split()[1] for line in open("vehicle.parm") if line.startswith("SYSID_THISMAV"))
+pathlib.Path("eeprom.bin").write_bytes(bytes(16384))
+pathlib.Path("logs").mkdir()
+pathlib.Path("logs/00000001.BIN").write_bytes(b"log of " + sysid.encode() + bytes(3_000_000))
+print("SITL of vehicle", sysid, flush=True)
+sys.path.insert(0, {root!r})
+from sitl import embedded
+embedded.main(["--sysid", sysid, "--home=" + option["--home"], "--speedup", option["--speedup"]])
+"""
+
+
+def stand_in_for_sitl(path: Path) -> dict[str, Any]:
+    """Write a stand-in for ArduPilot. Return the key `vehicles` of a scenario with this program."""
+    path.write_text(SITL.format(python=sys.executable, root=str(Path(__file__).parents[4])))
+    path.chmod(0o755)
+    return {"kind": "ardupilot", "binary": str(path)}
+
+
+def flights(directory: Path, vehicles: dict[str, Any], **keys: Any) -> Path:
+    usual = {"events": {"position_interval_s": 10}, "speedup": 10, "duration_s": 100, "final_reconcile": True}
+    return scenario(directory, vehicles=vehicles, **{**usual, **keys})
+
+
+def test_vehicle_programs_run_on_the_workers_of_their_agents(tmp_path: Path, hosts: Hosts) -> None:
+    hosts.start("one")
+    hosts.start("two", threads=2)
+    out = tmp_path / "run"
+    vehicles = stand_in_for_sitl(tmp_path / "arducopter")
+    path = flights(tmp_path, vehicles, timeline=[{"at_s": 50, "kill": [2]}, {"at_s": 60, "restart": [2]}])
+    station = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    station.bind(("127.0.0.1", 0))
+    gcs = f"127.0.0.1:{station.getsockname()[1]}"
+    run = Running(path, out, "--scheduler", hosts.scheduler_address, "--seed", 1, "--gcs", gcs)
+    run.wait_for_mission(1, 2, 3)
+    placed = [sum("arducopter" in command for command in hosts.processes(name).values()) for name in ("one", "two")]
+    assert sorted(placed) == [1, 2], "in proportion to the threads"
+    _, errors = run.process.communicate(timeout=120)
+    record = record_of(out)
+    assert (verdicts(record), run.process.returncode) == (GOOD, 0), errors
+    assert record["ground_station"]["sent"] > 10
+    station.close()
+    for incarnation in ("1", "2", "2-2", "3"):
+        directory = out / "vehicles" / incarnation
+        sysid = incarnation[0]
+        assert f"SITL of vehicle {sysid}" in (directory / "output.log").read_text()
+        log = (directory / "logs/00000001.BIN").read_bytes()
+        assert (len(log), log[:8]) == (3_000_008, f"log of {sysid}".encode())
+        assert (directory / "eeprom.bin").stat().st_size == 16384
+        assert (directory / "telemetry.tlog").stat().st_size > 1000
+    assert all(vehicle["armed"] and vehicle["altitude_m"] > 10 for vehicle in record["vehicles"].values())
+    until(lambda: hosts.left_behind() == [])
+
+
+def test_lost_worker_is_named_as_the_loss_of_its_vehicles(tmp_path: Path, hosts: Hosts) -> None:
+    hosts.start("one")
+    doomed = hosts.start("two")
+    out = tmp_path / "run"
+    path = flights(tmp_path, {"kind": "embedded"}, agents=4, duration_s=300)
+    run = Running(path, out, "--scheduler", hosts.scheduler_address, "--seed", 1)
+    run.wait_for_mission(1, 2, 3, 4)
+    doomed.kill()
+    _, errors = run.process.communicate(timeout=120)
+    record = record_of(out)
+    cut = {agent for agent, found in record["remote"].items() if found["cut_off"]}
+    lost = {vehicle: found["lost_with"] for vehicle, found in record["vehicles"].items() if "lost_with" in found}
+    assert len(cut) == 2
+    assert set(lost) == cut, errors
+    assert lost == {agent: record["remote"][agent]["worker"] for agent in cut}
+    assert f"vehicles {' and '.join(sorted(cut))} were lost with their worker" in errors
+    assert record["mission_s"] > 300, "the run went on"
+    assert run.process.returncode == 3
+    until(lambda: hosts.left_behind() == [])
+
+
+def test_vehicle_that_exits_on_a_worker_ends_the_run_with_its_output(tmp_path: Path, hosts: Hosts) -> None:
+    hosts.start("one")
+    binary = tmp_path / "arducopter"
+    binary.write_text("#!/bin/sh\necho bind failed >&2\nexit 1\n")
+    binary.chmod(0o755)
+    path = flights(tmp_path, {"kind": "ardupilot", "binary": str(binary)})
+    done = harness("run", path, "--scheduler", hosts.scheduler_address, "--out", tmp_path / "run", deadline_s=240)
+    said = sentences(done.stderr)[0]
+    assert re.search(r"vehicle \d \(ardupilot\) ended by itself with status 1; its last output .*: bind failed", said)
+    assert done.returncode == 2
+    until(lambda: hosts.left_behind() == [])
+
+
+def test_ended_command_leaves_no_vehicles_on_a_worker(tmp_path: Path, hosts: Hosts) -> None:
+    hosts.start("one")
+    vehicles = stand_in_for_sitl(tmp_path / "arducopter")
+    path = flights(tmp_path, vehicles, duration_s=9000)
+    run = Running(path, tmp_path / "run", "--scheduler", hosts.scheduler_address)
+    run.wait_for_mission(1, 2, 3)
+    assert sum("arducopter" in command for command in hosts.processes().values()) == 3
+    run.process.kill()
+    run.process.communicate(timeout=120)
+    until(lambda: hosts.left_behind() == [])
+
+
+@pytest.mark.parametrize("name", ["../7.tlog", "/etc/motd", "", "logs/../../x", "a\0b"])
+def test_worker_cannot_write_outside_the_directory_of_a_vehicle(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="is not the name of a file"):
+        file_path(tmp_path, name)
+
+
+@pytest.mark.parametrize(
+    ("binaries", "why"),
+    [
+        ({"/nowhere/arducopter": "00"}, "it has no program /nowhere/arducopter"),
+        ({"/bin/sh": "00"}, "is another program"),
+    ],
+)
+def test_worker_with_another_vehicle_program_is_refused(binaries: dict[str, str | None], why: str) -> None:
+    assert why in str(why_not([], binaries, has_keys=False))
+
+
+# Refusals
+
+
 @pytest.mark.parametrize(
     ("keys", "options", "why"),
     [
@@ -185,7 +315,6 @@ def test_nothing_is_left_behind_by_an_ended_command(tmp_path: Path, hosts: Hosts
         ({}, ["--listen", "127.0.0.1:14700"], "none joins at --listen"),
         ({}, ["--kernel", "uml"], "--scheduler does not work with --kernel uml"),
         ({"remote": {"agents": [2], "secret_file": "lab.key"}}, [], "`remote` does not work with --scheduler"),
-        ({"vehicles": {"kind": "embedded"}, "events": {}}, [], "cannot read the telemetry of their vehicles"),
         ({}, [], "--scheduler nowhere is not an address"),
     ],
 )
