@@ -178,9 +178,12 @@ def test_ctrl_c_ends_the_runs_of_workers(tmp_path: Path, dask: Cluster) -> None:
     asked, out = of_processes(tmp_path, scenario={"duration_s": 100_000}), tmp_path / "out"
     command = [*COMMAND, "matrix", str(asked), "--scheduler", address, "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        until(lambda: any(tmp_path.glob("dask/one/**/agents/*.trace.jsonl")) or process.poll() is not None)
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=DEADLINE_S)
+        try:
+            until(lambda: any(tmp_path.glob("dask/one/**/agents/*.trace.jsonl")) or process.poll() is not None)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=DEADLINE_S)
+        finally:
+            process.kill()  # otherwise a failed test waits for the whole mission
     assert process.returncode == 130, said
     until(lambda: not any(tmp_path.glob("dask/one/**/agents")))
     with cluster([-1], abs, address) as outcomes:
