@@ -21,10 +21,10 @@ from itertools import combinations_with_replacement
 from typing import Protocol
 
 from harness.checker.recorded_inputs import NotOnRecordError, decoded, event_of
-from harness.checker.reference.algorithms import ON_MESSAGE
+from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE, ON_TIMER
 from harness.checker.reference.state import ReferenceState
 from harness.checker.steps.deviation import StepDeviation
-from harness.checker.steps.follower import LOGS, StepComparer
+from harness.checker.steps.follower import EVENT_OF, LOGS, StepComparer
 from ucp.events import MalformedEventsError, decode_events
 from ucp.messages import (
     BlockAddResponse,
@@ -35,7 +35,7 @@ from ucp.messages import (
     encode,
 )
 from ucp.trace import HandlerRun, RecordedBytes, SentMessage
-from ucp.trigger import LocalTrigger, MessageTrigger
+from ucp.trigger import EventTrigger, LocalTrigger, MessageTrigger, TimerTrigger
 
 Line = tuple[int, HandlerRun]
 """A handler run with its line number."""
@@ -211,10 +211,13 @@ def _has_impossible_top(before: StepComparer, deviation: StepDeviation, line: Li
 
 
 def _contradicts_itself(run: HandlerRun, agent_id: int, others: OtherRecords) -> bool:
-    """Return true if a datagram on the line is invalid, or is not the sent message that the line names.
+    """Return true if the handler on the line has another number or another trigger, or if a datagram on the line is
+    invalid or is not the message that the line names.
 
     If another agent received an invalid datagram, the agent has sent it, and the line is correct.
     """
+    if _names_another_handler(run):
+        return True
     if isinstance(run.trigger, MessageTrigger) and _sent_message(run.input) is None:
         return True
     for sent in run.sent:
@@ -226,6 +229,26 @@ def _contradicts_itself(run: HandlerRun, agent_id: int, others: OtherRecords) ->
         if whole is not None and (whole.message, whole.seq, whole.block) != (sent.message, sent.seq, sent.block):
             return True
     return False
+
+
+def _names_another_handler(run: HandlerRun) -> bool:
+    """Return true if the line has the name of one handler, but the number or the trigger of another handler.
+
+    Such a line can be the beginning of one line and the end of a later line.
+    """
+    handler = HANDLERS.get(run.handler)
+    if handler is None:
+        return False
+    if handler.algorithm != run.algorithm:
+        return True
+    trigger = run.trigger
+    if isinstance(trigger, MessageTrigger):
+        return _MESSAGES.get(run.handler) != trigger.message
+    if isinstance(trigger, EventTrigger):
+        return run.handler != LOGS
+    if isinstance(trigger, TimerTrigger):
+        return handler not in ON_TIMER.values()
+    return isinstance(trigger, LocalTrigger) and run.handler not in EVENT_OF
 
 
 def _sent_message(datagram: RecordedBytes | None) -> SentMessage | None:

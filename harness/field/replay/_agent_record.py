@@ -255,14 +255,16 @@ class RecordedTrace:
     def was_paused(self, since: float, until: float) -> bool:
         """Return true if the agent was paused, or may have been paused, between two mission seconds.
 
-        If there is a run.json, it contains the pauses. Otherwise, two facts together suggest a pause: the agent wrote
-        no line between the two seconds, and its next line handles an overdue timer.
+        If there is a run.json, it contains the pauses. Otherwise, a long time without lines suggests a pause. Outside
+        of this time, only little time may have passed, because a running agent handles an overdue timer soon.
         """
         if self.flight.record is not None:
             return Evidence({}, record=self.flight.record).was_paused(self.agent_id, since, until)
-        after = bisect_right(self._times, since)
-        next_s = self._times[after] if after < len(self._times) else until
-        return since + self.header.late_s < next_s and until <= next_s + self.header.late_s
+        tolerated_s = self.header.late_s
+        after = bisect_right(self._times, since + tolerated_s)
+        begins_s = max(since, self._times[after - 1]) if after else since
+        ends_s = min(until, self._times[after]) if after < len(self._times) else until
+        return ends_s - begins_s > tolerated_s and (begins_s - since) + (until - ends_s) <= tolerated_s
 
     @cached_property
     def _times(self) -> list[float]:

@@ -328,6 +328,39 @@ def test_line_that_contradicts_its_datagram_leads_to_no_accusation(
         assert [deviation.sentence(str) for deviation in found.deviations] == [], number
 
 
+@pytest.mark.parametrize("key", ["algorithm", "trigger", "input"])
+def test_beginning_of_one_line_with_the_end_of_another_leads_to_no_accusation(
+    key: str, whole: tuple[Path, Undamaged], tmp_path: Path
+) -> None:
+    """A part of the file is lost. The first key after the lost part belongs to a later line, of another handler."""
+    home = tmp_path / "home"
+    shutil.copytree(whole[0], home)
+    path = home / "1.trace.jsonl"
+    lines = path.read_text("utf-8").splitlines(keepends=True)
+    handlers = [json.loads(line).get("handler") for line in lines]
+    joints = [number for number in range(5, len(lines) - 9) if len({None, *handlers[number : number + 4 : 3]}) == 3]
+    assert len(joints) > 20
+    for number in joints[::7]:
+        first, last = (line.partition(f'"{key}":') for line in (lines[number], lines[number + 3]))
+        joined = "".join([first[0], *last[1:]])
+        path.write_text("".join([*lines[:number], joined, *lines[number + 4 :]]), "utf-8")
+        found = RecordPlayer(open_record(home, 1)).to_end()
+        assert [deviation.sentence(str) for deviation in found.deviations] == [], number
+        assert _judge(home).wrong == (), number
+
+
+def test_pause_between_two_lines_may_begin_after_the_expiry_of_a_timer(whole: tuple[Path, Undamaged]) -> None:
+    """An agent can handle a message after the expiry, then pause, and then handle queued messages before the timer."""
+    record = open_record(whole[0], 1)
+    late_s = record.header.late_s
+    record.__dict__["_times"] = [9.0, 10.0 + late_s / 2, 50.0, 50.0 + late_s / 4, 51.0]
+    assert record.was_paused(10.0, 50.0)
+    assert record.was_paused(10.0, 50.0 + late_s / 4)
+    assert not record.was_paused(10.0, 51.0 + late_s)
+    record.__dict__["_times"] = [10.0 + step * late_s / 2 for step in range(100)]
+    assert not record.was_paused(10.0, 10.0 + 40 * late_s)
+
+
 @pytest.mark.parametrize("number", [119, 139])
 def test_three_lost_lines_near_each_other_lead_to_no_accusation(number: int, tmp_path: Path) -> None:
     """Flight 119 has a lost event whose block is on no record. Flight 139 has three lost answers within 8 lines."""
