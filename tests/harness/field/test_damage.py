@@ -329,7 +329,7 @@ def test_line_that_contradicts_its_datagram_leads_to_no_accusation(
 
 
 @pytest.mark.parametrize("key", ["algorithm", "trigger", "input"])
-def test_beginning_of_one_line_with_the_end_of_another_leads_to_no_accusation(
+def test_two_trace_lines_joined_by_damage_lead_to_no_accusation(
     key: str, whole: tuple[Path, Undamaged], tmp_path: Path
 ) -> None:
     """A part of the file is lost. The first key after the lost part belongs to a later line, of another handler."""
@@ -349,7 +349,7 @@ def test_beginning_of_one_line_with_the_end_of_another_leads_to_no_accusation(
         assert _judge(home).wrong == (), number
 
 
-def test_pause_between_two_lines_may_begin_after_the_expiry_of_a_timer(whole: tuple[Path, Undamaged]) -> None:
+def test_pause_may_begin_soon_after_the_expiry_of_a_timer(whole: tuple[Path, Undamaged]) -> None:
     """An agent can handle a message after the expiry, then pause, and then handle queued messages before the timer."""
     record = open_record(whole[0], 1)
     late_s = record.header.late_s
