@@ -1,9 +1,10 @@
 """Decide whether damage to a few lines of a trace explains a difference from the reference.
 
 A file from the field may lack a line, or contain a damaged line that is still readable. The difference then does not
-prove a mistake of the agent. The module tries four kinds of damage:
+prove a mistake of the agent. The module tries five kinds of damage:
 
 - One character of the line is wrong, or the line contradicts itself.
+- The line is the beginning of one line and the end of a later line. The part of the file between them is missing.
 - The line and the next line are in the wrong order.
 - The line before this line is missing. The missing handler run changed no block, so no recorded state reveals it.
 - Several lines before this line are missing. They contained answers to one question, which often arrive together. One
@@ -20,6 +21,7 @@ from copy import copy
 from itertools import combinations_with_replacement
 from typing import Protocol
 
+from harness.archive.vocabulary import branch_is_known
 from harness.checker.recorded_inputs import NotOnRecordError, decoded, event_of
 from harness.checker.reference.algorithms import HANDLERS, ON_MESSAGE, ON_TIMER
 from harness.checker.reference.state import ReferenceState
@@ -42,7 +44,7 @@ Line = tuple[int, HandlerRun]
 
 
 class OtherRecords(Protocol):
-    """The records of a flight: those of all other agents, and the times of the judged agent's reconciles."""
+    """The records of a flight: those of all other agents, and some facts about the judged agent and its trace file."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
         """Return the recorded datagrams with this sender and this sequence number."""
@@ -59,6 +61,9 @@ class OtherRecords(Protocol):
 
     def was_reconciling(self, at_s: float) -> bool:
         """Return true if the last trace line of the judged agent before this mission second shows a reconcile."""
+
+    def beginnings(self, number: int) -> Iterable[str]:
+        """Return each part of line `number` of the trace file that ends at the beginning of a disk block."""
 
 
 LINES_AFTER = 8
@@ -96,6 +101,8 @@ def damage_that_explains(
         return "the top chain hash on the line is damaged"
     if _contradicts_itself(line[1], before.state.agent_id, others):
         return "the line is damaged"
+    if _is_joined(deviation, line, others):
+        return "a part of the file is missing, and the line is joined from two lines"
     for trial in _with_a_line_more(before, line[1], others):
         if _agrees(trial, [line, *following], others):
             return "a line is missing"
@@ -145,9 +152,7 @@ def _as_it_may_have_been(
 ) -> Iterator[HandlerRun]:
     expected = deviation.expected
     if expected is not None and deviation.run is run and not _was_received(before, expected, run, others):
-        other = copy(expected)
-        other.input, other.sealed, other.started = run.input, run.sealed, other.started or None
-        yield other
+        yield _with_recorded_input(expected, run)
     if isinstance(run.trigger, MessageTrigger):
         try:
             sender, sequence, message = decoded(run.input)
@@ -229,6 +234,28 @@ def _contradicts_itself(run: HandlerRun, agent_id: int, others: OtherRecords) ->
         if whole is not None and (whole.message, whole.seq, whole.block) != (sent.message, sent.seq, sent.block):
             return True
     return False
+
+
+def _is_joined(deviation: StepDeviation, line: Line, others: OtherRecords) -> bool:
+    """Return true if the line is as expected up to the beginning of a disk block, or if its branch is unknown and the
+    line contains the beginning of a disk block.
+
+    The rest of the line then may be the end of a later line. Only few lines contain the beginning of a disk block, so
+    this damage cannot explain repeated mistakes of an agent.
+    """
+    number, run = line
+    if deviation.expected is None or deviation.run is not run:
+        return False
+    expected = _with_recorded_input(deviation.expected, run).to_line()
+    unknown = not branch_is_known(run)
+    return any(unknown or expected.startswith(beginning) for beginning in others.beginnings(number))
+
+
+def _with_recorded_input(expected: HandlerRun, run: HandlerRun) -> HandlerRun:
+    """Return the expected handler run with the input of the recorded one, which the reference does not compute."""
+    other = copy(expected)
+    other.input, other.sealed, other.started = run.input, run.sealed, other.started or None
+    return other
 
 
 def _names_another_handler(run: HandlerRun) -> bool:

@@ -24,8 +24,12 @@ from harness.errors import FieldError
 from harness.field._vehicle_captures import AgentCapture, CapturedDatagram
 from ucp.clock import MICROSECONDS
 from ucp.messages import MalformedDatagramError, Message, NextInSequenceResponse, decode
+from ucp.plain_file import open_plain_file
 from ucp.trace import CommandEntry, DroppedDatagram, HandlerRun
 from ucp.trigger import MessageTrigger
+
+DISK_BLOCK_BYTES = 4096
+"""Size of the blocks of usual file systems."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,6 +183,18 @@ class RecordedTrace:
         earlier = [entry.content for entry in self.entries if entry.content.t < at_s]
         runs = (content for content in reversed(earlier) if isinstance(content, HandlerRun))
         return any(run.state.reconciling for run in islice(runs, 1))
+
+    def beginnings(self, number: int) -> Iterator[str]:
+        """Yield each part of line `number` of the trace file that ends at the beginning of a disk block.
+
+        A file system stores a file in blocks, and a damaged disk loses whole blocks.
+        """
+        begin, line = 0, b""
+        with suppress(OSError), open_plain_file(self.path) as file:
+            for read in islice(file, number):
+                begin, line = begin + len(line), read
+        for end in range(DISK_BLOCK_BYTES - begin % DISK_BLOCK_BYTES, len(line), DISK_BLOCK_BYTES):
+            yield line[:end].decode("utf-8", "replace")
 
     @cached_property
     def _sent_by_complete_traces(self) -> dict[int, list[Message]]:

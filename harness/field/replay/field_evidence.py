@@ -25,13 +25,13 @@ def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
     results: dict[int, ReplayResult | str] = {}
     traces: dict[int, Trace] = {}
     for agent_id, recorded in flight.traces.items():
-        doubtful = dict[int, str]()
+        doubtful, file = dict[int, str](), flight.sources.get(agent_id, [Path()])[0]
         try:
-            record = RecordedTrace(Path(), "", recorded, IngestedRecords(flight), [])
+            record = RecordedTrace(file, "", recorded, IngestedRecords(flight), [])
             results[agent_id] = RecordPlayer(record).to_end()
             doubtful = record.doubtful_runs
         except FieldError as error:
-            results[agent_id] = str(error).removeprefix(".: ")
+            results[agent_id] = str(error).removeprefix(f"{file}: ")
         traces[agent_id] = _up_to_loss(recorded, doubtful)
     for agent_id, why in lacking_traces(traces):
         traces[agent_id].problem = traces[agent_id].problem or why

@@ -349,6 +349,20 @@ def test_two_trace_lines_joined_by_damage_lead_to_no_accusation(
         assert _judge(home).wrong == (), number
 
 
+@pytest.mark.parametrize(("seed", "agent_id", "block"), [(4, 2, 3), (9, 2, 16), (11, 3, 12)])
+def test_lost_block_of_the_disk_leads_to_no_accusation(seed: int, agent_id: int, block: int, tmp_path: Path) -> None:
+    """The line at the lost block is joined from two lines. It has one handler, and the JSON text is valid."""
+    home = tmp_path / "home"
+    bring_home(scenario(**FLIGHT), seed, "sim", tmp_path / "run", home)
+    path = home / f"{agent_id}.trace.jsonl"
+    data = path.read_bytes()
+    path.write_bytes(data[: block * 4096] + data[(block + 1) * 4096 :])
+    found = RecordPlayer(open_record(home, agent_id)).to_end()
+    assert [deviation.sentence(str) for deviation in found.deviations] == []
+    assert "joined from two lines" in found.lost[0] + found.lost[-1]
+    assert _judge(home).wrong == ()
+
+
 def test_pause_may_begin_soon_after_the_expiry_of_a_timer(whole: tuple[Path, Undamaged]) -> None:
     """An agent can handle a message after the expiry, then pause, and then handle queued messages before the timer."""
     record = open_record(whole[0], 1)
