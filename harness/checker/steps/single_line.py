@@ -68,6 +68,8 @@ class OtherRecords(Protocol):
 
 LINES_AFTER = 8
 """Number of lines after the difference that must agree with an explanation."""
+JOINED = "a part of the file is missing, and the line is joined from two lines"
+"""The phrase for a line that consists of the beginning of one line and the end of a later line."""
 MAX_FURTHER = 2
 """Maximum number of further lost lines among these lines."""
 MAX_ANSWERS = 4
@@ -102,7 +104,7 @@ def damage_that_explains(
     if _contradicts_itself(line[1], before.state.agent_id, others):
         return "the line is damaged"
     if _is_joined(deviation, line, others):
-        return "a part of the file is missing, and the line is joined from two lines"
+        return JOINED
     for trial in _with_a_line_more(before, line[1], others):
         if _agrees(trial, [line, *following], others):
             return "a line is missing"

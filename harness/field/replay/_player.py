@@ -18,7 +18,7 @@ from harness.checker.steps import end_of_record, wrongly_dropped
 from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import OptionalTraceFields, StepComparer
 from harness.checker.steps.implementation import REFERENCE, CoreImplementation
-from harness.checker.steps.single_line import LINES_AFTER, damage_that_explains
+from harness.checker.steps.single_line import JOINED, LINES_AFTER, damage_that_explains
 from harness.field.replay._agent_record import RecordedTrace, RecordEntry
 from harness.field.replay._ignored_messages import ignored_messages
 from harness.field.replay._resumption import ClockChangeDetector, ResumptionSearch
@@ -294,14 +294,19 @@ class RecordPlayer:
         them.
 
         Such damage is rare. If it explains more than a few places in a record, the deviations count as mistakes of the
-        agent.
+        agent. A line is only assumed to be joined from two lines if the record has no deviation without explanation.
         """
         if self.record.is_counted:
             return None
         if self.record.doubts is None:
             doubting = _DoubtingPlayer(self.record)
             doubting.to(len(doubting.entries))
-            found = {position: why for position, why in doubting.found.items() if why is not None}
+            whys = doubting.found.values()
+            found = {
+                position: why
+                for position, why in doubting.found.items()
+                if why is not None and not (JOINED in why and None in whys)
+            }
             self.record.doubts = found if len(found) <= MAX_DOUBTS else {}
         return self.record.doubts.get(self.position)
 
