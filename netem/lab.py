@@ -22,6 +22,7 @@ import signal
 import socket
 import sys
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -47,17 +48,14 @@ _OPEN_DEADLINE_S = 60.0
 _CLOSE_DEADLINE_S = 5.0
 
 
-class LabProcess:
-    """A program in the virtual network. The program ends at the latest when the network is closed."""
+class RunningProgram(ABC):
+    """A program that can be waited for, and controlled with signals. `send_signal` depends on where it runs."""
 
     left_behind: tuple[str, ...] = ()
-    """Always empty, because child processes of the program run on when the program ends."""
+    """Names of child processes that ended with the program. Always empty, because only containers know these names."""
 
-    def __init__(self, channel: LabConnection, vehicle: int | None, pid: int, ended: asyncio.Future[int]) -> None:
-        self._channel = channel
+    def __init__(self, ended: asyncio.Future[int]) -> None:
         self._ended = ended
-        self.vehicle = vehicle
-        self.pid = pid
 
     @property
     def returncode(self) -> int | None:
@@ -73,14 +71,13 @@ class LabProcess:
 
     async def wait(self) -> int:
         """Wait until the program ends, and return the return code. The return code is -SIGKILL if the program ended
-        because the network was closed.
+        with its network or its computer.
         """
         return await asyncio.shield(self._ended)
 
+    @abstractmethod
     async def send_signal(self, number: int) -> None:
         """Send a signal to the program and its child processes. Do nothing if the program has ended."""
-        if not self._ended.done():
-            await self._channel.ask("signal", pid=self.pid, signal=int(number))
 
     async def pause(self) -> None:
         """Suspend the program with SIGSTOP until `resume` is called."""
@@ -98,6 +95,20 @@ class LabProcess:
         except TimeoutError:
             await self.send_signal(signal.SIGKILL)
             return await self.wait()
+
+
+class LabProcess(RunningProgram):
+    """A program in the virtual network. The program ends at the latest when the network is closed."""
+
+    def __init__(self, channel: LabConnection, vehicle: int | None, pid: int, ended: asyncio.Future[int]) -> None:
+        super().__init__(ended)
+        self._channel = channel
+        self.vehicle = vehicle
+        self.pid = pid
+
+    async def send_signal(self, number: int) -> None:
+        if not self._ended.done():
+            await self._channel.ask("signal", pid=self.pid, signal=int(number))
 
 
 class Lab:
@@ -350,4 +361,4 @@ def _last_line(log: Path) -> str:
     return lines[-1] if lines else "it printed nothing"
 
 
-__all__ = ["EngineName", "Lab", "LabError", "LabProcess", "LabUnavailable", "UdpCounters", "in_words"]
+__all__ = ["EngineName", "Lab", "LabError", "LabProcess", "LabUnavailable", "RunningProgram", "UdpCounters", "in_words"]

@@ -27,62 +27,35 @@ from harness.play.remote._far_clock import ping
 from harness.play.remote._far_ends import FarEnd
 from harness.play.remote._wire import LOST_AFTER_S, NUMBER_BYTES, SILENT_S, Kind, Message, WireError
 from netem.errors import SpawnError
-from netem.lab import in_words
+from netem.lab import RunningProgram
 
 PING_EVERY_S = 0.5
 READ_BYTES = 1 << 16
 
 
-class FarVehicle:
-    """A vehicle program on a worker, as a `LabProgram`."""
+class FarVehicle(RunningProgram):
+    """A vehicle program on a worker. When it has ended, the worker ends the processes that it left behind.
 
-    left_behind: tuple[str, ...] = ()
-    """Always empty, because the worker ends the processes that the program left behind."""
+    Its files have arrived when `wait` returns. If the worker is lost, the return code is -SIGKILL.
+    """
 
     def __init__(self, number: int, worker: WorkerConnection, output: Path) -> None:
+        loop = asyncio.get_running_loop()
+        super().__init__(loop.create_future())
         self.number, self.output = number, output
         self._worker = worker
-        loop = asyncio.get_running_loop()
         self.started: asyncio.Future[str | None] = loop.create_future()
         """The reason why the program could not be started, or None."""
-        self.ended: asyncio.Future[int] = loop.create_future()
         self.killed = False
-
-    @property
-    def returncode(self) -> int | None:
-        return self.ended.result() if self.ended.done() else None
-
-    @property
-    def end(self) -> str:
-        return in_words(self.ended.result())
-
-    async def wait(self) -> int:
-        """Wait for the program to end and for its files to arrive. If the worker is lost, return -SIGKILL."""
-        return await asyncio.shield(self.ended)
 
     async def send_signal(self, number: int) -> None:
         self.killed |= number == signal.SIGKILL
-        if not self.ended.done():
+        if not self._ended.done():
             self._worker.send(Kind.SIGNAL, {"program": self.number, "number": int(number)})
 
-    async def pause(self) -> None:
-        await self.send_signal(signal.SIGSTOP)
-
-    async def resume(self) -> None:
-        await self.send_signal(signal.SIGCONT)
-
-    async def terminate(self, grace_s: float) -> int:
-        await self.send_signal(signal.SIGTERM)
-        await self.resume()  # a stopped process cannot react to SIGTERM
-        try:
-            return await asyncio.wait_for(self.wait(), grace_s)
-        except TimeoutError:
-            await self.send_signal(signal.SIGKILL)
-            return await self.wait()
-
     def finish(self, status: int) -> None:
-        if not self.ended.done():
-            self.ended.set_result(status)
+        if not self._ended.done():
+            self._ended.set_result(status)
 
 
 class WorkerConnection:
